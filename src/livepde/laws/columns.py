@@ -311,7 +311,7 @@ class _Trials:
         self.columns = columns
         self.options = replace(columns.options, passes=min(columns.options.passes, PASSES))
         self.base = columns.samples()
-        self.vain = len(self.base.spans) if columns.state.fit.screened[0] else 0
+        self.vain = len(self.base) if columns.state.fit.screened[0] else 0
 
     def refitted(self, samples: StoredSamples) -> Found | None:
         """Return the end of a search.
@@ -320,7 +320,7 @@ class _Trials:
         """
         found = refitted(samples, self.options, last=False, screened=self.vain)
         if found is not None and found.screened:
-            self.vain = len(samples.spans)
+            self.vain = len(samples)
         return found
 
     def promising(self, at: _Fit, cost: float) -> Iterator[tuple[float, Error]]:
@@ -433,7 +433,7 @@ class _Trials:
         Shifted readings would change by their noise, too, which hides a slow signal.
         """
         predicted, place = samples.readings - one.residuals, self.columns.places[name] - 1
-        t, h = np.array([span.t1 for span in samples.spans]), predicted[:, place]
+        t, h = samples.times, predicted[:, place]
         there, change = np.isfinite(h), np.zeros_like(predicted)
         change[:, place] = h - np.interp(t - by, t[there], h[there])
         return change

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -107,6 +108,28 @@ def withdrawn(log: Array, sensors: Mask, since: Array) -> Array:
 def trimmed(log: Array, first: int) -> Array:
     """Return a log from a row on."""
     return log[:, first:].copy()
+
+
+class Rows(NamedTuple):
+    """The rows of one member that have a time, as arrays with the rows as first axis."""
+
+    times: Array
+    readings: Array
+    noise: Array  # NaN: that of the sensor
+    inputs: Array
+    parts: IntArray
+
+    @classmethod
+    def of(cls, log: Array, sensors: int) -> Rows:
+        """Return the rows of a log of one member."""
+        rows, (inputs, _) = log[0][np.isfinite(log[0, :, 0])], _inputs(log, sensors)
+        return cls(
+            times=rows[:, 0],
+            readings=rows[:, 1 : 1 + sensors],
+            noise=rows[:, 1 + sensors : inputs.start],
+            inputs=rows[:, inputs],
+            parts=rows[:, -1].astype(int),
+        )
 
 
 def _rows(log: Array, channels: tuple[str, ...]) -> list[End]:

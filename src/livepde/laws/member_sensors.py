@@ -8,6 +8,7 @@ the state becomes U - (H U + D C) K: what the readings determine depends no long
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cached_property
 
 import numpy as np
@@ -62,6 +63,26 @@ class MemberSensors:
             predicted.append(z + Y[-1] if deviates else z)
             rows.append(Y[: len(x.U[k])])
         return np.array(predicted), np.array(rows)
+
+    def observe_each(
+        self, x: FilterState, columns: Array, ends: Iterable[Moments]
+    ) -> tuple[Array, Array]:
+        """Return the same for states and rows U of `columns` at some moments.
+
+        `columns`: (moments, 1 + r, members, n), about states without a deviation. Results have the
+        shapes (moments, members, sensors) and (moments, members, r, sensors).
+        """
+        if self.fixed:
+            seen = self._read(columns.reshape(-1, columns.shape[3]))
+            seen = seen.reshape(*columns.shape[:3], seen.shape[1])
+            return seen[:, 0], seen[:, 1:].swapaxes(1, 2)
+        shape, sensors = columns.shape, self.problem.observed.size
+        predicted = np.empty((shape[0], shape[2], sensors))
+        Y = np.empty((shape[0], shape[2], shape[1] - 1, sensors))
+        for k, (one, at) in enumerate(zip(columns, ends, strict=True)):
+            now = changed(x, u=one[0], U=one[1:].swapaxes(0, 1))
+            predicted[k], Y[k] = self.observe(now, at)
+        return predicted, Y
 
     def rows(self, x: FilterState, U: Array, C: Array, at: Moments) -> Array:
         """Return [U C] H^T for rows of each member, (members, rows, sensors), about its point."""

@@ -53,7 +53,7 @@ def _sensor_columns(
     Effects have shape (samples, sensors), in the unit of the readings. The largest size is a
     standard deviation of the amplitude that is plausible.
     """
-    times = np.array([float(span.t1) for span in samples.spans])
+    times = samples.times
     share = (times - times[0]) / max(float(np.ptp(times)), 1e-300)
     count, sensors = predicted.shape
     # A sensor that moves may have no place at first.
@@ -248,8 +248,8 @@ def linear_model(
     `one`, `used`: the best fit, and the readings that it uses. `T`: what is asked for, as rows on
     the coordinates xi, (numbers, r).
     """
-    work = len(samples.spans) * samples.filter.problem.model.X.dim
-    fine = len(samples.spans) >= MANY and work * MOST_COLUMNS < MOST_WORK
+    work = len(samples) * samples.filter.problem.model.X.dim
+    fine = len(samples) >= MANY and work * MOST_COLUMNS < MOST_WORK
     numbers = FULL if fine else SMALL
     errors = ErrorColumns(samples, numbers)
     answers, states, predicted = errors.followed(one)
@@ -283,7 +283,7 @@ def linear_model(
         families[kind] = (columns, partial(_root, modes, count))
     for effect, largest in _sensor_columns(samples, predicted, states):
         causes.append((int(add(effect[:, :, None])[0]), largest))
-    times = np.array([float(span.t1) for span in samples.spans])
+    times = samples.times
     sensors = predicted.shape[1]
     together, apart = _slow_noise(times, sensors, numbers.noise)
     families["common"] = (add(together), partial(_root, np.zeros(1), numbers.noise))

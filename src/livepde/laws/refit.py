@@ -21,6 +21,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import scipy
+from scipy.special import ndtri
 
 from livepde.laws.assimilation import assimilate
 from livepde.laws.filter_state import FilterState
@@ -161,7 +162,7 @@ def refitted(
     """
     search = _Search(samples, options, last, lacking=1 if screened else AGREED)
     search.descend(samples.reached)
-    screens = search.suspicious and len(samples.spans) >= (ANEW_LAST if last else ANEW) * screened
+    screens = search.suspicious and len(samples) >= (ANEW_LAST if last else ANEW) * screened
     if screens:
         search.screen()
     elif screened and search.stays(samples.reached):
@@ -461,9 +462,9 @@ def _shift(sizes: Array, g: Array, delta: float) -> float:
 
 
 def _normal(count: int, size: int) -> Array:
-    """Return Sobol points of N(0, I), shape (count, size)."""
-    sobol = scipy.stats.qmc.Sobol(size, seed=0)
-    return np.asarray(scipy.special.ndtri(np.clip(sobol.random(count), 1e-6, 1.0 - 1e-6)))
+    """Return a Latin hypercube of points of N(0, I), shape (count, size)."""
+    ranks = np.random.default_rng(0).random((count, size)).argsort(axis=0)
+    return np.asarray(ndtri((ranks + 0.5) / count))
 
 
 def _misfit(residuals: Array, readings: Array, used: Mask) -> float:
@@ -558,9 +559,9 @@ def _after(
         cost=np.array([found.best.cost(found.used)]),
         readings=np.array([float(there.sum())]),
         refused=np.array([float((there & ~found.used).sum())]),
-        work=spent + found.passes * len(samples.spans),
+        work=spent + found.passes * len(samples),
         converged=np.array([float(found.converged)]),
-        screened=np.array([len(samples.spans)]) if found.screened else state.fit.screened,
+        screened=np.array([len(samples)]) if found.screened else state.fit.screened,
         xi=found.best.xi[None, :, None],
     )
     now = work.filter.relinearised(x)

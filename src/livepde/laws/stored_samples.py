@@ -18,11 +18,11 @@ from livepde.laws.assimilation import HALF_LOG, absorb, assimilate
 from livepde.laws.filter import Filter, contraction
 from livepde.laws.filter_state import FilterState, coordinates, extended
 from livepde.laws.gate import Gate
-from livepde.laws.history import first_interval, intervals_since
+from livepde.laws.history import Rows, first_interval, intervals_since
 from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array, Mask
-from livepde.stepping import BandedStage, Span, StageOfMembers, advance
+from livepde.stepping import BandedStage, Span, StageOfMembers, Steps, Sweep, advance
 
 FACTORS = 32  # factorised matrices that a pass keeps: one for each length of a stage
 TOGETHER = 6  # trajectories that are tried at once where one array holds them
@@ -64,21 +64,39 @@ class Passed:
 class StoredSamples:
     """The samples of one member since the start of its window."""
 
-    # Parts of the law, and the member as it is now.
+    # Parts of the law, the member as it is now, and its rows since the start of the window.
     work: SensitivityWork
     state: SensitivityState
-    # Intervals that lead to each sample; the first is without length if it is at the start.
-    spans: Sequence[Span]
+    rows: Rows
 
     @classmethod
     def of(cls, work: SensitivityWork, state: SensitivityState) -> StoredSamples:
         """Return the samples in the window of one member."""
-        filter_, log = work.filter, state.log[:, int(state.window[0]) :]
-        channels = filter_.problem.channels
+        sensors = work.filter.problem.observed.size
+        return cls(work, state, Rows.of(state.log[:, int(state.window[0]) :], sensors))
+
+    def __len__(self) -> int:
+        return len(self.rows.times) - self._before
+
+    @property
+    def _before(self) -> int:
+        """Rows before the first sample: the row at the start is one, if it has readings."""
+        return int(not self.state.opening[0])
+
+    @cached_property
+    def spans(self) -> Sequence[Span]:
+        """Intervals that lead to each sample; the first has no length if it is at the start."""
+        state, filter_ = self.state, self.filter
+        log, channels = state.log[:, int(state.window[0]) :], filter_.problem.channels
         intervals = intervals_since(log, channels)
         if state.opening[0]:
             intervals = [first_interval(log, channels), *intervals]
-        return cls(work, state, [filter_.span(interval) for interval in intervals])
+        return [filter_.span(interval) for interval in intervals]
+
+    @property
+    def times(self) -> Array:
+        """Times of the samples, (samples,)."""
+        return self.rows.times[self._before :]
 
     @property
     def filter(self) -> Filter:
@@ -93,19 +111,23 @@ class StoredSamples:
     @cached_property
     def noise(self) -> Array:
         """Standard deviation of each reading, (samples, sensors)."""
-        return np.array([self.filter.noise_of(self.state.now, span)[0] for span in self.spans])
+        own = self.rows.noise[self._before :]
+        found: Array = np.where(np.isnan(own), self.filter.noise, own)
+        return np.asarray(np.sqrt(self.state.now.level[0]) * found)
 
     @cached_property
     def readings(self) -> Array:
-        """All readings in units of their noise, (samples, sensors); NaN: missing.
+        """All readings in units of their noise, (samples, sensors); NaN: missing."""
+        return self._values / self.noise
 
-        A reading of a sensor whose position is missing is none.
-        """
-        found = np.array([span.z1[0] for span in self.spans]) / self.noise
-        for number, span in enumerate(self.spans):
-            if np.isnan(span.end.inputs).any():
-                predicted, _ = self.filter.sensors.observe(self.state.start, span.end)
-                found[number, ~np.isfinite(predicted[0])] = np.nan
+    @cached_property
+    def _values(self) -> Array:
+        """All readings; one of a sensor whose position is missing is none."""
+        found = self.rows.readings[self._before :].copy()
+        missing = np.isnan(self.rows.inputs[self._before :]).any(axis=1)
+        for number in np.flatnonzero(missing).tolist():
+            predicted, _ = self.filter.sensors.observe(self.state.start, self.spans[number].end)
+            found[number, ~np.isfinite(predicted[0])] = np.nan
         return found
 
     @cached_property
@@ -179,13 +201,35 @@ class StoredSamples:
             kept=self.filter.stage.kept(count),
         )
 
-    def _followed(self, x: FilterState) -> Iterator[tuple[FilterState, Span]]:
-        """Yield trajectories after each span; ends early where a step fails."""
-        filter_, factors, kept = self.filter, dict[float, Any](), x.kept
-        along = filter_.reduction.directions(x.q, x.C)
-        exact = np.zeros(len(x.member), dtype=bool)
+    @cached_property
+    def _steps(self) -> Steps:
+        rows, problem = self.rows, self.filter.problem
+        start = np.maximum(np.arange(len(self)) - 1 + self._before, 0)
+        ends = np.stack([rows.times[start], self.times], axis=1)
+        parts, inputs1 = rows.parts[self._before :], rows.inputs[self._before :]
+        channels = problem.channels
+        return Steps.through(ends, parts, rows.inputs[start], inputs1, channels, problem.control)
+
+    def _followed(self, x: FilterState) -> Iterator[tuple[slice, Array]]:
+        """Yield numbers of spans, and trajectories with derivatives, (spans, 1 + r, points, n).
+
+        It ends early where a step fails.
+        """
+        if not len(self):
+            return iter(())
+        stage, scheme = self.filter.stage, self.filter.problem.control.scheme
+        along = self.filter.reduction.directions(x.q, x.C)
         columns = np.concatenate([x.u[None], x.U.transpose(1, 0, 2)])
-        for span in self.spans:
+        sweep = Sweep.of(stage, scheme, self._steps, x.q, along)
+        return self._stepped(x, columns, along) if sweep is None else sweep.blocks(columns)
+
+    def _stepped(
+        self, x: FilterState, columns: Array, along: Array
+    ) -> Iterator[tuple[slice, Array]]:
+        """Yield the same, one stage after the other."""
+        filter_, factors, kept = self.filter, dict[float, Any](), x.kept
+        exact = np.zeros(len(x.member), dtype=bool)
+        for number, span in enumerate(self.spans):
             if len(factors) > FACTORS:
                 factors.clear()
 
@@ -200,53 +244,54 @@ class StoredSamples:
                 columns, _, failure = advance(control, stage, columns, span.start, span.t1)
                 if failure is not None:
                     return
-            yield changed(x, u=columns[0], U=columns[1:].transpose(1, 0, 2), kept=kept), span
+            yield slice(number, number + 1), columns[None]
 
     def along(self, one: Passed) -> Iterator[FilterState]:
         """Yield the state and the unknowns of a trajectory at each sample."""
-        for x, _ in self._followed(self.placed(one.xi[None], rows=False)):
-            yield x
+        x = self.placed(one.xi[None], rows=False)
+        for _, found in self._followed(x):
+            for columns in found:
+                yield changed(x, u=columns[0])
 
-    def _compared(self, start: FilterState) -> Iterator[tuple[FilterState, Array, Array]]:
-        """Yield trajectories after each span, with residuals and derivatives in units of the noise.
+    def _compared(self, x: FilterState) -> Iterator[tuple[slice, Array, Array, Array]]:
+        """Yield numbers of spans, and trajectories after the last one, (1 + r, points, n).
 
-        Shapes (points, sensors) and (points, r, sensors); empty at samples without a reading.
+        With residuals and derivatives of the predictions, in units of the noise, (spans, points,
+        sensors) and (spans, points, r, sensors). NaN for samples without a reading.
         """
-        nothing = np.zeros((0, 0)), np.zeros((0, 0, 0))
-        for number, (x, span) in enumerate(self._followed(start)):
-            if not self.seen[number]:
-                yield x, *nothing
-                continue
-            predicted, Y = self.filter.sensors.observe(x, span.end)
-            noise, there = self.noise[number], np.isfinite(self.readings[number])
-            yield x, np.where(there, (span.z1 - predicted) / noise, np.nan), Y / noise
+        for some, found in self._followed(x):
+            seen = np.flatnonzero(self.seen[some])
+            ends = (self.spans[some.start + k].end for k in seen.tolist())
+            predicted, Y = self.filter.sensors.observe_each(x, found[seen], ends)
+            noise = self.noise[some][seen][:, None]
+            shape = (len(found), *predicted.shape[1:])
+            missed, slopes = np.full(shape, np.nan), np.zeros((len(found), *Y.shape[1:]))
+            missed[seen] = (self._values[some][seen][:, None] - predicted) / noise
+            slopes[seen] = Y / noise[:, :, None]
+            yield some, found[-1], missed, slopes
 
     def about(self, xi: Array) -> Passed | None:
         """Return the samples about one trajectory with derivatives; None if a step fails."""
         there = np.isfinite(self.readings)
         r, J = self.missing.copy(), np.zeros((*there.shape, len(xi)))
-        x, number = None, -1
-        for number, (after, missed, Y) in enumerate(
-            self._compared(self.placed(xi[None], rows=True))
-        ):
-            x = after
-            if len(missed):
-                r[number] = missed[0]
-                J[number, there[number]] = Y[0].T[there[number]]
-        if x is None or number + 1 < len(self.spans):
+        x, taken = self.placed(xi[None], rows=True), 0
+        for some, columns, missed, Y in self._compared(x):
+            r[some], J[some] = missed[:, 0], Y[:, 0].swapaxes(1, 2)
+            last, taken = columns, some.stop
+        if not taken or taken < len(self):
             return None
+        J[~there] = 0.0
+        end = changed(x, u=last[0], U=last[1:].transpose(1, 0, 2))
         # Of squares: what overflows there has neither a cost nor a direction.
-        squares = (J**2).sum() + (x.u**2).sum() + (x.U**2).sum() + (r[there] ** 2).sum()
-        return Passed(xi=xi, residuals=r, slopes=J, end=x) if np.isfinite(squares) else None
+        squares = (J**2).sum() + (last**2).sum() + (r[there] ** 2).sum()
+        return Passed(xi=xi, residuals=r, slopes=J, end=end) if np.isfinite(squares) else None
 
     def residuals(self, xi: Array) -> Array | None:
         """Return the residuals about one trajectory; None if a step fails."""
-        r, number = self.missing.copy(), -1
-        compared = self._compared(self.placed(xi[None], rows=False))
-        for number, (_, missed, _) in enumerate(compared):
-            if len(missed):
-                r[number] = missed[0]
-        return r if number + 1 == len(self.spans) else None
+        r, taken = self.missing.copy(), 0
+        for some, _, missed, _ in self._compared(self.placed(xi[None], rows=False)):
+            r[some], taken = missed[:, 0], some.stop
+        return r if taken == len(self) else None
 
     def costs(self, points: Array, used: Mask, limit: float = np.inf) -> tuple[Array, float]:
         """Return the costs of trajectories, and how much of a pass they took.
@@ -258,17 +303,17 @@ class StoredSamples:
         for first in range(0, len(points), AT_ONCE):
             part = slice(first, first + AT_ONCE)
             compared = self._compared(self.placed(points[part], rows=False))
-            for number, (x, missed, _) in enumerate(compared):
-                taken += len(x)
-                whole[part] = number + 1 == len(self.spans)
-                if len(missed):
-                    found[part] += 0.5 * (np.where(used[number], missed, 0.0) ** 2).sum(axis=1)
+            for some, _, missed, _ in compared:
+                taken += missed.shape[1] * len(missed)
+                whole[part] = some.stop == len(self)
+                squares = np.where(used[some][:, None], missed, 0.0) ** 2
+                found[part] += 0.5 * squares.sum(axis=(0, 2))
                 if not (found[part] < limit).any():
                     whole[part] = False
                     break
         columns = 1 + int(self.alive.sum())
         cost = np.where(whole & np.isfinite(found), found, np.inf)
-        return cost, taken / (columns * max(len(self.spans), 1))
+        return cost, taken / (columns * max(len(self), 1))
 
     def updated(self, one: Passed, used: Mask) -> FilterState:
         """Return the filter after all readings in use, linear about a trajectory.

@@ -23,6 +23,7 @@ from livepde.stepping.schemes import (
     advance,
     interruptible,
 )
+from livepde.stepping.sweep import Steps, Sweep
 
 __all__ = [
     "LONG_SUBSTEPS",
@@ -49,6 +50,8 @@ __all__ = [
     "Stage",
     "StageOfMembers",
     "StepFailed",
+    "Steps",
+    "Sweep",
     "advance",
     "interruptible",
     "member_stage",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
@@ -57,6 +57,16 @@ class Held:
             kind: [n for n, one in between.items() if one == kind] for kind in ("hold", "next")
         }
         return cls(tuple(sorted(kinds["hold"])), tuple(sorted(kinds["next"])))
+
+    def acting(
+        self, channels: Sequence[str], first: Array, last: Array, row: Array
+    ) -> tuple[Array, Array]:
+        """Return the inputs that act inside intervals, at their starts and ends.
+
+        `row` are those of the samples at the ends; all have the shape (..., channels).
+        """
+        first = np.where([name in self.next for name in channels], row, first)
+        return first, np.where([name in self.last for name in channels], first, last)
 
     def __bool__(self) -> bool:
         return bool(self.last or self.next)
@@ -293,19 +303,13 @@ class Span:
         first, last = self.inputs0, self.inputs1
         if first is last or not held:
             return self
-        to_next = np.array([name in held.next for name in self.channels], dtype=bool)
-        if to_next.all():
-            return replace(self, inputs0=last)
-        to_last = np.array([name in held.last for name in self.channels], dtype=bool)
         row = last if self.row is None else self.row
-        if to_last.all():
+        if all(name in held.next for name in self.channels):
+            return replace(self, inputs0=last)
+        if all(name in held.last for name in self.channels):
             return replace(self, inputs1=first, row=row)
-        return replace(
-            self,
-            inputs0=np.where(to_next, row, first),
-            inputs1=np.where(to_last, first, last),
-            row=row,
-        )
+        first, last = held.acting(self.channels, first, last, row)
+        return replace(self, inputs0=first, inputs1=last, row=row)
 
     @property
     def stated(self) -> Array:

@@ -296,6 +296,12 @@ class BandedStage(MemberStage):
             return "the model is not affine in its input channels"
         return ""
 
+    @property
+    def repeats(self) -> bool:
+        """True if stages of one length and the same unknowns differ by their inputs alone."""
+        vectors = self._boundary, self._mass_boundary, self._load, self._offset
+        return not self._terms and all(one.responses is not None for one in vectors)
+
     def _stacked(self, *parts: Array) -> sp.csr_array:
         """Return vertically stacked matrices of the pattern."""
         blocks = [self.pattern.matrix(part) for part in parts]

@@ -1,0 +1,199 @@
+"""Many steps of an affine process with fixed unknowns: for each a product with a small matrix.
+
+If stages of one length differ by their inputs alone, a step of a scheme is y+ = Q y + g, with one
+matrix Q for each length. All g of a block of steps are solved for at once, as members of one stage.
+So is what drives the tangents, once the states are known: they have the same Q.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from livepde.linalg import Array, IntArray, nonfinite_allowed
+from livepde.stepping.interval import Moments
+from livepde.stepping.member_stage import BandedStage, MemberStage, StageOfMembers
+from livepde.stepping.schemes import Advance, Scheme, advance, safe_point
+
+BLOCK = 256  # steps that are solved for at once
+WIDEST = 256  # coefficients of a state up to which products are cheaper than stages
+NOTHING = np.zeros(0)
+REPEATED = 8  # steps of each length, in the mean, from which its matrix is worth its solves
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Steps:
+    """The substeps of the spans of one process.
+
+    Attributes
+    ----------
+    starts, lengths, of
+        Of each substep its start, its length, and the number of its span.
+    after
+        How many substeps are taken at the end of each span.
+    ends, inputs0, inputs1, channels
+        Start and end of each span, (spans, 2), and the inputs there, (spans, channels).
+    """
+
+    starts: Array
+    lengths: Array
+    of: IntArray
+    after: IntArray
+    ends: Array
+    inputs0: Array
+    inputs1: Array
+    channels: tuple[str, ...]
+
+    @classmethod
+    def through(
+        cls,
+        ends: Array,
+        parts: IntArray,
+        inputs0: Array,
+        inputs1: Array,
+        channels: tuple[str, ...],
+        control: Advance,
+    ) -> Steps:
+        """Return the substeps that a control takes through spans if no step fails.
+
+        `parts`, (spans,), divides the substeps of each span; the inputs are those of the samples.
+        """
+        begun, counts = list[tuple[float, float]](), list[int]()
+
+        def begin(t: float, h: float) -> None:
+            begun.append((t, h))
+
+        for (start, stop), division in zip(ends.tolist(), parts.tolist(), strict=True):
+            before = len(begun)
+            if stop > start:
+                own = control.divided(max(division, 1))
+                advance(own, lambda y, t, h: y, NOTHING, start, stop, begin)
+            counts.append(len(begun) - before)
+        starts, lengths = np.reshape(begun, (-1, 2)).T
+        inputs0, inputs1 = control.held.acting(channels, inputs0, inputs1, inputs1)
+        return cls(
+            starts=starts,
+            lengths=lengths,
+            of=np.repeat(np.arange(len(ends)), counts),
+            after=np.cumsum(counts),
+            ends=ends,
+            inputs0=inputs0,
+            inputs1=inputs1,
+            channels=channels,
+        )
+
+    @property
+    def repeat(self) -> bool:
+        """True if there are many steps of few lengths."""
+        return len(np.unique(self.lengths)) * REPEATED <= len(self.lengths)
+
+    def moments(self, some: IntArray, t: float, members: int) -> Moments:
+        """Return the inputs at a time after the start of some substeps, each for all members."""
+        of = self.of[some]
+        begin, end = self.ends[of].T
+        share = ((self.starts[some] + t - begin) / (end - begin))[:, None]
+        first, last = self.inputs0[of], self.inputs1[of]
+        mixed = np.where(first == last, last, (1.0 - share) * first + share * last)
+        return Moments(t, self.channels, mixed.repeat(members, axis=0))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sweep:
+    """Trajectories of members with fixed unknowns through all steps.
+
+    `q`, (members, dim), are the unknowns, `directions`, (members, r, m), their derivatives along
+    each tangent, and `matrices` the transpose of Q for each length, (members, n, n).
+    """
+
+    stage: BandedStage
+    scheme: Scheme
+    steps: Steps
+    q: Array
+    directions: Array
+    matrices: Mapping[float, Array]
+
+    @classmethod
+    @nonfinite_allowed()
+    def of(
+        cls, stage: MemberStage, scheme: Scheme, steps: Steps, q: Array, directions: Array
+    ) -> Sweep | None:
+        """Return the sweep; None where stages one after the other are needed, or cheaper."""
+        if not (isinstance(stage, BandedStage) and stage.repeats and steps.repeat):
+            return None
+        (members, _, m), n = directions.shape, stage.model.X.dim
+        if n > WIDEST:
+            return None
+        still, matrices = np.zeros((members, n, m)), dict[float, Array]()
+        bare = cls(
+            stage=stage, scheme=scheme, steps=steps, q=q, directions=still, matrices=matrices
+        )
+        units = np.zeros((1 + n, 1, members, n))
+        units[1:, 0] = np.eye(n)[:, None]
+        for h in np.unique(steps.lengths).tolist():
+            some = np.flatnonzero(steps.lengths == h)[:1]
+            matrices[h] = bare._each(units, some, {})[1:, 0].transpose(1, 0, 2).copy()
+            if not np.isfinite(matrices[h]).all():
+                return None
+        return cls(
+            stage=stage, scheme=scheme, steps=steps, q=q, directions=directions, matrices=matrices
+        )
+
+    @nonfinite_allowed()
+    def blocks(self, columns: Array) -> Iterator[tuple[slice, Array]]:
+        """Yield states and tangents, from those at the start, (1 + r, members, n).
+
+        Numbers of some spans, and the columns at their ends, (spans, 1 + r, members, n).
+        """
+        steps, r = self.steps, len(columns) - 1
+        for first in range(0, max(len(steps.of), 1), BLOCK):
+            safe_point()
+            some, factors = np.arange(first, min(first + BLOCK, len(steps.of))), dict[float, Any]()
+            still = np.zeros((1, len(some), *columns.shape[1:]))
+            states = self._recurred(columns[:1], some, self._each(still, some, factors))
+            found = states
+            if r:
+                still = np.broadcast_to(still, (r, *still.shape[1:]))
+                driven = self._each(np.concatenate([states[:, :-1], still]), some, factors)[1:]
+                found = np.concatenate([states, self._recurred(columns[1:], some, driven)])
+            columns = found[:, -1]
+            low, high = np.searchsorted(steps.after, [first, first + len(some)], side="right")
+            part = slice(int(low) if first else 0, int(high))
+            yield part, found[:, steps.after[part] - first].swapaxes(0, 1)
+
+    def _recurred(self, columns: Array, some: IntArray, driven: Array) -> Array:
+        """Return columns before some steps and after the last one, (c, steps + 1, members, n)."""
+        c, count, members, n = driven.shape
+        found = np.empty((count + 1, members, c, n))
+        found[0], driven = columns.swapaxes(0, 1), driven.transpose(1, 2, 0, 3)
+        for k, h in enumerate(self.steps.lengths[some].tolist()):
+            np.matmul(found[k], self.matrices[h], out=found[k + 1])
+            found[k + 1] += driven[k]
+        return found.transpose(2, 0, 1, 3)
+
+    def _each(self, columns: Array, some: IntArray, factors: dict[float, Any]) -> Array:
+        """Return columns, (1 + r, steps, members, n), each after one of some steps."""
+        found, lengths = np.empty(columns.shape), self.steps.lengths[some]
+        for h in np.unique(lengths).tolist():
+            own = np.flatnonzero(lengths == h)
+            found[:, own] = self._of_one_length(columns[:, own], some[own], h, factors)
+        return found
+
+    def _of_one_length(
+        self, columns: Array, some: IntArray, h: float, factors: dict[float, Any]
+    ) -> Array:
+        """Return the same for steps of one length: they are members of one stage."""
+        c, steps, members, n = columns.shape
+        q = np.tile(self.q, (steps, 1))
+        directions = np.tile(self.directions, (steps, 1, 1))
+        zero, kept = np.zeros(len(q), dtype=np.int64), self.stage.kept(len(q))
+
+        def stage(columns: Array, t: float, length: float) -> Array:
+            at = self.steps.moments(some, t, members)
+            work = StageOfMembers(zero, q, directions, length, at, kept, zero > 0, factors)
+            return self.stage.advance(columns, work)[0]
+
+        flat = columns.reshape(c, steps * members, n)
+        return self.scheme.advance(stage, flat, 0.0, h).reshape(columns.shape)

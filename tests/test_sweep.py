@@ -1,0 +1,107 @@
+"""Passes over stored samples by products with small matrices: those of the stages one by one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import livepde as lp
+from livepde.laws.stored_samples import Passed, StoredSamples
+from livepde.stepping import sweep
+
+PLACES = {"a": 0.2, "b": 0.55, "c": 0.8}
+ENDS = {"left": lp.Channel("T_0"), "right": lp.Channel("T_1")}
+
+
+def conduction(q: Any, u: Any, v: Any, x: Any) -> Any:
+    return q.k * lp.dot(lp.grad(u), lp.grad(v))
+
+
+def flowing(q: Any, u: Any, v: Any, x: Any) -> Any:
+    return conduction(q, u, v, x) + q.w * lp.grad(u)[0] * v - 0.3 * (q.w + 1.0) * v
+
+
+def model(kind: str) -> lp.Model:
+    mesh = lp.interval(0.0, 1.0, 14)
+    field = lp.Field(mesh, lp.linear(mesh), dirichlet=ENDS)
+    k = lp.LogNormal(0.1, std=0.05)
+    if kind == "layers":
+        layers = {"one": lambda x: x[0] < 0.4, "two": lambda x: x[0] > 0.4}
+        return lp.Model(field, {"k": lp.Piecewise(layers, k), "w": lp.Normal(0.0, 0.3)}, A=flowing)
+    more = {"off": lp.Normal(0.0, 1.0)} if kind == "offset" else {}
+    return lp.Model(field, {"k": k, "w": lp.Normal(0.1, 0.3), **more}, A=flowing)
+
+
+def stored(kind: str, law: lp.SensitivityLaw, t: Any, first: bool, **parts: Any) -> StoredSamples:
+    rng = np.random.default_rng(4)
+    noise = [0.1, 0.2, 0.1]
+    sensors: lp.observation.Observation = lp.Points(PLACES, noise=noise)
+    if kind == "offset":
+        sensors = lp.observation.Calibrated(lp.Points(PLACES), lambda y, q, x: y + q.off, noise=0.1)
+    identifier = lp.Identifier(model(kind), sensors, law, u0=10.0, **parts)
+    for number, time in enumerate(([0.0] if first else []) + t.tolist()):
+        row = dict(zip(PLACES, (10.0 + rng.standard_normal(3)).tolist(), strict=True))
+        if number % 7 == 3:
+            row["b"] = np.nan
+        if number % 11 == 5:
+            row = dict.fromkeys(PLACES, np.nan)
+        inputs = {"T_0": 10.0 + 3.0 * np.sin(time), "T_1": 10.0 + 2.0 * (time > 2.0)}
+        identifier.step(float(time), row, inputs)
+    return StoredSamples.of(identifier._work, identifier._state)
+
+
+EVEN = 0.05 * np.arange(1, 81)
+PACES = np.cumsum(np.where(np.arange(80) < 40, 0.05, 0.125))
+
+
+@pytest.mark.parametrize(
+    ("kind", "t", "options", "parts"),
+    [
+        ("plain", EVEN, {}, {}),
+        ("plain", PACES, {}, {"between": {"T_0": "hold", "T_1": "next"}}),
+        ("layers", EVEN, {}, {"dt_max": 0.02, "between": {"T_1": "hold"}}),
+        ("offset", EVEN, {"shadows": None}, {"scheme": lp.ImplicitEuler()}),
+        ("plain", PACES, {}, {"u0_errors": [1.0, lambda x: x[0]]}),
+    ],
+)
+@pytest.mark.parametrize("first", [False, True])
+def test_a_pass_is_that_of_the_stages_one_by_one(
+    kind: str, t: Any, options: Any, parts: Any, first: bool, monkeypatch: pytest.MonkeyPatch
+):
+    law = lp.SensitivityLaw(refit=lp.Refit(start=2, window=100), gate=np.inf, **options)
+    samples = stored(kind, law, t, first, **parts)
+    r = len(samples.alive)
+    points = 0.5 * np.random.default_rng(1).standard_normal((5, r)) * samples.alive
+    monkeypatch.setattr(sweep, "BLOCK", 37)
+    used = np.isfinite(samples.readings)
+
+    def passed() -> tuple[Passed, Any, Any]:
+        one, residuals = samples.about(points[0]), samples.residuals(points[0])
+        assert one is not None
+        assert residuals is not None
+        np.testing.assert_allclose(one.residuals, residuals, rtol=1e-12, atol=1e-12)
+        states = np.array([x.u[0] for x in samples.along(one)])
+        return one, states, samples.costs(points, used)[0]
+
+    swept, states, costs = passed()
+    monkeypatch.setattr(sweep, "WIDEST", 0)
+    each, other, others = passed()
+    for name in ("residuals", "slopes"):
+        np.testing.assert_allclose(getattr(swept, name), getattr(each, name), rtol=1e-9, atol=1e-9)
+    for name in ("u", "U"):
+        ends = (getattr(one.end, name) for one in (swept, each))
+        np.testing.assert_allclose(*ends, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(states, other, rtol=1e-10)
+    np.testing.assert_allclose(costs, others, rtol=1e-9)
+    assert costs[0] == pytest.approx(swept.cost(used), rel=1e-10)
+
+
+def test_where_stages_differ_or_lengths_do_not_repeat_stages_follow_each_other():
+    law = lp.SensitivityLaw(refit=lp.Refit(start=2), shadows=None)
+    uneven = stored("plain", law, np.cumsum(0.05 + 0.001 * np.arange(40)), False)
+    assert not uneven._steps.repeat
+    even = stored("plain", law, EVEN, False)
+    assert even._steps.repeat
+    assert even.filter.stage.repeats
