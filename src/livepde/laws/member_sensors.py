@@ -8,7 +8,7 @@ the state becomes U - (H U + D C) K: what the readings determine depends no long
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -43,10 +43,29 @@ class MemberSensors:
     def _read(self) -> RowProduct:
         return row_product(sp.csr_array(self.problem.observed.G))
 
+    def _seen(self, columns: Array) -> Array:
+        """Return G times columns of states, (..., sensors) for (..., n)."""
+        found = self._read(columns.reshape(-1, columns.shape[-1]))
+        return found.reshape(*columns.shape[:-1], found.shape[1])
+
+    def _direct(self, at: Moments) -> Array | None:
+        """Return D of sensors z = G u + D q that are the same at all times; None for others."""
+        affine = None if self.fixed else self.problem.observed.affine(at.member(0))
+        return None if affine is None else affine[1]
+
+    def _of_unknowns(self, x: FilterState, D: Array) -> Array:
+        """Return D q of each member, (members, sensors)."""
+        return np.array([D @ self.problem.model.latent.value(q) for q in x.q])
+
     def observe(self, x: FilterState, at: Moments) -> tuple[Array, Array]:
         """Return predictions, (members, sensors), and Y = [U C] H^T, (members, r, sensors)."""
-        if self.fixed:
-            return self._read(x.u + x.du), self.rows(x, x.U, x.C, at)
+        D = self._direct(at)
+        if self.fixed or D is not None:
+            found = self._seen(x.u + x.du)
+            if D is not None:
+                shift = self.reduction.directions(x.q, x.da[:, None])[:, 0]
+                found = found + self._of_unknowns(x, D) + shift @ D.T
+            return found, self.rows(x, x.U, x.C, at)
         predicted, rows = [], []
         for k in range(len(x)):
             deviates = bool(x.du[k].any() or x.da[k].any())
@@ -65,30 +84,35 @@ class MemberSensors:
         return np.array(predicted), np.array(rows)
 
     def observe_each(
-        self, x: FilterState, columns: Array, ends: Iterable[Moments]
+        self, x: FilterState, columns: Array, end: Callable[[int], Moments]
     ) -> tuple[Array, Array]:
-        """Return the same for states and rows U of `columns` at some moments.
+        """Return the same for states and rows U of `columns` at moments `end(0), ...`.
 
         `columns`: (moments, 1 + r, members, n), about states without a deviation. Results have the
         shapes (moments, members, sensors) and (moments, members, r, sensors).
         """
-        if self.fixed:
-            seen = self._read(columns.reshape(-1, columns.shape[3]))
-            seen = seen.reshape(*columns.shape[:3], seen.shape[1])
-            return seen[:, 0], seen[:, 1:].swapaxes(1, 2)
+        D = self._direct(end(0)) if len(columns) else None
+        if self.fixed or D is not None:
+            seen = self._seen(columns)
+            found, Y = seen[:, 0], seen[:, 1:].swapaxes(1, 2)
+            if D is None:
+                return found, Y
+            slopes = self.reduction.directions(x.q, x.C[:, : Y.shape[2]]) @ D.T
+            return found + self._of_unknowns(x, D), Y + slopes
         shape, sensors = columns.shape, self.problem.observed.size
         predicted = np.empty((shape[0], shape[2], sensors))
         Y = np.empty((shape[0], shape[2], shape[1] - 1, sensors))
-        for k, (one, at) in enumerate(zip(columns, ends, strict=True)):
+        for k, one in enumerate(columns):
             now = changed(x, u=one[0], U=one[1:].swapaxes(0, 1))
-            predicted[k], Y[k] = self.observe(now, at)
+            predicted[k], Y[k] = self.observe(now, end(k))
         return predicted, Y
 
     def rows(self, x: FilterState, U: Array, C: Array, at: Moments) -> Array:
         """Return [U C] H^T for rows of each member, (members, rows, sensors), about its point."""
-        if self.fixed:
-            seen = self._read(U.reshape(-1, U.shape[2]))
-            return seen.reshape(*U.shape[:2], seen.shape[1])
+        D = self._direct(at)
+        if self.fixed or D is not None:
+            found = self._seen(U)
+            return found if D is None else found + self.reduction.directions(x.q, C) @ D.T
         each = (self._of_one(x.u[k], x.q[k], U[k], C[k], at, k)[1] for k in range(len(x)))
         return np.array(list(each))
 

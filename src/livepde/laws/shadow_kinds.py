@@ -82,8 +82,7 @@ class HalvedMesh:
     @cached_property
     def G(self) -> sp.csr_array | Array | None:
         """Observation matrix of the state, shape (sensors, N), if it is constant; else None."""
-        observation = self.observed.observation
-        if type(self.observed) is not Observed or observation.directs or observation.inputs:
+        if type(self.observed) is not Observed or self.observed.observation.inputs:
             return None
         return compact(self.observed.G)
 

@@ -21,8 +21,8 @@ from livepde.laws.gate import Gate
 from livepde.laws.history import Rows, first_interval, intervals_since
 from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
-from livepde.linalg import Array, Mask
-from livepde.stepping import BandedStage, Span, StageOfMembers, Steps, Sweep, advance
+from livepde.linalg import Array, IntArray, Mask
+from livepde.stepping import BandedStage, Moments, Span, StageOfMembers, Steps, Sweep, advance
 
 FACTORS = 32  # factorised matrices that a pass keeps: one for each length of a stage
 TOGETHER = 6  # trajectories that are tried at once where one array holds them
@@ -261,8 +261,11 @@ class StoredSamples:
         """
         for some, found in self._followed(x):
             seen = np.flatnonzero(self.seen[some])
-            ends = (self.spans[some.start + k].end for k in seen.tolist())
-            predicted, Y = self.filter.sensors.observe_each(x, found[seen], ends)
+
+            def end(k: int, numbers: IntArray = some.start + seen) -> Moments:
+                return self.spans[int(numbers[k])].end
+
+            predicted, Y = self.filter.sensors.observe_each(x, found[seen], end)
             noise = self.noise[some][seen][:, None]
             shape = (len(found), *predicted.shape[1:])
             missed, slopes = np.full(shape, np.nan), np.zeros((len(found), *Y.shape[1:]))

@@ -173,6 +173,7 @@ class Observed:
         for name in observation.directs:
             if name not in self.names:
                 raise ObservationError(f"direct: no sensor is called '{name}'; {self.names} are.")
+        self._steady_direct: Array | None = None  # D, once it is known to read no time or input
         self._splits: Memo[bytes, Split] = Memo(LARGEST_MEMO)
         self._reconstructors: Memo[bytes, Reconstructor] = Memo(LARGEST_MEMO)
 
@@ -273,8 +274,8 @@ class Observed:
 
     def _direct(self, moment: Moment) -> Array | None:
         """Return the direct part D of z = G u + D q, shape (sensors, m); None if there is none."""
-        if not self.observation.directs:
-            return None
+        if not self.observation.directs or self._steady_direct is not None:
+            return self._steady_direct
         matrix = np.zeros((self.size, self.parameter.dim))
         zero = np.zeros(self.parameter.dim)
         place = Place(np.zeros((0,)), None, moment)
@@ -290,7 +291,19 @@ class Observed:
                 unit = zero.copy()
                 unit[column] = 1.0
                 matrix[row, column] = float(direct(numbers(self.parameter, unit), place))
+        if not place.used:
+            self._steady_direct = matrix
         return matrix
+
+    def affine(self, moment: Moment) -> tuple[sp.csr_array, Array | None] | None:
+        """Return G and D if z = G u + D q at all times; D is None if sensors see no unknown.
+
+        None for other sensors.
+        """
+        if type(self) is not Observed or self.observation.inputs:
+            return None
+        D = self._direct(moment)
+        return (self.G, D) if D is self._steady_direct else None
 
     def linearised(self, z: Array, u: Array) -> Array:
         """Return readings of equivalent linear sensors, by one Newton step from the state u."""
