@@ -161,7 +161,8 @@ class Sweep:
             columns = found[:, -1]
             low, high = np.searchsorted(steps.after, [first, first + len(some)], side="right")
             part = slice(int(low) if first else 0, int(high))
-            yield part, found[:, steps.after[part] - first].swapaxes(0, 1)
+            if part.start < part.stop:
+                yield part, found[:, steps.after[part] - first].swapaxes(0, 1)
 
     def _recurred(self, columns: Array, some: IntArray, driven: Array) -> Array:
         """Return columns before some steps and after the last one, (c, steps + 1, members, n)."""
