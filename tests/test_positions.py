@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from factories import ROD_CASE, observe
-from skfem import ElementLineP1, ElementQuad1, ElementQuad2, ElementVector
+from skfem import ElementLineP1, ElementQuad1, ElementQuad2, ElementVector, MeshTri
 
 import livepde as lp
 from livepde import cases
+from livepde.models import heat
 
 AT = {"T_1": 0.2, "T_2": 0.45, "T_3": 0.7}
 
@@ -315,6 +316,7 @@ channels.b = { role = "sensor", column = "b", at = [0.3, 0.4], component = 0 }
 OWN = """
 from skfem import ElementQuad2, ElementVector
 import livepde as lp
+from livepde.models import heat
 
 def build(mesh, unknowns, dirichlet):
     state = lp.Field(mesh, ElementVector(ElementQuad2()), dirichlet={"boundary": 0.0})
@@ -357,3 +359,14 @@ def test_a_case_without_components_says_so_when_it_is_prepared(tmp_path: Path):
     )
     with pytest.raises(lp.errors.ObservationError, match="name the measured one"):
         case.prepare()
+
+
+def test_a_position_that_has_no_room_along_an_axis_keeps_its_prior_there():
+    """At the top of a disc there is no room to either side."""
+    mesh = MeshTri.init_circle(2)
+    at = tuple(mesh.p[:, np.argmax(mesh.p[1])].tolist())
+    points = lp.Points({"top": at, "mid": (0.3, 0.2)}, noise=0.01, position_std=0.02)
+    found = lp.Identifier(heat(mesh, lp.LogNormal(0.1, std=0.05)), points, u0=lambda x: x[0] + x[1])
+    for t in (0.1, 0.2):
+        estimate = found.step(t, {"top": 0.9, "mid": 0.4})
+    assert estimate.parameters["position[top.x]"] == pytest.approx((0.0, 0.02))

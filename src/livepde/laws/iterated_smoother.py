@@ -363,7 +363,7 @@ class _Samples:
         length = self.intervals[-1].t1 - opening.t1 if self.intervals else 0.0
         now, initial = state.now, bool(state.initial[0])
         window = Window(
-            start=state.start,
+            start=self.work.at_level(state.start, now),
             now=now,
             reference=state.start.q[0],
             initial=initial,

@@ -146,7 +146,7 @@ def model_errors(
     one, used = found
     if used.sum() < FEWEST:
         return f"fewer than {FEWEST} readings are in use"
-    start, reduction = samples.state.start, samples.filter.reduction
+    start, reduction = samples.start, samples.filter.reduction
     T = reduction.Phi @ start.C[0].T
     model, causes, families = linear_model(samples, one, used, T)
     mixture = averaged(model, causes, families).widened(shift)
@@ -178,7 +178,7 @@ def _best(samples: StoredSamples, options: Refit) -> tuple[Passed, Mask] | None:
     H, g = one.model(used)
     sizes, axes = principal(H)
     step = axes @ (axes.T @ g / sizes)
-    if not samples.state.start.U.any() or step @ H @ step < NEAR**2:
+    if not samples.start.U.any() or step @ H @ step < NEAR**2:
         return one, used
     better = samples.about(samples.within_bounds(one.xi + step))
     if better is None or better.cost(used) > one.cost(used):
@@ -208,7 +208,7 @@ def _allowed(
     samples: StoredSamples, mixture: Mixture, variance: Array, std: Array
 ) -> Iterator[Allowed]:
     problem, reduction = samples.filter.problem, samples.filter.reduction
-    latent, base = problem.model.latent, samples.state.start.q[0]
+    latent, base = problem.model.latent, samples.start.q[0]
     own = set(problem.observed.observation.unknowns)
     for name, item in latent.parts.items():
         if isinstance(item.unknown, Scalar) and item.unknown.corrects:  # an input

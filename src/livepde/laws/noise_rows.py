@@ -362,6 +362,13 @@ def initial_rows(
     return np.vstack([unknown, *own]), C
 
 
+def rows_of_sensors(problem: Problem, reduction: Reduction) -> IntArray:
+    """Return which of the initial rows are the noise of a sensor, as it is stated for the sensor."""
+    readings = problem.initial_readings.items()
+    of_sensor = [name in problem.observed.names and np.isnan(one.noise) for name, one in readings]
+    return reduction.size + np.flatnonzero(of_sensor)
+
+
 def with_initial_rows(
     x: FilterState, problem: Problem, reduction: Reduction, noise: Array, moment: Moment
 ) -> FilterState:

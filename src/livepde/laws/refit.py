@@ -300,7 +300,7 @@ class _Search:
     def _free(self, one: Passed, g: Array) -> Array:
         """Return a basis of the directions in which no bound is in the way, (r, free)."""
         samples = self.samples
-        reduction, start = samples.filter.reduction, samples.state.start
+        reduction, start = samples.filter.reduction, samples.start
         lower, upper = reduction.ends
         q = start.q[0] + reduction.Phi @ (start.C[0].T @ one.xi)
         along = reduction.Phi @ (start.C[0].T @ g)
@@ -386,7 +386,7 @@ class _Search:
             return False
         H, _ = self.best.model(self.used)
         # Of the unknowns: rows of an uncertain start, and padding, may stay as they were.
-        C = self.samples.state.start.C[0]
+        C = self.samples.start.C[0]
         sizes, axes = principal(H)
         left = axes.T @ C
         before, after = C.T @ C, left.T @ (left / sizes[:, None])
@@ -573,7 +573,7 @@ def _after(
 def _filter(samples: StoredSamples, found: Found, *, last: bool) -> FilterState | None:
     """Return the filter that continues from the end of a search; None if a step fails."""
     now = samples.state.now
-    evidence = samples.state.start.evidence + samples.log_evidence(found.best, found.used)
+    evidence = samples.start.evidence + samples.log_evidence(found.best, found.used)
     best = changed(samples.updated(found.best, found.used), evidence=evidence)
     away = apart(samples.filter, best, now)
     # Sums of the verdict and errors of the discretisation stay with the filter until then: a later

@@ -103,7 +103,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     noise
         Standard deviation of the measurement noise; default the noise of the observation. "auto":
         the noise of the observation is a first guess, and the level is found from the samples, the
-        same multiple for all sensors.
+        same multiple for all sensors. Without `refit` the first samples keep the weight of the
+        guess: intervals are too narrow if it is too small.
     drift
         Variance of a gained per unit of time, relative to the prior, by every unknown without an
         evolution of its own: > 0 follows parameters that change. An unknown gains the less, the

@@ -15,6 +15,7 @@ from livepde.laws.filter_state import NO_LEDGER, FilterState, unaccompanied
 from livepde.laws.history import added, trimmed, withdrawn
 from livepde.laws.law import Fit, InitialReading
 from livepde.laws.member_arrays import changed, take, where, zeros
+from livepde.laws.noise_rows import rows_of_sensors
 from livepde.laws.policies import Guards, Jumps, Refit, Watch
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
@@ -67,6 +68,22 @@ class SensitivityWork:
     def kept_start(self, x: FilterState) -> FilterState:
         """Return the filter where a window begins; zeros for a law that never goes back there."""
         return x if self.window else zeros(x)
+
+    @cached_property
+    def _of_sensors(self) -> IntArray:
+        return rows_of_sensors(self.filter.problem, self.filter.reduction)
+
+    def at_level(self, start: FilterState, now: FilterState) -> FilterState:
+        """Return the filter at the start, where the noise has the level that was found since.
+
+        A u0 that is made of readings is as uncertain as they are.
+        """
+        rows = self._of_sensors
+        if not (self.options.adaptive and len(rows)) or start.age.any() or not start.U.any():
+            return start
+        U = start.U.copy()
+        U[:, rows] *= np.sqrt(now.level / start.level)[:, None, None]
+        return changed(start, U=U)
 
     @cached_property
     def jumping(self) -> Mask:

@@ -103,8 +103,8 @@ def _begun(
     them it uses with them. So these, which cost twice as much again, are followed only where it
     refuses a reading.
     """
+    start, initial = unjudged(work.at_level(before.now, after)), bool(before.initial[0])
     work = replace(work.unjudged, options=replace(work.options, adaptive=False))
-    start, initial = unjudged(before.now), bool(before.initial[0])
     whole = _FixedInterval(work, start, initial, after, data)
     bare = _FixedInterval(work.unaccompanied, unaccompanied(start), initial, after, data)
     best = bare.about(bare.estimated)

@@ -93,6 +93,11 @@ class StoredSamples:
             intervals = [first_interval(log, channels), *intervals]
         return [filter_.span(interval) for interval in intervals]
 
+    @cached_property
+    def start(self) -> FilterState:
+        """The filter before the first sample."""
+        return self.work.at_level(self.state.start, self.state.now)
+
     @property
     def times(self) -> Array:
         """Times of the samples, (samples,)."""
@@ -126,14 +131,14 @@ class StoredSamples:
         found = self.rows.readings[self._before :].copy()
         missing = np.isnan(self.rows.inputs[self._before :]).any(axis=1)
         for number in np.flatnonzero(missing).tolist():
-            predicted, _ = self.filter.sensors.observe(self.state.start, self.spans[number].end)
+            predicted, _ = self.filter.sensors.observe(self.start, self.spans[number].end)
             found[number, ~np.isfinite(predicted[0])] = np.nan
         return found
 
     @cached_property
     def alive(self) -> Mask:
         """Rows of the square root at the start that are not zero, as padding is, shape (r,)."""
-        at = self.placed(np.zeros((1, self.state.start.C.shape[1])), rows=True)
+        at = self.placed(np.zeros((1, self.start.C.shape[1])), rows=True)
         return np.asarray(at.C[0].any(axis=1) | at.U[0].any(axis=1))
 
     @cached_property
@@ -157,14 +162,14 @@ class StoredSamples:
 
         Those of an uncertain start, which no unknown has, are where the last refit ended.
         """
-        now, start, reduction = self.state.now, self.state.start, self.filter.reduction
+        now, start, reduction = self.state.now, self.start, self.filter.reduction
         shift = reduction.reduced(reduction.bounded(self.filter.estimate(now)) - start.q)[0]
         last: Array = self.state.fit.xi[0, :, 0]
         return last + coordinates(start.C[0], shift - start.C[0].T @ last)
 
     def within_bounds(self, xi: Array) -> Array:
         """Return xi, moved the least so that the unknowns are within their bounds."""
-        start, reduction = self.state.start, self.filter.reduction
+        start, reduction = self.start, self.filter.reduction
         shift = start.C[0].T @ xi
         q = start.q[0] + reduction.Phi @ shift
         inside = reduction.bounded(q)
@@ -174,7 +179,7 @@ class StoredSamples:
 
     def placed(self, points: Array, rows: bool) -> FilterState:
         """Return the start of trajectories, shape (points, r), with or without derivatives."""
-        start, reduction = self.state.start, self.filter.reduction
+        start, reduction = self.start, self.filter.reduction
         count, (r, k), n = len(points), start.C[0].shape, start.u.shape[1]
         shifts = points @ start.C[0]
         q = start.q + shifts @ reduction.Phi.T
@@ -370,7 +375,7 @@ class StoredSamples:
         now = state.now
         at = self.placed(one.xi[None], rows=True)
         start = changed(
-            state.start,
+            self.start,
             q=at.q,
             u=at.u,
             U=at.U,

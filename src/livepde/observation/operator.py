@@ -292,6 +292,7 @@ class Observed:
                 unit[column] = 1.0
                 matrix[row, column] = float(direct(numbers(self.parameter, unit), place))
         if not place.used:
+            matrix.setflags(write=False)
             self._steady_direct = matrix
         return matrix
 

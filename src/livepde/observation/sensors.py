@@ -37,7 +37,7 @@ class _Shift:
     The quadratic interpolates the values at -a, 0 and b (`below`, `above`), about a standard
     deviation to each side. A derivative is not used because u has none at a node of linear
     elements. At the end of the mesh a or b is 0, and the interpolant is the straight line to the
-    other side. The rows `low` and `high` evaluate the differences of u there to u at 0, shape (1,
+    other side; where both are, at the top of a disc say, the shift has no effect. The rows `low` and `high` evaluate the differences of u there to u at 0, shape (1,
     n); `column` is the position of the shift in q.
     """
 
@@ -52,14 +52,14 @@ class _Shift:
         """Return the interpolation weights of both differences at a shift d."""
         a, b = self.below, self.above
         if a == 0.0 or b == 0.0:
-            return (-d / a, 0.0) if b == 0.0 else (0.0, d / b)
+            return (-d / a if a else 0.0), (d / b if b else 0.0)
         return d * (d - b) / (a * (a + b)), d * (d + a) / (b * (a + b))
 
     def slopes(self, d: float) -> tuple[float, float]:
         """Return the derivatives of `weights`."""
         a, b = self.below, self.above
         if a == 0.0 or b == 0.0:
-            return (-1.0 / a, 0.0) if b == 0.0 else (0.0, 1.0 / b)
+            return (-1.0 / a if a else 0.0), (1.0 / b if b else 0.0)
         return (2.0 * d - b) / (a * (a + b)), (2.0 * d + a) / (b * (a + b))
 
 
@@ -121,7 +121,7 @@ class PlacedObserved(Observed):
 
     def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
         direct = self._direct(moment)
-        H_q = np.zeros((self.size, self.parameter.dim)) if direct is None else direct
+        H_q = np.zeros((self.size, self.parameter.dim)) if direct is None else direct.copy()
         differences = (self._differences @ u).reshape(-1, 2)
         weights = []
         for shift, difference in zip(self.shifts, differences, strict=True):
