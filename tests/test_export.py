@@ -698,6 +698,11 @@ def test_a_moment_is_a_number_a_quantity_or_a_date(rod, tmp_path, moment):
     assert np.array_equal(found.point_data["u"], rod.dataset["u"].values[1])
 
 
+def test_a_moment_outside_of_the_run_is_refused(rod, tmp_path):
+    with pytest.raises(ConfigurationError, match="outside of the run, from"):
+        call("export", rod.path, tmp_path / "a.vtu", "--at", "2026-04-01 06:02")
+
+
 @pytest.mark.slow
 def test_a_date_needs_dates(tmp_path):
     run = made(tmp_path / "rod")

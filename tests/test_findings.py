@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -23,13 +24,15 @@ import test_refit as refits
 import test_run_warnings as warned
 import test_step_choice as fronts
 import test_verdict as rods
-from factories import driven_rod, line
+from factories import driven_rod, line, short_rod
 
 import livepde as lp
 from benchmarks.silent import unjudged
+from livepde import cases
+from livepde.cases.remedies import start_missed
 from livepde.runs import clock_findings, input_findings, sampling_findings, verdict
 from livepde.stepping import Advance, simulate
-from livepde.verdict import Cause, Verdict
+from livepde.verdict import Cause, Finding, Verdict
 
 SOURCE = Path(lp.__file__).parent
 ISSUE = ("Finding", "_each")  # calls with the kind of a finding as their first argument
@@ -280,7 +283,17 @@ def missing(loss: float) -> list[str]:
     return of_data(warned.run(warned.rod(lp.Normal(0.2, 0.1)), truth, verdict=False))
 
 
+def started(initial: str) -> list[str]:
+    """Return the finding on the start of a case that is doubted, and states an initial state."""
+    with TemporaryDirectory() as folder:
+        settings = {"initial": initial}
+        prepared = cases.load(short_rod(Path(folder), 10), settings=settings).prepare()
+        doubted = Verdict.of([Finding("misfit", "caution", "It misfits.")])
+        return [finding.what for finding in start_missed(prepared, doubted)]
+
+
 RUNS = {
+    "remedies: start": Pair(partial(started, "90 degC"), partial(started, "interpolate")),
     "assess: misfit": Pair(partial(rod, "offset"), rod),
     "assess: following": Pair(partial(rod, "slow noise"), rod),
     "assess: start": Pair(partial(rod, u0=0.06), rod),

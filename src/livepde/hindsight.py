@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from itertools import groupby
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from livepde.laws import Belief, FixedInterval, Problem, Status
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
-from livepde.records import SMOOTHED, Record, bare
+from livepde.records import INTERVAL_ENDS, SMOOTHED, Record, bare, interval_95
 from livepde.result import Estimate, Result
 from livepde.stepping import End, Interval
 
@@ -145,14 +145,19 @@ class LinearReadings:
 
 
 def with_smoothed(data: xr.Dataset, smoothed: xr.Dataset) -> xr.Dataset:
-    """Return the dataset of a run with added variables `k_smoothed` and `k_smoothed_std`.
+    """Return the dataset of a run with added `k_smoothed`, `k_smoothed_std`, and interval ends.
 
     `smoothed`: smoothed dataset of the same samples, as `Identifier.smoothed` returns it.
     """
-    attrs, found = data.attrs, {}
+    attrs, found = data.attrs, dict[str, Any]()
     own = {*attrs["scalars"].split("\n"), *attrs["fields"].split(), *attrs["state"].split()}
     for key, variable in smoothed.data_vars.items():
         name = key if key in own else bare(str(key))
         if name in own:
             found[f"{name}{SMOOTHED}{str(key).removeprefix(str(name))}"] = variable.variable
-    return data.assign(found)
+    data = data.assign(found)
+    for name in (key for key in found if f"{key}_std" in data and f"{key}_low" not in data):
+        about = data[f"{name}_std"]
+        for end, values in zip(INTERVAL_ENDS, interval_95(data, name), strict=True):
+            data[f"{name}{end}"] = (about.dims, values, about.attrs)
+    return data

@@ -588,7 +588,8 @@ class Identifier(Shown):
     ) -> Callable[[], Verdict]:
         """Return the verdict of the law with the findings on steps, validation sensors and gaps."""
         validation, gaps, steps = self._validation, self._gaps, self._steps
-        names, ignored = self.validation.names if self.validation is not None else (), self.ignored
+        known, ignored = self.validation, self.ignored
+        names, units = ((), ()) if known is None else (known.names, known.units)
         inputs = self._channels.inputs
         if not names and not steps.irregular and gaps.silent:
             return judge
@@ -596,7 +597,7 @@ class Identifier(Shown):
         def found() -> Verdict:
             held = gaps.findings(inputs, diagnose().shifts)
             return judge().with_findings(
-                [*steps.findings(), *validation.findings(names, ignored), *held]
+                [*steps.findings(), *validation.findings(names, ignored, units), *held]
             )
 
         return found

@@ -52,6 +52,7 @@ TOKEN = "LIVEPDE_TOKEN"  # which opens the page and /health, and is no password 
 LOG = logging.getLogger("livepde.run")
 FAR = 3.0  # ranges of the other values of a row: a value beyond has to be confirmed
 START = "start"  # kind of remark on values of the first rows
+BEGIN = "begin"  # that on rows before the first value of an input
 LATE = (
     "late requires complete data. For a live source, delay the other channels at the source, or "
     "correct the clock."
@@ -98,18 +99,31 @@ def read_data(
     source: str | Iterable[str] | None,
 ) -> DataTable | JsonLines:
     """Return the data: of the case's file, another file, or lines of JSON as they come."""
-    late = delays(case)
     found = _all_read(case, columns, clock, source)
     if isinstance(found, JsonLines):
         refuse_late(case)
-    if not late or isinstance(found, JsonLines):
         return found
+    tables = _on_time(case, columns, found)
+    return tables[0] if len(tables) == 1 else _merged(case, tables, columns)
+
+
+def _on_time(
+    case: CaseContent, columns: Mapping[str, Column], tables: list[DataTable]
+) -> list[DataTable]:
+    """Return tables, those with late channels as several with the times that these should have."""
+    late = delays(case)
+    if not late:
+        return tables
     from livepde.streams.join import not_late
 
     # The noise of a reading has its time.
-    noise = {name: late[of] for name, one in columns.items() if (of := one.noise_of) in late}
-    may_lack = {*case.roles(*SENSORS), *noise}
-    return _merged(case, not_late(found, late | noise, may_lack), columns)
+    late |= {name: late[of] for name, one in columns.items() if (of := one.noise_of) in late}
+    may_lack = {*case.roles(*SENSORS), *(late.keys() - case.spec.channels.keys())}
+    each = (
+        not_late(table, {name: late[name] for name in table.names if name in late}, may_lack)
+        for table in tables
+    )
+    return [part for parts in each for part in parts]
 
 
 def delays(case: CaseContent) -> dict[str, float]:
@@ -136,16 +150,17 @@ def _all_read(
     columns: Mapping[str, Column],
     clock: Clock,
     source: str | Iterable[str] | None,
-) -> DataTable | JsonLines:
+) -> list[DataTable] | JsonLines:
+    """Return the tables of all files, before they are joined."""
     spec = case.spec.data
     if source is None and isinstance(spec.file, tuple):
-        return _joined(case, spec.file, columns)
+        return _of_files(case, spec.file, columns)
     check_hours(case, clock, spec.file if source is None else source)
     if not isinstance(source, str | None):
         return JsonLines(source, columns, clock, every=spec.every, missing=spec.missing)
     if source is None and case.reader is not None:
-        return _from_reader(case, case.reader, columns, clock)
-    return _read(data_file(case) if source is None else Path(source), columns, clock, spec)
+        return [_from_reader(case, case.reader, columns, clock)]
+    return [_read(data_file(case) if source is None else Path(source), columns, clock, spec)]
 
 
 def check_hours(case: CaseContent, clock: Clock, source: Any) -> None:
@@ -173,10 +188,10 @@ def _read(path: Path, columns: Mapping[str, Column], clock: Clock, spec: DataSpe
     return read_csv(path, columns, clock, **rows, **written)
 
 
-def _joined(
+def _of_files(
     case: CaseContent, files: Sequence[FileSpec], columns: Mapping[str, Column]
-) -> DataTable:
-    """Return several files as one table, joined by time; each channel comes from one of them."""
+) -> list[DataTable]:
+    """Return several files as tables; each channel comes from one of them."""
     specs = [case.spec.data.of(file) for file in files]
     paths = [_found(case, str(spec.file)) for spec in specs]
     headers = list(map(partial(_header, case), specs, paths))
@@ -192,7 +207,7 @@ def _joined(
         if not own:
             raise case.error("data.file", f"no channel has a column of {path}; leave it out.")
         tables.append(_read(path, own, clock_of(case, spec), spec))
-    return _merged(case, tables, columns)
+    return tables
 
 
 def _merged(
@@ -288,9 +303,35 @@ def _comparable(case: CaseContent, names: Sequence[str]) -> list[list[int]]:
     return [*groups.values()]
 
 
+def _from_first_inputs(case: CaseContent, table: DataTable) -> DataTable:
+    """Return a record from the first row on where all inputs have had a value.
+
+    Raises `CaseError` if one never has.
+    """
+    known, begin, remarks = np.isfinite(table.values), 0, dict(table.remarks)
+    for k, name in enumerate(table.names):
+        channel = case.spec.channels.get(name)
+        # A mean since the last row is needed at the next one; rows to skip are skipped anyway.
+        if not (channel and channel.drives) or channel.between == "next" or channel.gaps == "skip":
+            continue
+        if not known[:, k].any():
+            raise case.error(
+                f"channels.{name}",
+                "its column has no value, and the model needs it: choose another column, or a "
+                "shorter time with `data.start` and `data.stop`.",
+            )
+        if first := int(known[:, k].argmax()):
+            remarks[BEGIN, name] = first
+            begin = max(begin, first)
+    if not begin:
+        return table
+    return replace(table, t=table.t[begin:], values=table.values[begin:], remarks=remarks)
+
+
 def without_gaps(case: CaseContent, table: DataTable) -> DataTable:
     """Return a finished record without gaps and spikes of the channels that drive the model."""
-    table, channels = without_wild_start(case, table), case.spec.channels
+    table = _from_first_inputs(case, without_wild_start(case, table))
+    channels = case.spec.channels
     interpolated = [name for name, item in channels.items() if item.gaps == "interpolate"]
     means = [name for name in interpolated if channels[name].between == "next"]
     screened = [name for name, item in channels.items() if item.screened]

@@ -359,10 +359,12 @@ def _sensor(equation: Equation, key: str, name: str, values: Array) -> FoundChan
     if equation.components:
         given["of"] = equation.components[0]
         told.append(f"of {' or '.join(equation.components)}")
-    stated = IN_BRACKETS.search(name)
+    stated, unit = IN_BRACKETS.search(name), ""
     if stated and not PLACE.fullmatch(stated[1].strip()):
         unit = unit_in(name, equation.state.unit, IN_BRACKETS) or f"{BLANK} {stated[1]}"
-        given |= {"unit": unit} if unit != equation.state.unit else {}
+    elif not stated and (suffix := SUFFIX.search(name)) and len(suffix["unit"]) > 1:
+        unit = unit_in(name, equation.state.unit, SUFFIX)  # T_in_degF, but not T_K or T_C
+    given |= {"unit": unit} if unit not in ("", equation.state.unit) else {}
     return FoundChannel(key, given, (name,), ", ".join(told))
 
 

@@ -355,9 +355,12 @@ def conditioned(case: CaseContent) -> CaseContent:
     units = equation.fluxes
     if units is None:
         keys = [f"boundary.{name}" for name in given] + [f"sources.{n}" for n in spec.sources]
-        key = next(iter(keys), f"channels.{next(iter(shifted), '')}.offset")
+        if not keys:
+            key = f"channels.{next(iter(shifted))}.offset"
+            text = f"the offset of a boundary value of '{equation.name}' cannot be an unknown; "
+            raise case.error(key, text + "leave it out, or correct the column with `data.reader`.")
         text = f"the equation '{equation.name}' takes no fluxes and no sources of a case; "
-        raise case.error(key, text + "'livepde equations' lists those that do.")
+        raise case.error(keys[0], text + "take another equation, such as 'heat'.")
     names = _ConditionNames(case)
     boundary = {name: _passing(names, units, name, item) for name, item in given.items()}
     for name, channel in shifted.items():

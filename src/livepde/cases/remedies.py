@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from livepde.cases.read import settings_in, toml_key, toml_value
-from livepde.verdict import Cause, Finding, Verdict, channel_setting
-from livepde.verdict.sentences import ESTIMATED, LIKELY, estimating
+from livepde.verdict import Cause, Finding, Severity, Verdict, channel_setting
+from livepde.verdict.sentences import ESTIMATED, FINDINGS, LIKELY, amount_of, estimating
 
 if TYPE_CHECKING:
     from livepde.cases.case import Case, Prepared
@@ -24,6 +24,8 @@ KEYS = {kind: key for kind, (_, key) in ESTIMATED.items()}
 # Errors with a size that a fit could find.
 SIZED = ("boundary", "channel", "drift", "flux", "lag", "loss", "source")
 STATED = ("factor", "late")  # keys of a channel whose stated value a cause does not replace
+MISSED = 5.0  # times the noise that the first readings may miss a stated start
+JUMPED = "The run may allow for jumps, and has found none."
 NO_SETTING = "This case has no setting to estimate it."
 
 
@@ -35,6 +37,8 @@ def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
 
     def named(cause: Cause) -> Cause:
         settings = freed(prepared, cause)
+        if cause.kind == "jump" and _jumps(prepared.case):
+            settings = ()
         cause = _with_remedy(prepared.case, cause, settings)
         if settings:
             return replace(cause, setting="; ".join(settings))
@@ -45,13 +49,39 @@ def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
     def settled(finding: Finding) -> Finding:
         return replace(finding, causes=tuple(map(named, finding.causes)))
 
-    return replace(verdict, findings=tuple(map(settled, verdict.findings)))
+    found = tuple(map(settled, verdict.findings))
+    gaps = next((one.remedy for one in found if one.what == "input" and one.remedy), "")
+    if gaps:  # readings are missed where an input is a guess: they are not what to correct
+        found = tuple(
+            replace(one, remedy=f"{gaps} Then judge the readings again.")
+            if one.what == "refused"
+            else one
+            for one in found
+        )
+    return replace(verdict, findings=found)
+
+
+def start_missed(prepared: Prepared, verdict: Verdict) -> list[Finding]:
+    """Return the finding of a stated start that the first readings miss, in a doubted run."""
+    settings, missed = _initial(prepared), first_miss(prepared)
+    noise = prepared.identifier.observed.noise
+    doubted = verdict.level in ("caution", "do not trust")
+    if not (settings and doubted and noise is not None and missed > MISSED * np.median(noise)):
+        return []
+    unit = prepared.case.equation.state.unit
+    text, remedy = FINDINGS["start, missed"].filled(
+        missed=amount_of(missed, unit), setting=settings[0]
+    )
+    severity: Severity = "do not trust" if verdict.level == "do not trust" else "caution"
+    return [Finding("start", severity, text, "", missed, remedy=remedy)]
 
 
 def _with_remedy(case: Case, cause: Cause, settings: tuple[str, ...]) -> Cause:
     """Return a cause whose remedy has the setting, for an error of a sensor or of the start."""
     if cause.kind == "initial" and settings and settings != settings_in(cause.setting):
         return replace(cause, remedy=f"Specify its uncertainty: `{settings[0]}`.")
+    if cause.kind == "jump" and _jumps(case):
+        return replace(cause, setting="", remedy=JUMPED)
     if cause.kind not in KEYS or cause.subject not in case.roles("sensor"):
         return cause
     if settings == settings_in(cause.setting):  # the remedy has the value, and its unit
@@ -60,6 +90,11 @@ def _with_remedy(case: Case, cause: Cause, settings: tuple[str, ...]) -> Cause:
         return replace(cause, remedy=LIKELY[cause.kind].remedy.format(name=cause.subject))
     value = settings[0].partition("=")[2]
     return replace(cause, remedy=estimating(cause.kind, cause.subject, value))
+
+
+def _jumps(case: Case) -> bool:
+    law = case.spec.law
+    return law.kind == "sensitivity" and bool(law.jumps)
 
 
 def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:

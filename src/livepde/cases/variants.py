@@ -36,6 +36,7 @@ AS_STATED = "as stated"
 GAINED = 3.0  # of log evidence: strong evidence (Kass and Raftery 1995), 20 to 1
 SAME = 1e-9  # of the length of a run: times that differ by less are one moment
 WORSE = 0.02  # share by which the error of validation sensors may grow: about its own error
+USABLE = ("trusted", "caution")
 MOST = 12  # variants that the program chooses
 SAMPLES = 64  # in which a source moves the state by the usual error
 NAMES = {  # kind of cause -> name of the variant
@@ -50,6 +51,7 @@ NAMES = {  # kind of cause -> name of the variant
     "initial": "uncertain start",
     "sensor": "without {}",
     "stuck": "without {}",
+    "drift": "without {}",
     "unit": "unit of {}",
 }
 
@@ -323,9 +325,12 @@ def recommended(base: VariantRun, others: Sequence[VariantRun]) -> VariantRun:
     """Return the variant with the best evidence that predicts the validation sensors no worse.
 
     Of several whose evidence is no strong one against each other it is the one with the fewest
-    unknowns; the case itself if none has strong evidence against it.
+    unknowns; the case itself if none has strong evidence against it. One that is not to be trusted
+    is of no use where another one with strong evidence is.
     """
     fair = [one for one in others if not _worse(one, base)]
+    useful = [one for one in fair if one.level in USABLE and one.gained(base) > GAINED]
+    fair = useful or fair
     best = max((one.gained(base) for one in fair if not math.isnan(one.gained(base))), default=0.0)
     if not best > GAINED:
         return base
@@ -429,6 +434,7 @@ def _disagreements(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[s
 def proposed(prepared: Prepared, base: VariantRun, most: int = MOST) -> list[Variant]:
     """Return variants of a case, the likely causes of the verdict of its run first, each once."""
     found: dict[frozenset[str], Variant] = {}
+    start = [Variant(NAMES["initial"], freed(prepared, Cause("initial", "", "")))]
     likely = [
         Variant(
             NAMES.get(cause.kind, cause.kind + " of {}").format(cause.subject),
@@ -436,7 +442,9 @@ def proposed(prepared: Prepared, base: VariantRun, most: int = MOST) -> list[Var
         )
         for cause in base.causes
     ]
-    for variant in (*likely, *_usual(prepared, base)):
+    # A start that the first readings miss looks like many other errors.
+    missed = first_miss(prepared) > _usual_error(base)
+    for variant in (*(start if missed else []), *likely, *_usual(prepared, base)):
         if variant.settings:
             # The same keys with another prior are no other variant.
             keys = frozenset(setting.partition("=")[0] for setting in variant.settings)
@@ -472,8 +480,6 @@ def _process(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     error, table = _usual_error(base), prepared.raw
     if not (isinstance(table, DataTable) and len(table) > 1 and error > 0.0):
         return
-    if first_miss(prepared) > error:
-        yield Variant(NAMES["initial"], freed(prepared, Cause("initial", "", "")))
     time = SAMPLES * float(np.median(np.diff(table.t)))
     for kind, size in (("source", error / time), ("loss", 0.1 / time)):
         yield Variant(kind, freed(prepared, Cause(kind, "", "", size=size)))

@@ -66,11 +66,16 @@ def check(
 
 
 def _refused(prepared: Prepared) -> list[str]:
-    """Return sentences on values of input channels that a run will refuse."""
+    """Return sentences on values of input channels that a run will refuse, or make up."""
     texts = {
         "start": "{name}: the first {n} values are outliers. A run counts them as missing.",
         "spike": "{name}: {n} values are spikes. A run rejects them. To use them, set "
         '`channels.{name}.spikes = "keep"`.',
+        "begin": "{name}: the first {n} rows have no value. A run leaves them out.",
+        "bridged": "{name}: {n} values are missing in long gaps. A run interpolates them. To leave "
+        'these rows out, set `channels.{name}.missing = "skip"`.',
+        "ended": "{name}: the last {n} rows have no value. A run holds the one before. To end the "
+        "run before them, set `data.stop`.",
     }
     remarks = getattr(prepared.stream, "remarks", {})
     return [

@@ -320,7 +320,7 @@ def concluded(
 def _judged(prepared: Prepared, driven: Driven, dataset: xr.Dataset) -> Verdict:
     """Return the verdict on a run, with settings of the case that would remedy what was found."""
     from livepde import runs
-    from livepde.cases.remedies import with_settings
+    from livepde.cases.remedies import start_missed, with_settings
 
     raw, journal = prepared.raw, driven.journal
 
@@ -332,7 +332,8 @@ def _judged(prepared: Prepared, driven: Driven, dataset: xr.Dataset) -> Verdict:
         *runs.clock_findings(journal),
         *runs.input_findings(journal, prepared.case.roles("boundary", "input")),
     ]
-    return with_settings(prepared, runs.verdict(dataset).with_findings(found))
+    verdict = runs.verdict(dataset).with_findings(found)
+    return with_settings(prepared, verdict.with_findings(start_missed(prepared, verdict)))
 
 
 def _with_smoothed(

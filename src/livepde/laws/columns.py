@@ -30,6 +30,7 @@ from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import Cause, channel_setting
+from livepde.verdict.directions import boundary_lifts
 from livepde.verdict.sentences import LIKELY, amount_of, estimating, table_of
 
 MOST_ROWS = 600  # samples that are looked at, from the start of the stored ones
@@ -228,8 +229,11 @@ class Columns:
         return values[np.isfinite(values)]
 
     def unit(self, name: str) -> str:
-        """Return the unit of a sensor; empty for inputs, where it is not known."""
-        observed = self.work.filter.problem.observed
+        """Return the unit of a sensor, or of the state for its boundary values; else empty."""
+        problem = self.work.filter.problem
+        observed, single = problem.observed, problem.model.state_space.single
+        if single and name in self.inputs and name in boundary_lifts(problem.model):
+            return observed.unit
         return dict(zip(observed.names, observed.units, strict=True)).get(name, "")
 
     @property

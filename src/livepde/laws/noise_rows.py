@@ -363,7 +363,7 @@ def initial_rows(
 
 
 def rows_of_sensors(problem: Problem, reduction: Reduction) -> IntArray:
-    """Return which of the initial rows are the noise of a sensor, as it is stated for the sensor."""
+    """Return which of the initial rows are the noise of a reading, as its sensor states it."""
     readings = problem.initial_readings.items()
     of_sensor = [name in problem.observed.names and np.isnan(one.noise) for name, one in readings]
     return reduction.size + np.flatnonzero(of_sensor)

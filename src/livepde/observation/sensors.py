@@ -37,8 +37,9 @@ class _Shift:
     The quadratic interpolates the values at -a, 0 and b (`below`, `above`), about a standard
     deviation to each side. A derivative is not used because u has none at a node of linear
     elements. At the end of the mesh a or b is 0, and the interpolant is the straight line to the
-    other side; where both are, at the top of a disc say, the shift has no effect. The rows `low` and `high` evaluate the differences of u there to u at 0, shape (1,
-    n); `column` is the position of the shift in q.
+    other side; where both are, at the top of a disc say, the shift has no effect. The rows `low`
+    and `high` evaluate the differences of u there to u at 0, shape (1, n); `column` is the position
+    of the shift in q.
     """
 
     sensor: int

@@ -426,7 +426,14 @@ def _vtk(run: Run, path: Path, at: float | None) -> None:
     import meshio
 
     data = _with_fields(run)
-    k = -1 if at is None else int(np.abs(data["snapshot"].values - at).argmin())
+    k = -1
+    if at is not None:
+        first, last = float(data["snapshot"][0]), float(data["time"].max())
+        if not min(first, float(data["time"].min())) <= at <= last:
+            raise ConfigurationError(
+                f"{path.name}: t = {at:g} is outside of the run, from {first:g} to {last:g}."
+            )
+        k = int(np.abs(data["snapshot"].values - at).argmin())
     meshio.write(path, meshio.Mesh(*_mesh(data), point_data=_fields(data, k)))
 
 

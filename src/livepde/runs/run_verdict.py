@@ -32,6 +32,7 @@ from livepde.verdict import (
     Shifts,
     Verdict,
     at_bound,
+    channel_setting,
     discretised,
     flat,
 )
@@ -53,7 +54,10 @@ INPUT_KINDS = {
     "start": "first values were outliers and count as missing",
     "spike": "spikes were rejected",
     "interpolated": "missing values were interpolated",
-    "missing": "missing values were replaced by the last one",
+    "bridged": "values in long gaps were interpolated",
+    "ended": "values at the end were missing: the last one before them was held",
+    "missing": "values were missing: the last one before them was held",
+    "begin": "rows at the start were left out: they have no value of it, and none is known yet",
 }
 
 
@@ -104,9 +108,14 @@ def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
         parts = [f"{counts[kind]} {text}" for kind, text in INPUT_KINDS.items() if counts.get(kind)]
         if not parts:
             continue
-        held = counts.get("missing", 0) / max(len(journal), 1)
-        text, _ = FINDINGS["input, counts"].filled(name=name, counts=", ".join(parts))
-        found.append(Finding("input", "note", text, name, held))
+        held = (counts.get("missing", 0) + counts.get("ended", 0)) / max(len(journal), 1)
+        kind = next((kind for kind in ("bridged", "ended") if counts.get(kind)), "counts")
+        text, remedy = FINDINGS[f"input, {kind}"].filled(
+            name=name,
+            counts=", ".join(parts),
+            skip=channel_setting(name, "missing", '"skip"'),
+        )
+        found.append(Finding("input", "note", text, name, held, remedy=remedy))
     return found
 
 

@@ -40,6 +40,7 @@ CENTRE, NEIGHBOURS = 2, 5  # of the five values that make a residual
 LEFT = 0.2  # share of a residual that may remain without a spike; of a step's 0.3 remains
 SHORT = 1.0 / 16.0  # of the usual interval: two rows nearer than this may write a step
 STAYS = 0.5  # of a step: what the values before and after it may change
+LONG = 10  # rows of a gap beyond which it is told apart: what the channel did there is unknown
 ROUNDING = 1e-12  # of the largest value of a channel: less is no residual
 ABOUT = 3  # values on each side that have to be plausible without a spike
 GAUSS = 1.4826  # standard deviation over median absolute deviation of Gaussian noise
@@ -227,6 +228,15 @@ def _from_next(x: Array) -> tuple[Array, Mask]:
     return found, np.isnan(x) & np.isfinite(found)
 
 
+def _long(gaps: Mask) -> Mask:
+    """Return which rows are in gaps of more than `LONG` rows."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], gaps, [False]]).astype(int)))
+    found = np.zeros_like(gaps)
+    for first, last in edges.reshape(-1, 2).tolist():
+        found[first:last] = last - first > LONG
+    return found
+
+
 def fill_table(
     table: DataTable,
     interpolated: Iterable[str],
@@ -237,9 +247,10 @@ def fill_table(
 ) -> DataTable:
     """Return a finished record without gaps between known values, and without spikes.
 
-    Its remarks count interpolated values as "interpolated", refused ones as "spike" and remaining
-    gaps as "missing". Readings of the channels `means` are means since the last one: a gap is part
-    of the next mean.
+    Its remarks count interpolated values as "interpolated", or as "bridged" in gaps of more than
+    `LONG` rows, refused ones as "spike", those after the last value as "ended" if they are as many,
+    and remaining gaps as "missing". Readings of the channels `means` are means since the last one:
+    a gap is part of the next mean.
     """
     values, remarks = table.values.copy(), dict(table.remarks)
     fills, screens, of_means = set(interpolated), set(screened), set(means)
@@ -255,8 +266,13 @@ def fill_table(
         if name not in fills:
             column[gaps], gaps = math.nan, np.zeros_like(gaps)
         values[:, k] = column
-        left = np.isnan(column).sum()
-        counts = {"spike": spikes.sum(), "interpolated": gaps.sum(), "missing": left}
+        known = np.flatnonzero(np.isfinite(column))
+        after = len(column) - 1 - int(known[-1]) if len(known) else 0
+        ended = after if after > LONG else 0
+        left = np.isnan(column).sum() - ended
+        bridges = _long(gaps).sum()
+        counts = {"spike": spikes.sum(), "interpolated": gaps.sum() - bridges, "bridged": bridges}
+        counts |= {"ended": ended, "missing": left}
         remarks |= {(kind, name): int(number) for kind, number in counts.items() if number}
     return replace(table, values=values, remarks=remarks)
 

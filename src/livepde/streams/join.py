@@ -89,7 +89,7 @@ def not_late(
     """Return a table as several, in which the times of late channels are earlier.
 
     A channel without values stays where it is. A sensor whose times are early has no value at the
-    start of the table, which begins as before; an input has to be known from the start.
+    start of the others, which begin as before; an input has to be known from the start.
 
     `late`: channel -> how much later than its values its times are, in the unit of the times.
     `sensors`: channels that may be missing.
@@ -103,7 +103,7 @@ def not_late(
         values = table.values[:, table.names.index(name)]
         known = np.isfinite(values)
         t, own = table.t[known] - by, values[known, None]
-        if name in sensors and t[0] > table.t[0]:
+        if names and name in sensors and t[0] > table.t[0]:
             t, own = np.append(table.t[:1], t), np.vstack([np.full((1, 1), np.nan), own])
         found.append(replace(table, t=t, values=own, names=(name,), remarks={}))
     return found

@@ -355,7 +355,9 @@ class ValidationLedger:
         last = np.where(seen, error, self.last)
         return ValidationLedger(self.sums + np.where(seen, rows, 0.0), last)
 
-    def findings(self, names: Sequence[str], ignored: Collection[str] = ()) -> Iterator[Finding]:
+    def findings(
+        self, names: Sequence[str], ignored: Collection[str] = (), units: Sequence[str] = ()
+    ) -> Iterator[Finding]:
         """Return which sensors, but ignored ones, are missed by more than is allowed.
 
         That is prediction and noise.
@@ -379,7 +381,11 @@ class ValidationLedger:
                 continue
             size, mean = math.sqrt(squares / count), errors / count
             text, _ = FINDINGS["validation"].filled(
-                name=name, size=size, mean=mean, ratio=math.sqrt(ratio)
+                name=name,
+                size=size,
+                mean=mean,
+                ratio=math.sqrt(ratio),
+                unit=f" {units[k]}".replace("degC", "K") if units and units[k] else "",
             )
             likely, remedy = LIKELY["validation"].filled(name=name)
             cause = self._unit(k, name) or Cause("validation", name, likely, remedy=remedy)

@@ -149,7 +149,8 @@ class ModelErrors:
     def sentence(self, *, doubted: bool) -> str:
         """Return fit and effect in words."""
         signal = 100.0 * self.of_signal
-        fit = f"Residuals are {self.misfit:.2g} times the noise and {signal:.2g} % of the signal."
+        share = f"{signal:.0f}" if signal >= 99.5 else f"{signal:.2g}"
+        fit = f"Residuals are {self.misfit:.2g} times the noise and {share} % of the signal."
         if self.failed:
             return f"The fit failed. {fit}"
         # Of many unknowns those are listed whose error may be largest.

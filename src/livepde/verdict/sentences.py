@@ -163,8 +163,8 @@ FINDINGS: dict[str, Sentence] = {
         f"Check these sensors, {RAISE_GATE}",
     ),
     "validation": Sentence(
-        "The prediction of {name} (validation sensor) has an error of {size:.2g} (mean "
-        "{mean:+.2g}), {ratio:.1f} times what prediction and noise allow."
+        "The prediction of {name} (validation sensor) has an error of {size:.2g}{unit} (mean "
+        "{mean:+.2g}{unit}), {ratio:.1f} times what prediction and noise allow."
     ),
     # --- inputs
     "input, start": Sentence(
@@ -183,6 +183,16 @@ FINDINGS: dict[str, Sentence] = {
         "Interpolate {name} where the next value is known, or sample it more often.",
     ),
     "input, counts": Sentence("Input {name}: {counts}."),
+    "input, bridged": Sentence(
+        "Input {name}: {counts}.", "To leave out the rows in the gaps of {name}, set `{skip}`."
+    ),
+    "input, ended": Sentence(
+        "Input {name}: {counts}.", "To end the run at the last value of {name}, set `data.stop`."
+    ),
+    "start, missed": Sentence(
+        "The first readings miss the stated initial state by {missed} (root mean square).",
+        "Specify its uncertainty: `{setting}`.",
+    ),
     "hold": Sentence(
         'Inputs are held between readings (`between = "hold"` or `"next"`), but vary smoothly. '
         "Linear interpolation would shift the unknowns by {total:.1f} standard deviations{each}. "
@@ -348,7 +358,8 @@ def table_of(name: str) -> str:
 
 def quoted(name: str) -> str:
     """Return the name of a channel as a key of TOML."""
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
+    plain = re.fullmatch(r"[A-Za-z0-9_-]+", name)
+    return name if plain else json.dumps(name, ensure_ascii=False)
 
 
 def estimating(kind: str, name: str, value: str) -> str:

@@ -1,0 +1,137 @@
+"""Where a table begins, ends or has gaps, and files whose clocks differ."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from factories import short_rod
+
+from livepde import cases
+from livepde.cases.case import Prepared
+from livepde.cases.measured import measured
+from livepde.cases.new_case import channels_in
+from livepde.cases.remedies import start_missed, with_settings
+from livepde.cli.check import _refused
+from livepde.errors import CaseError
+from livepde.models import EQUATIONS
+from livepde.runs import input_findings
+from livepde.verdict import Cause, Finding, Verdict
+
+ROWS = 61
+
+
+def changed(folder: Path, change: Any, **settings: object) -> Prepared:
+    path = short_rod(folder, ROWS)
+    table = pd.read_csv(path.parent / "rod.csv")
+    change(table)
+    table.to_csv(path.parent / "rod.csv", index=False)
+    return cases.load(path, settings=settings).prepare()
+
+
+def without(name: str, rows: slice) -> Any:
+    def change(table: pd.DataFrame) -> None:
+        table.loc[table.index[rows], name] = np.nan
+
+    return change
+
+
+def noted(prepared: Prepared) -> list[Finding]:
+    rows: Any = type("Rows", (list,), {})(range(ROWS))
+    rows.counts = prepared.stream.remarks  # type: ignore[attr-defined]
+    return input_findings(rows, ["T_left"])
+
+
+def test_a_run_begins_where_all_inputs_have_a_value(tmp_path):
+    plain = changed(tmp_path / "plain", lambda table: None)
+    found = changed(tmp_path / "late", without("T_left", slice(20)))
+    assert plain.raw is not None
+    np.testing.assert_array_equal(found.stream.t, plain.raw.t[20:])
+    (note,) = noted(found)
+    assert "20 rows at the start were left out" in note.text
+    assert any("T_left: the first 20 rows have no value" in text for text in _refused(found))
+
+
+def test_an_input_without_any_value_is_refused_in_terms_of_the_case(tmp_path):
+    with pytest.raises(CaseError, match=r"channels\.T_left: its column has no value"):
+        changed(tmp_path, without("T_left", slice(None)))
+
+
+@pytest.mark.parametrize(
+    ("rows", "said", "remedy"),
+    [
+        (slice(20, 35), "15 values in long gaps were interpolated", 'T_left.missing="skip"'),
+        (slice(40, None), "21 values at the end were missing", "data.stop"),
+        (slice(20, 25), "5 missing values were interpolated", ""),
+    ],
+)
+def test_a_long_gap_of_an_input_is_the_first_to_be_mended(tmp_path, rows, said, remedy):
+    prepared = changed(tmp_path, without("T_left", rows))
+    (note,) = noted(prepared)
+    assert said in note.text
+    assert remedy in note.remedy
+    assert bool(note.remedy) == bool(remedy)
+    key = remedy.partition("=")[0]
+    assert any(key in text for text in _refused(prepared)) == bool(remedy)
+    refused = Finding("refused", "caution", "The gate rejected readings.", remedy="Check them.")
+    both = with_settings(prepared, Verdict.of([refused, note]))
+    shown = next(one for one in both.findings if one.what == "refused")
+    assert shown.remedy.startswith(note.remedy or "Check them.")
+
+
+def test_the_clock_of_one_of_several_files_is_corrected_before_they_are_joined(tmp_path):
+    path = short_rod(tmp_path / "plain", ROWS)
+    plain = cases.load(path).prepare().raw
+    assert plain is not None
+    table = pd.read_csv(path.parent / "rod.csv")
+    time, others = table.columns[0], [name for name in table.columns[1:] if name != "T_left"]
+    # Further apart than the record is long: without `late` they have no time in common.
+    for shift in (100.0, 1e6):
+        ahead = table[[time, "T_left"]].assign(**{time: table[time] + shift})
+        ahead.to_csv(path.parent / "ends.csv", index=False)
+        table[[time, *others]].to_csv(path.parent / "sensors.csv", index=False)
+        settings = {
+            "data.file": ["sensors.csv", "ends.csv"],
+            "channels.T_left.late": f"{shift} s",
+        }
+        found = cases.load(path, settings=settings).prepare().raw
+        assert found is not None
+        np.testing.assert_allclose(found.t, plain.t)
+        columns = [found.names.index(name) for name in plain.names]
+        np.testing.assert_allclose(found.values[:, columns], plain.values)
+
+
+def test_a_start_that_the_first_readings_miss_is_named(tmp_path):
+    prepared = changed(tmp_path, lambda table: None, initial="90 degC")
+    doubted = Verdict.of([Finding("misfit", "caution", "It misfits.")])
+    (found,) = start_missed(prepared, doubted)
+    assert "miss the stated initial state by" in found.text
+    assert 'initial={ from = "90 degC", std' in found.remedy
+    assert not start_missed(prepared, Verdict.of([]))
+    near = changed(tmp_path / "near", lambda table: None)
+    assert not start_missed(near, doubted)
+
+
+def test_jumps_that_are_allowed_already_are_no_advice(tmp_path):
+    cause = Cause("jump", "k", "k may have changed", 1.0, "Allow jumps.", "law.jumps=true")
+    verdict = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=(cause,))])
+    for jumps, said in ((True, "has found none"), (False, "Allow jumps.")):
+        settings: dict[str, object] = {"law.jumps": jumps}
+        prepared = changed(tmp_path / str(jumps), lambda table: None, **settings)
+        (shown,) = with_settings(prepared, verdict).findings[0].causes
+        assert said in shown.remedy
+        assert bool(shown.setting) != jumps
+
+
+def test_a_unit_at_the_end_of_a_name_is_that_of_the_sensor(tmp_path):
+    rows = "\n".join(f"{60 * k},{50 + k},{20 + k},{k}" for k in range(9))
+    path = tmp_path / "wall.csv"
+    path.write_text(f"time_s,T_12cm_degF,T_20cm,T_K\n{rows}\n")
+    found = channels_in(measured(path, "s"), EQUATIONS["heat"])
+    given = {one.name: one.given for one in found}
+    assert given["T_12cm_degF"]["unit"] == "degF"
+    assert "unit" not in given["T_20cm"]
+    assert "unit" not in given["T_K"]
