@@ -11,7 +11,6 @@ parameters with their standard deviations and diagnostics.
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -23,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.processes import usual_environment
 from livepde.cases import Case, load
 from livepde.fem import Channel, Inputs, Normal, interval
 from livepde.models import heat
@@ -165,13 +165,8 @@ def overhead(rounds: int = 5, samples: int = SAMPLES) -> Outcome:
 
 def _first(folder: Path, out: str) -> tuple[float, float]:
     """Return the processor time of a fresh process until its first two estimates."""
-    given = {
-        name: value
-        for name, value in os.environ.items()
-        if name not in ("PYTHONDONTWRITEBYTECODE", "EAGER_IMPORT")
-    }
-    cache = f"pycache_prefix={folder / 'bytecode'}"
-    command = [sys.executable, "-X", cache, "-c", SCRIPT, str(folder / out)]
+    command = [sys.executable, "-c", SCRIPT, str(folder / out)]
+    given = usual_environment(folder / "bytecode")
     done = subprocess.run(
         command, env=given, cwd=folder, capture_output=True, text=True, check=True
     )

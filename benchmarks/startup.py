@@ -8,13 +8,13 @@ as pip does for what it installs.
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from benchmarks.processes import usual_environment
 from livepde.diagnostics.check_report import Check, Table
 from livepde.runs import Outcome
 
@@ -56,11 +56,7 @@ def startup(rounds: int = 15) -> Outcome:
 
 
 def _seconds(code: str, cache: str) -> float:
-    given = {
-        name: value
-        for name, value in os.environ.items()
-        if name not in ("PYTHONDONTWRITEBYTECODE", "EAGER_IMPORT")
-    }
-    command = [sys.executable, "-X", f"pycache_prefix={cache}", "-c", _TIMED.format(code)]
+    command = [sys.executable, "-c", _TIMED.format(code)]
+    given = usual_environment(cache)
     done = subprocess.run(command, env=given, capture_output=True, text=True, check=True)
     return float(done.stdout)

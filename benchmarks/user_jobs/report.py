@@ -17,6 +17,7 @@ import xarray as xr
 from scipy.interpolate import griddata
 
 from benchmarks import ROOT
+from benchmarks.processes import usual_environment
 from benchmarks.user_jobs.data import JOBS, Job, true_field
 from livepde import runs
 from livepde.diagnostics.check_report import Check, Table
@@ -85,29 +86,26 @@ def _measured(job: Job, folder: Path, rounds: int) -> tuple[list[tuple[Timed, Ti
     """Return the times of livepde and of the fit in each round, and their estimates compared."""
     job.write(folder / "all")
     job.write(folder / "few", FEW)
-    times = []
+    times, cache = [], folder / "bytecode"
+    fit = ["benchmarks.user_jobs.fits", job.name, f"{folder}/all"]
+    _livepde(folder, "few", "first", cache)  # these compile the modules
+    _run(fit, cache)
     for number in range(rounds):
-        own, few = (
-            _run(
-                [
-                    "livepde",
-                    "run",
-                    f"{folder}/{part}/case.toml",
-                    "--out",
-                    f"{folder}/{part}{number}",
-                ]
-            )
-            for part in ("all", "few")
-        )
-        whole, printed = _run(["benchmarks.user_jobs.fits", job.name, f"{folder}/all"])
-        fit = json.loads(printed)
-        times.append((Timed(own[0], own[0] - few[0]), Timed(whole, fit["seconds"])))
-    return times, _compared(job, folder / "all0", fit["estimates"])
+        own, few = (_livepde(folder, part, number, cache) for part in ("all", "few"))
+        whole, printed = _run(fit, cache)
+        found = json.loads(printed)
+        times.append((Timed(own[0], own[0] - few[0]), Timed(whole, found["seconds"])))
+    return times, _compared(job, folder / "all0", found["estimates"])
 
 
-def _run(command: Sequence[str]) -> tuple[float, str]:
+def _livepde(folder: Path, part: str, number: int | str, cache: Path) -> tuple[float, str]:
+    case, out = f"{folder}/{part}/case.toml", f"{folder}/{part}{number}"
+    return _run(["livepde", "run", case, "--out", out], cache)
+
+
+def _run(command: Sequence[str], cache: Path) -> tuple[float, str]:
     """Return the processor seconds of a module that runs as a process, and its output."""
-    given = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    given = usual_environment(cache) | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     before = os.times()
     done = subprocess.run(
         [sys.executable, "-m", *command],
