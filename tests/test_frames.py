@@ -109,6 +109,7 @@ def ended(frame: Frame) -> lp.Estimate:
 SHEET = Frame(flat=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("frame", "other"),
     [
@@ -117,7 +118,6 @@ SHEET = Frame(flat=True)
         pytest.param(Frame(), Frame(unit=3600.0), id="seconds"),
         pytest.param(Frame(), Frame(split=True), id="groups"),
         pytest.param(SHEET, replace(SHEET, swapped=True), id="axes"),
-        pytest.param(SHEET, replace(SHEET, swapped=True, mirrored=True), id="turned"),
         pytest.param(SHEET, replace(SHEET, scale=1.0 + 1e-12), id="rounding"),
     ],
 )
@@ -143,6 +143,7 @@ def test_verdict_and_intervals_do_not_depend_on_the_frame(frame: Frame, other: F
         assert ends[0] == pytest.approx(ends[1], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_layers_are_the_same_by_name_and_by_place():
     """Names of cells and of their halves, on which the discretisation is judged, agree."""
 
@@ -161,6 +162,7 @@ def test_layers_are_the_same_by_name_and_by_place():
     np.testing.assert_allclose(by_name, by_place, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_offset_that_is_proposed_is_twice_the_one_that_is_named():
     """Both are those of the fit, and not one of a fit and one of a linear model."""
     rows = [{**row, "b": row["b"] + 2.0} for row in readings()]
@@ -178,6 +180,7 @@ def test_the_offset_that_is_proposed_is_twice_the_one_that_is_named():
     assert f"`offset = {2.0 * cause.size:.2g}`" in cause.remedy
 
 
+@pytest.mark.slow
 def test_members_that_are_stepped_apart_begin_as_single_runs_do():
     """The discretisation is judged from the initial state of each member, and not of the first."""
     places = lp.observation.Calibrated(

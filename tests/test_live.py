@@ -71,12 +71,12 @@ def test_killed_at_any_moment_it_goes_on_as_if_nothing_had_happened(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     for folder in (whole, killed):
         folder.mkdir()
-        write(folder, 400)
+        write(folder, 150)
     undisturbed = live(whole)
     undisturbed.run()
     here = str(Path(__file__).parent)
     rng, kills = np.random.default_rng(1), 0
-    for samples in (0, 120, 0):
+    for samples in (0, 50, 0):
         fuse = str(samples), f"{rng.uniform(0.001, 0.012)}"  # and seconds of a processor
         child = subprocess.run([sys.executable, "-c", CHILD, str(killed), here, *fuse], check=False)
         assert child.returncode in (0, -signal.SIGPROF)
@@ -86,7 +86,7 @@ def test_killed_at_any_moment_it_goes_on_as_if_nothing_had_happened(tmp_path):
     rest.run()
     assert kills == 3
     same(rest.journal, undisturbed.journal)
-    assert rest.journal.accepted == 400
+    assert rest.journal.accepted == 150
 
 
 @pytest.mark.slow

@@ -34,7 +34,7 @@ def test_every_notebook_is_executed_and_kept_without_outputs():
         assert all(cell.get("execution_count") is None for cell in cells(name)), name
 
 
-@pytest.mark.slow
+@pytest.mark.pages
 def test_the_wall_is_known_where_the_average_method_is_not(monkeypatch):
     pytest.importorskip("matplotlib")
     found = executed("wall", monkeypatch)
@@ -49,7 +49,7 @@ def test_the_wall_is_known_where_the_average_method_is_not(monkeypatch):
     assert abs(found["changes"]["first and last two thirds"]) > 0.05  # ISO 9869 asks for more days
 
 
-@pytest.mark.slow
+@pytest.mark.pages
 def test_the_pumping_test_agrees_with_the_theis_equation(monkeypatch):
     pytest.importorskip("matplotlib")
     found = executed("pumping_test", monkeypatch)
@@ -59,7 +59,7 @@ def test_the_pumping_test_agrees_with_the_theis_equation(monkeypatch):
     assert (ours["std"] / theirs["std"]).between(0.7, 3.0).all()
 
 
-@pytest.mark.slow
+@pytest.mark.pages
 def test_the_stream_bed_is_followed_where_a_window_of_waves_mixes_two_flows(monkeypatch):
     pytest.importorskip("matplotlib")
     found = executed("stream_bed", monkeypatch)
@@ -72,7 +72,7 @@ def test_the_stream_bed_is_followed_where_a_window_of_waves_mixes_two_flows(monk
     assert kappas.to_numpy() == pytest.approx(kappas["truth"], rel=0.03)
 
 
-@pytest.mark.slow
+@pytest.mark.pages
 def test_the_thermal_response_agrees_with_superposed_sources(monkeypatch):
     pytest.importorskip("matplotlib")
     found = executed("thermal_response", monkeypatch)
@@ -85,7 +85,7 @@ def test_the_thermal_response_agrees_with_superposed_sources(monkeypatch):
     assert found["std_line"] > 10.0 * ours.loc["k", "std"]  # it takes the power for noise
 
 
-@pytest.mark.slow
+@pytest.mark.pages
 def test_the_battery_agrees_with_a_least_squares_fit(monkeypatch):
     pytest.importorskip("matplotlib")
     found = executed("battery", monkeypatch)
