@@ -698,8 +698,8 @@ def test_a_moment_is_a_number_a_quantity_or_a_date(rod, tmp_path, moment):
     assert np.array_equal(found.point_data["u"], rod.dataset["u"].values[1])
 
 
-def test_a_moment_outside_of_the_run_is_refused(rod, tmp_path):
-    with pytest.raises(ConfigurationError, match="outside of the run, from"):
+def test_a_moment_outside_the_run_is_refused(rod, tmp_path):
+    with pytest.raises(ConfigurationError, match="outside the run, from"):
         call("export", rod.path, tmp_path / "a.vtu", "--at", "2026-04-01 06:02")
 
 

@@ -62,12 +62,7 @@ PACES = np.cumsum(np.where(np.arange(80) < 40, 0.05, 0.125))
         ("plain", EVEN, {}, {}),
         ("plain", PACES, {}, {"between": {"T_0": "hold", "T_1": "next"}}),
         ("layers", EVEN, {}, {"dt_max": 0.02, "between": {"T_1": "hold"}}),
-        (
-            "plain",
-            EVEN,
-            {},
-            {"dt_max": 0.0005},
-        ),  # a sample after 100 substeps, and more than a block
+        ("plain", EVEN[:24], {}, {"dt_max": 0.001}),  # intervals of more steps than a block
         ("offset", EVEN, {"shadows": None}, {"scheme": lp.ImplicitEuler()}),
         ("plain", PACES, {}, {"u0_errors": [1.0, lambda x: x[0]]}),
     ],

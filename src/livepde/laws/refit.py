@@ -21,7 +21,6 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import scipy
-from scipy.special import ndtri
 
 from livepde.laws.assimilation import assimilate
 from livepde.laws.filter_state import FilterState
@@ -464,7 +463,7 @@ def _shift(sizes: Array, g: Array, delta: float) -> float:
 def _normal(count: int, size: int) -> Array:
     """Return a Latin hypercube of points of N(0, I), shape (count, size)."""
     ranks = np.random.default_rng(0).random((count, size)).argsort(axis=0)
-    return np.asarray(ndtri((ranks + 0.5) / count))
+    return np.asarray(scipy.special.ndtri((ranks + 0.5) / count))
 
 
 def _misfit(residuals: Array, readings: Array, used: Mask) -> float:

@@ -431,7 +431,7 @@ def _vtk(run: Run, path: Path, at: float | None) -> None:
         first, last = float(data["snapshot"][0]), float(data["time"].max())
         if not min(first, float(data["time"].min())) <= at <= last:
             raise ConfigurationError(
-                f"{path.name}: t = {at:g} is outside of the run, from {first:g} to {last:g}."
+                f"{path.name}: t = {at:g} is outside the run, from {first:g} to {last:g}."
             )
         k = int(np.abs(data["snapshot"].values - at).argmin())
     meshio.write(path, meshio.Mesh(*_mesh(data), point_data=_fields(data, k)))
