@@ -112,6 +112,7 @@ def test_held_inputs_equal_dense_rows_that_repeat_the_value(law: str) -> None:
     assert low < 0.5 < high
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
 def test_next_is_hold_of_the_shifted_column(law: str) -> None:
     held = identifier(LAWS[law], between=dict.fromkeys(CHANNELS, "hold"))
@@ -225,6 +226,7 @@ def test_a_step_in_two_rows_has_no_curvature(monkeypatch: pytest.MonkeyPatch) ->
     assert shifted(*rows, "line")["input"] > 1.0  # that of a curve with this slope
 
 
+@pytest.mark.slow
 def test_held_inputs_have_no_curvature() -> None:
     times = np.arange(0.0, 4.0, PERIOD)
     for between in ("hold", "next"):

@@ -201,6 +201,7 @@ def test_most_of_those_that_can_be_believed_decide():
         assert found.kept[0].tolist() == used
 
 
+@pytest.mark.slow
 def test_errors_leave_refused_readings_out_and_count_them():
     z = broken(12, -127.0)
     result = rod().run(

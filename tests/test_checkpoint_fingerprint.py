@@ -69,6 +69,7 @@ def begun(**changed: Any) -> lp.Identifier:
     return who
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_a_checkpoint_of_another_problem_is_refused(case):
     changed, message = CASES[case]
@@ -101,6 +102,7 @@ def test_rounding_of_another_machine_does_not_matter():
     rod(**shift).restore(who.dump())
 
 
+@pytest.mark.slow
 def test_another_process_has_the_same_fingerprint(tmp_path):
     begun().save(tmp_path / "a.bin")
     code = "import sys; sys.path.insert(0, sys.argv[1]); import test_checkpoint_fingerprint as t; "

@@ -429,6 +429,7 @@ def test_a_burst_of_rows_a_minute_is_no_leap():
     assert found == [60.0 * k for k in range(30)]
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_rows_that_wait():
     intake = Intake(COLUMNS, Clock("t"), last=-1.0)
     for k in range(20):

@@ -49,6 +49,7 @@ def estimates(model):
     return estimate
 
 
+@pytest.mark.slow
 def test_estimates_are_those_of_the_form_in_the_unknowns():
     plain, named = rod(named=False), rod(named=True)
     assert isinstance(member_stage(named), BandedStage)
@@ -59,6 +60,7 @@ def test_estimates_are_those_of_the_form_in_the_unknowns():
         assert found[name].std == pytest.approx(expected[name].std, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_members_of_a_fleet_are_single_runs():
     model = rod(named=True)
     sensors = lp.Points({"T_1": 0.2, "T_2": 0.6}, noise=0.01)
@@ -124,6 +126,7 @@ def test_both_forms_of_a_ready_made_equation_agree(model, q):
     )
 
 
+@pytest.mark.slow
 def test_an_unknown_that_varies_in_space_is_evaluated_at_each_step():
     k = lp.Piecewise({"in": lambda x: x[0] < 0.5, "out": lambda x: x[0] >= 0.5}, UNKNOWNS["k"])
     models = [rod(named, unknowns={"k": k, "C": UNKNOWNS["C"]}) for named in (True, False)]

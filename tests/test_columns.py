@@ -161,6 +161,7 @@ def test_a_wrong_input_with_noise_is_named_and_the_initial_state_is_made_of_it(c
     assert verdict.level == "do not trust"
 
 
+@pytest.mark.slow
 def test_columns_that_are_right_are_not_looked_at(monkeypatch: pytest.MonkeyPatch):
     def refused(*_: Any) -> None:
         raise AssertionError("nothing speaks against this run")

@@ -255,6 +255,7 @@ def causes() -> list[Cause]:
     return [*sensors, *process, Cause("flux", "right", "", size=1e-3), jump]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("equation", ROD)
 def test_every_cause_has_a_setting_that_makes_it_an_unknown(tmp_path, equation):
     path = short_rod(tmp_path)

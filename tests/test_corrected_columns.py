@@ -163,6 +163,7 @@ def test_the_setting_of_a_cause_has_the_size_that_was_fitted():
     assert found.setting == fitted.setting
 
 
+@pytest.mark.slow
 def test_an_early_input_is_compared_with_the_readings_that_it_uses(tmp_path):
     path = changed(tmp_path, lambda table: table.update(table["T_left"].shift(-3).ffill()))
     step = pd.read_csv(path.parent / "rod.csv").iloc[:, 0].diff().median()
@@ -176,6 +177,7 @@ def test_an_early_input_is_compared_with_the_readings_that_it_uses(tmp_path):
     assert recommended(base, [early]) is early
 
 
+@pytest.mark.slow
 def test_a_late_column_that_loses_nothing_is_compared_with_the_case(tmp_path):
     path = changed(tmp_path, late_by("T_10", 3))
     step = pd.read_csv(path.parent / "rod.csv").iloc[:, 0].diff().median()

@@ -339,6 +339,7 @@ RUNS = {
 }
 
 
+@pytest.mark.slow
 def test_every_finding_of_the_source_has_its_two_runs():
     assert issued() == set(RUNS)
 

@@ -93,6 +93,7 @@ ax.figure.savefig("alpha.png")
 """
 
 
+@pytest.mark.slow
 def test_the_lines_that_a_user_of_pandas_types(here, capsys):
     pytest.importorskip("matplotlib")
     dated().rename_axis("time").to_csv("rod.csv")
@@ -201,6 +202,7 @@ def test_missing_values_of_pandas():
     assert found != known().last.parameters
 
 
+@pytest.mark.slow
 def test_the_noise_of_readings_has_the_unit_of_the_column():
     table = measured().drop(columns="battery_V")
     noise = np.where(np.arange(len(table)) % 2, 0.02, 0.3)
@@ -211,6 +213,7 @@ def test_the_noise_of_readings_has_the_unit_of_the_column():
     assert (two, deviation) == pytest.approx((one, std), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_an_xarray_dataset_with_units():
     data = xr.Dataset.from_dataframe(measured())
     assert same(identifier().run(data))
@@ -226,6 +229,7 @@ def test_an_xarray_dataset_with_units():
         identifier().run(data.assign(T_30=data["T_30"].expand_dims("depth")))
 
 
+@pytest.mark.slow
 def test_files(tmp_path):
     measured().to_csv(tmp_path / "numbers.csv")
     dated().to_csv(tmp_path / "dates.csv")
@@ -240,6 +244,7 @@ def test_files(tmp_path):
         identifier().run(tmp_path / "rows.jsonl", strict=True)
 
 
+@pytest.mark.slow
 def test_parquet(tmp_path):
     pytest.importorskip("pyarrow")
     measured().to_parquet(tmp_path / "numbers.parquet")
@@ -251,6 +256,7 @@ def test_parquet(tmp_path):
         identifier().run(tmp_path / "wrong.parquet")
 
 
+@pytest.mark.slow
 def test_rows_one_by_one():
     channels = dated().drop(columns="battery_V")
     who, other = identifier(), identifier()
@@ -263,6 +269,7 @@ def test_rows_one_by_one():
     assert np.array_equal(*ahead)
 
 
+@pytest.mark.slow
 def test_a_row_of_a_table_may_have_other_columns():
     found = [identifier().step(0.0, row) for _, row in measured().iloc[:1].iterrows()]
     assert found[0].parameters == identifier().step(0.0, measured().iloc[0, :3]).parameters
@@ -273,6 +280,7 @@ def test_a_row_of_a_table_may_have_other_columns():
             identifier().step(0.0, wrong)
 
 
+@pytest.mark.slow
 def test_the_next_table_continues_the_dates():
     who, whole = identifier(), identifier().run(dated()).to_xarray()
     first, second = who.run(dated().iloc[:15]), who.run(dated().iloc[15:])
@@ -287,6 +295,7 @@ def test_the_next_table_continues_the_dates():
         numbers.run(dated())
 
 
+@pytest.mark.slow
 def test_a_checkpoint_keeps_the_origin(tmp_path):
     who, other = identifier(), identifier()
     who.run(dated().iloc[:15])
@@ -297,6 +306,7 @@ def test_a_checkpoint_keeps_the_origin(tmp_path):
     assert other.origin == who.origin
 
 
+@pytest.mark.slow
 def test_a_smoothed_table_has_its_dates():
     smoothed = identifier().run(dated()).smoothed()
     assert smoothed.attrs["origin"] == "2025-03-01 12:00:00"
@@ -331,6 +341,7 @@ def two() -> lp.Result:
     return lp.Identifier(model, sensors, lp.SensitivityLaw(modes=3), u0=0.0).run(measured())
 
 
+@pytest.mark.slow
 def test_a_summary_is_a_table():
     summary = found().summary()
     row, alpha = summary.loc["alpha"], found().last["alpha"]
@@ -353,6 +364,7 @@ def test_the_summary_is_what_a_run_prints():
         assert np.allclose((low, high), summary.loc[label, ["low", "high"]].tolist(), rtol=0.05)
 
 
+@pytest.mark.slow
 def test_numbers_over_time_as_a_table():
     table = found().to_dataframe()
     assert table.index.equals(dated().index.rename("time").as_unit(table.index.unit))
@@ -506,6 +518,7 @@ def test_inference_data_for_arviz():
     assert arviz.extract(tree)["alpha"].sizes["sample"] == 50
 
 
+@pytest.mark.slow
 def test_the_likelihood_of_draws_is_that_of_simulations():
     noise = np.where(np.arange(24) % 2, NOISE, 2.0 * NOISE)
     table = dated().assign(**{"noise of T_30": noise})
@@ -535,6 +548,7 @@ def test_the_likelihood_of_draws_is_that_of_simulations():
     assert np.allclose(shown.std(("chain", "draw")), noise[2:], rtol=0.25)
 
 
+@pytest.mark.slow
 def test_noise_of_inputs_widens_the_likelihood():
     exact, noisy = (
         identifier(**options).run(measured().iloc[:9]).to_inference_data(99)
@@ -544,6 +558,7 @@ def test_noise_of_inputs_widens_the_likelihood():
     assert spread[1] > 2.0 * spread[0]
 
 
+@pytest.mark.slow
 def test_unknowns_that_move_have_no_likelihood_of_a_draw():
     drifting = lp.Scalar(lp.LogNormal(0.1, std=0.05), evolution=lp.RandomWalk(0.1))
     model = heat(lp.interval(0.0, 1.0, 8), drifting, {"right": 0.0})
@@ -676,6 +691,7 @@ def test_the_figure_of_a_run_begins_with_what_was_measured():
     ] == "T_60 again (validation)"
 
 
+@pytest.mark.slow
 def test_sensors_of_several_units_have_a_figure_for_each():
     pytest.importorskip("matplotlib")
     cold = lp.Points({"T_60": 0.6}, noise=NOISE, unit="K")
@@ -721,6 +737,7 @@ def test_corner():
         two().plot.corner(["s"])
 
 
+@pytest.mark.slow
 def test_fields():
     pytest.importorskip("matplotlib")
     last = two().to_xarray()["s"].values[-1]
@@ -830,6 +847,7 @@ def system() -> lp.Model:
     return lp.Model(parts, {"k": lp.Normal(1.0, 0.1)}, A=lambda q, u, v, x: q.k * u.c * v.d)
 
 
+@pytest.mark.slow
 def test_the_initial_state_of_a_system_names_all_of_it_or_is_one_number():
     sensors = lp.Points({"C": 0.5}, of="c", noise=0.1)
     assert (lp.Identifier(system(), sensors, u0=20.0).u0 == 20.0).all()
@@ -858,6 +876,7 @@ def test_the_initial_state_of_a_system_names_all_of_it_or_is_one_number():
 # --- own data by coordinates ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_data_of_a_subdomain_by_coordinates():
     mesh = lp.interval(0.0, 1.0, 10)
     model = heat(mesh, lp.Normal(0.1, std=0.05), {"right": 0.0})

@@ -58,6 +58,7 @@ def test_each_case_is_one_file_without_a_law() -> None:
         assert not {"law", "steps", "intake"} & set(case)
 
 
+@pytest.mark.slow
 def test_noise_of_the_inputs_of_the_wall_spreads_as_draws_do() -> None:
     k, C, rows = 0.8, 1.5e6, 60
     rng, times = np.random.default_rng(0), first_hour.WALL_STEP * np.arange(rows)

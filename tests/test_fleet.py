@@ -483,6 +483,7 @@ def test_blocks_solve_what_each_would_and_a_singular_one_disturbs_none():
         np.testing.assert_allclose(x[:, k], np.linalg.solve(dense, right[:, k].T).T, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_estimates_are_computed_when_they_are_read_and_are_those_of_their_sample(monkeypatch):
     kept, eager = (lp.Fleet(rod(), SENSORS, law(), 3) for _ in range(2))
     stream, calls, beliefs = samples(kept, 6), [], kept._engine.beliefs

@@ -115,6 +115,7 @@ def test_a_plate_needs_one_dimension() -> None:
         bound(model, FluxPlates({"q": "left"}))
 
 
+@pytest.mark.slow
 def test_a_member_of_a_fleet_reads_its_plate_as_a_single_run() -> None:
     mesh = lp.interval(0.0, 1.0, 8)
     model = conduction(mesh, lp.LogNormal(2.0, std=1.0), {"right": lp.Channel("T")}, C=4.0)

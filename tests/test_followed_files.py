@@ -58,6 +58,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "log.csv"
 
 
+@pytest.mark.slow
 def test_a_file_that_is_emptied_and_refilled_beyond_its_length(path: Path) -> None:
     path.write_text(HEADER + lines(0, 100))
     with closing(Follow(path, follow=True)) as source:
@@ -69,6 +70,7 @@ def test_a_file_that_is_emptied_and_refilled_beyond_its_length(path: Path) -> No
     assert "are lost" in found[0].broken
 
 
+@pytest.mark.slow
 def test_a_window_that_is_written_in_place_moves_on(path: Path) -> None:
     """Without an end of the file between: rows of before follow those of now."""
     path.write_text(HEADER + lines(100, 200))
@@ -98,6 +100,7 @@ def test_a_window_that_moves_on_twice_before_it_is_read_is_reported(path: Path) 
     assert kinds(found) == ["rewritten"]
 
 
+@pytest.mark.slow
 def test_a_window_that_is_written_all_the_time(path: Path) -> None:
     path.write_text(HEADER + lines(100, 200))
     over = threading.Event()
@@ -145,6 +148,7 @@ def copied(path: Path, content: str) -> None:
     path.write_text(HEADER + content)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("away", [False, True])
 @pytest.mark.parametrize("often", [1, 2, 3])
 @pytest.mark.parametrize("rotate", [rotated, copied])
@@ -173,6 +177,7 @@ def test_rotations_between_two_looks_lose_nothing(
     assert times(found).count(150) == (2 if away else 1)
 
 
+@pytest.mark.slow
 def test_what_is_gone_while_the_reader_was_away_is_reported(path: Path) -> None:
     path.write_text(HEADER + lines(0, 10))
     source = Follow(path, follow=True)
@@ -188,6 +193,7 @@ def test_what_is_gone_while_the_reader_was_away_is_reported(path: Path) -> None:
     assert times(found) == [*range(20, 30)]
 
 
+@pytest.mark.slow
 def test_a_writer_that_keeps_a_renamed_file_open(path: Path) -> None:
     path.write_text(HEADER + lines(0, 10))
     with closing(Follow(path, follow=True)) as source, path.open("a") as writer:
@@ -204,6 +210,7 @@ def test_a_writer_that_keeps_a_renamed_file_open(path: Path) -> None:
     assert times(found) == [*range(30)]
 
 
+@pytest.mark.slow
 def test_nul_bytes_wait_for_what_replaces_them(path: Path, monkeypatch) -> None:
     text = (HEADER + lines(0, 100)).encode()
     cut = len(HEADER + lines(0, 40)) + 3
@@ -231,6 +238,7 @@ def test_nul_bytes_wait_for_what_replaces_them(path: Path, monkeypatch) -> None:
     assert times(found) == [*range(100, 110)]
 
 
+@pytest.mark.slow
 def test_a_header_that_appears_again_holds_from_there_on(path: Path) -> None:
     path.write_text("t,a,b\n0,1,2\nt,a,b\n1,1,2\nt,b,a\n2,2,1\n")
     expected = [{"t": str(k), "a": "1", "b": "2"} for k in range(4)]
@@ -288,6 +296,7 @@ def test_a_device_is_no_table() -> None:
         read_csv("/dev/zero", {"a": Column(("a",))}, Clock("t"))
 
 
+@pytest.mark.slow
 def test_a_run_counts_what_it_cannot_know(tmp_path: Path) -> None:
     data = tmp_path / "data.csv"
     given = [",".join(map(repr, row.values())) for row in rows(40)]

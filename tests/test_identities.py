@@ -308,6 +308,7 @@ def close(one: lp.Estimate, other: lp.Estimate, size: float = 1.0, rtol: float =
 # --- identities -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @drawn(4)
 def test_a_run_that_is_restored_continues_to_the_bit(examples):
     def same(o: Options) -> None:
@@ -327,6 +328,7 @@ def test_a_run_that_is_restored_continues_to_the_bit(examples):
     check(options(), examples, same)
 
 
+@pytest.mark.slow
 @drawn(4)
 def test_a_forecast_is_the_next_prediction(examples):
     def same(o: Options) -> None:
@@ -348,6 +350,7 @@ def test_a_forecast_is_the_next_prediction(examples):
     check(options(), examples, same)
 
 
+@pytest.mark.slow
 @drawn(4)
 def test_the_last_smoothed_estimate_is_the_last_filtered_one(examples):
     def same(o: Options) -> None:
@@ -365,6 +368,7 @@ def test_the_last_smoothed_estimate_is_the_last_filtered_one(examples):
     check(options(multiplies=False, guards=False), examples, same)
 
 
+@pytest.mark.slow
 @drawn(4)
 def test_a_member_of_a_fleet_is_a_single_identifier(examples):
     def same(o: Options) -> None:
@@ -397,6 +401,7 @@ FRAMES = {
 }
 
 
+@pytest.mark.slow
 @drawn(4)
 @pytest.mark.parametrize("name", FRAMES)
 def test_order_units_and_origin_change_nothing(name, examples):
@@ -468,6 +473,7 @@ def matches(mean: Any, std: Any, belief: kalman.Gaussian) -> None:
     np.testing.assert_allclose(std, belief.std[: len(mean)], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 @drawn(16)
 def test_filter_and_smoother_are_those_of_an_independent_code(examples):
     def same(o: Options) -> None:

@@ -41,6 +41,7 @@ def run(seed: int, guess: float, noise: str | None, unknown: Any) -> lp.Estimate
     return last
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "unknown",
     [

@@ -34,6 +34,7 @@ def problems(document: dict[str, Any]) -> list[str]:
     return [error.message for error in validator.iter_errors(as_json(document))]
 
 
+@pytest.mark.slow
 def test_the_schema_is_one():
     jsonschema.Draft202012Validator.check_schema(case_schema())
 

@@ -195,6 +195,7 @@ def run_in(folder: Path, unit: str, origin: str | None) -> xr.Dataset:
     return data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("unit", "step"), [("s", "1.5s"), ("min", "90s"), ("h", "90min"), ("d", "36h"), ("day", "36h")]
 )

@@ -63,6 +63,7 @@ def test_a_pause_of_a_hundred_million_substeps_ends_and_moves_nothing(tmp_path: 
     assert np.sqrt(np.nanmean(late**2)) < 1.3 * 0.05
 
 
+@pytest.mark.slow
 def test_a_live_run_takes_all_samples_after_a_pause_and_a_resume(tmp_path: Path) -> None:
     mixed = list(rows(60))
     for row in mixed[20:]:
@@ -79,6 +80,7 @@ def test_a_live_run_takes_all_samples_after_a_pause_and_a_resume(tmp_path: Path)
     assert len(Journal.open(tmp_path / "journal.sqlite")) == 60
 
 
+@pytest.mark.slow
 def test_a_fleet_counts_intervals_that_are_too_long() -> None:
     who = identifier()
     sensors = lp.Points({"a": 0.3, "b": 0.6}, noise=0.01)
@@ -108,6 +110,7 @@ def stopped_in_a_step(run: loop.Live, at: int) -> None:
     run.identifier.step = stepped
 
 
+@pytest.mark.slow
 def test_a_step_is_left_between_substeps_and_taken_by_the_next_session(tmp_path, monkeypatch):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     for folder in (whole, parts):
@@ -185,6 +188,7 @@ def killed_after(run: loop.Live, steps: int) -> None:
     run._conclude = lambda: None
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_every_few_steps_makes_progress(tmp_path, monkeypatch):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     for folder in (whole, parts):
@@ -214,6 +218,7 @@ def test_a_run_that_is_killed_every_few_steps_makes_progress(tmp_path, monkeypat
         assert np.array_equal(mine.numbers, theirs.numbers)
 
 
+@pytest.mark.slow
 def test_checkpoints_cost_a_small_share_of_the_steps(tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "APART", 0.0)
     write(tmp_path, 40)
@@ -225,6 +230,7 @@ def test_checkpoints_cost_a_small_share_of_the_steps(tmp_path, monkeypatch):
     assert 1 <= len(kept) <= 1 + run._seconds * loop.COST / min(run._cost, 1e-4)
 
 
+@pytest.mark.slow
 def test_samples_are_taken_again_in_parts_if_a_signal_comes(tmp_path):
     write(tmp_path, 40)
     run = live(tmp_path)

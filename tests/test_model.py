@@ -314,6 +314,7 @@ def test_both_laws_learn_an_exchange_rate(mesh, sparse):
     assert np.abs(data["s"][-1].values - s[np.argsort(mesh.p[0])]).max() < 0.05
 
 
+@pytest.mark.slow
 def test_plots_draw_every_component(mesh):
     pytest.importorskip("matplotlib")
     model = exchange(mesh)

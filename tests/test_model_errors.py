@@ -160,6 +160,7 @@ def identified(z: Any) -> lp.Identifier:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "mode", "size"),
     [
@@ -231,6 +232,7 @@ def ended(z: Any) -> lp.Estimate:
     return identifier.run(samples).last
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_sound_run_is_trusted_with_hardly_a_wider_interval(seed):
     verdict = ended(truth(seed)).verdict
@@ -245,6 +247,7 @@ def test_a_sound_run_is_trusted_with_hardly_a_wider_interval(seed):
 WRONG = [pytest.param(one, marks=pytest.mark.long) for one in (("loss", 0.5), ("flow", 0.15))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [("source", 0.06), *WRONG])
 def test_a_model_that_lacks_a_term_ends_in_an_interval_that_holds(wrong):
     verdict = ended(truth(3, wrong)).verdict
@@ -267,6 +270,7 @@ def test_readings_that_no_model_explains_are_not_trusted():
     assert verdict.sentences[0].startswith("The fit failed.")
 
 
+@pytest.mark.slow
 def test_an_unknown_that_moves_has_no_such_interval_and_the_run_says_so():
     walk = lp.Scalar(PRIOR, evolution=lp.RandomWalk(0.01))
     identifier = lp.Identifier(
@@ -422,6 +426,7 @@ def test_a_guessed_curvature_of_inputs_is_a_caution_unless_an_interval_holds_it(
     assert held.severity == "note"
 
 
+@pytest.mark.slow
 def test_an_initial_time_long_before_the_samples_changes_no_course_in_time():
     """Forgotten t0: sources that begin within the run must not begin before the first sample."""
     rng = np.random.default_rng(4)

@@ -119,6 +119,7 @@ def test_a_model_of_lambdas_says_why_it_cannot_be_pickled():
     assert copy.copy(model) is model
 
 
+@pytest.mark.slow
 def test_another_process_reads_a_result(tmp_path):
     result = layers().run(samples())
     (tmp_path / "result.pickle").write_bytes(pickle.dumps(result))

@@ -308,6 +308,7 @@ def test_loops_name_a_limit_once():
     assert legends[1] is None
 
 
+@pytest.mark.slow
 def test_an_unknown_over_orders_of_magnitude_has_a_logarithmic_axis() -> None:
     data = dataset(scalars={"k": 3.0}, span=60.0, unit="s")
     assert panel(plots.overview(data), "k").get_yscale() == "linear"

@@ -153,6 +153,7 @@ def test_wild_readings_in_a_row_are_told_from_those_beside_them():
     assert near_neighbours(values, 4.0)[[*range(17), *range(23, 40)]].all()
 
 
+@pytest.mark.slow
 def test_a_run_continues_to_the_bit():
     rows = stream()
     whole, half = column(PRIORS["far above"]), column(PRIORS["far above"])
@@ -233,6 +234,7 @@ def test_a_reading_whose_place_is_missing_is_not_fitted():
     assert one.q == pytest.approx(other.q, abs=1e-3 * std)  # a search ends within 0.03
 
 
+@pytest.mark.slow
 def test_a_fit_that_leaves_out_many_readings_says_so():
     """Also where its filter, which has taken the others one by one, has refused none of them."""
     z, wild = np.array(measured()), np.arange(len(TIMES)) % 6 == 3
@@ -356,6 +358,7 @@ def test_numbers_that_end_a_refit_apart_end_no_run(monkeypatch: pytest.MonkeyPat
     assert estimate.verdict.level == "do not trust"
 
 
+@pytest.mark.slow
 def test_readings_withdrawn_while_a_refit_is_under_way_are_not_in_it():
     """A sensor that is set aside meanwhile brings no reading, from its first misfit on."""
     samples = rod_samples()

@@ -56,6 +56,7 @@ EVEN = 0.05 * np.arange(1, 81)
 PACES = np.cumsum(np.where(np.arange(80) < 40, 0.05, 0.125))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "t", "options", "parts"),
     [
@@ -99,6 +100,7 @@ def test_a_pass_is_that_of_the_stages_one_by_one(
     assert costs[0] == pytest.approx(swept.cost(used), rel=1e-10)
 
 
+@pytest.mark.slow
 def test_where_stages_differ_or_lengths_do_not_repeat_stages_follow_each_other():
     law = lp.SensitivityLaw(refit=lp.Refit(start=2), shadows=None)
     uneven = stored("plain", law, np.cumsum(0.05 + 0.001 * np.arange(40)), False)

@@ -37,6 +37,7 @@ def run(changes: dict[int, float], count: int = 60) -> tuple[lp.Estimate, list[f
     return estimate, refused
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [9999.0, -127.0, 1e300])
 def test_one_wild_reading_is_as_a_missing_one(value: float) -> None:
     wild, refused = run({40: value})
