@@ -469,7 +469,10 @@ def passed(value: bool | tuple[int, int]) -> bool:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["line", "triangle", "hexahedron"])
+@pytest.mark.parametrize(
+    "kind",
+    ["triangle", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("line", "hexahedron"))],
+)
 def test_a_checker_of_cf_accepts_the_files(tmp_path, kind):
     export(made(tmp_path / "run", kind, origin=ORIGIN), tmp_path / "run.nc")
     # The roles of UGRID are part of CF 1.11, appendix A; the checker only knows the older ones.
