@@ -78,9 +78,14 @@ FAULTS: dict[str, tuple[Any, str, str]] = {
     "input late": (lambda c: {**c, "TC5": late(c["TC5"], 60.0)}, "TC5", "TC5 may be 60 late"),
     "sensor late": (lambda c: {**c, "TC3": late(c["TC3"], 60.0)}, "TC3", "TC3 may be 60 late"),
     "input scaled": (lambda c: scaled(c, "TC1", 1.15), "TC1", "the scale of TC1 may be 15"),
-    "input off": (lambda c: scaled(c, "TC1", 1.0, 1.5), "TC1", "TC1 may read 1.5 too high"),
+    "input off": (lambda c: scaled(c, "TC1", 1.0, 1.5), "TC1", "TC1 may read 1.5 K too high"),
     "input in degF": (lambda c: scaled(c, "TC5", 1.8, 32.0), "TC5", "TC5 may be in degF"),
     "sensor in degF": (lambda c: scaled(c, "TC3", 1.8, 32.0), "TC3", "TC3 may be in degF"),
+    "sensor in degC, stated as degF": (
+        lambda c: scaled(c, "TC3", 1.0 / 1.8, -32.0 / 1.8),
+        "TC3",
+        "TC3 may be in degC instead of degF",
+    ),
     "sensors exchanged": (
         lambda c: exchanged(c, "TC2", "TC3"),
         "TC2",
@@ -100,7 +105,7 @@ def run(
         lp.LogNormal(1e-6, std=6e-7),
         A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
     )
-    sensors = lp.Points(PLACES, noise=NOISE)
+    sensors = lp.Points(PLACES, noise=NOISE, unit="degC")
     law = lp.SensitivityLaw(**options)
     identifier = lp.Identifier(
         model, sensors, law, **{"u0": 20.0, "between": between, **(parts or {})}

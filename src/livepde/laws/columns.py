@@ -391,7 +391,8 @@ class _Trials:
         """Iterate over the same of a sensor: the trajectory is the same."""
         expected = self.columns.unit(name)
         for number, unit in enumerate(UNITS):
-            if unit.expected == expected or expected not in TEMPERATURES:
+            # A case may have stated the wrong one of two units of temperature.
+            if unit.name in TEMPERATURES or expected not in TEMPERATURES:
                 error = Error("unit", (name,), unit=number)
                 yield base.cost - _Fit.about(self._seen(base, error)).cost, error
 
