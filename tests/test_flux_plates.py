@@ -16,6 +16,7 @@ from benchmarks import first_hour
 from livepde.cases import load
 from livepde.errors import CaseError, ObservationError
 from livepde.fem import Inputs, Moment
+from livepde.laws.shadow_kinds import HalvedMesh
 from livepde.models import conduction
 from livepde.observation import Combined, FluxPlates
 from livepde.runs.summary import LAYERS, SURFACES, resistance, tables
@@ -173,10 +174,8 @@ def test_a_plate_as_a_sensor_determines_k_and_C(
     estimate = result.last
     assert estimate is not None
     for name, truth in truths.items():
-        low, high = estimate[name].interval()
-        assert low <= truth <= high, (name, low, truth, high)
-    assert estimate["k"].std < 0.005 * truths["k"]
-    assert estimate["C"].std < 0.1 * truths["C"]  # lines between readings cost most of it
+        value, std = estimate[name].median, estimate[name].std
+        assert abs(value - truth) < 3.0 * std < 0.015 * truth, (name, value, truth, std)
     data = prepared.layout.dataset(result.records)
     (row,) = next(table for table in tables(data) if table.title.startswith("Measured")).rows
     assert row[0] == "q"
@@ -348,3 +347,49 @@ def test_a_wall_that_begins_in_a_curve_or_a_line(table: str) -> None:
         low, high = estimate[name].interval()
         assert low <= truth <= high, (name, low, truth, high)
         assert high - low < 0.1 * truth
+
+
+@pytest.mark.parametrize(
+    "bend", [lambda x: 20.0 - 80.0 * x + 99.0 * x**2, lambda x: np.sin(8.0 * x)]
+)
+@pytest.mark.parametrize("at", ["left", 0.1475])
+def test_the_halved_mesh_shows_what_plates_read_there(at: Any, bend: Any) -> None:
+    """A plate reads another value of the same state on cells half as wide."""
+    layers = {"one": lambda x: x[0] < 0.2, "two": lambda x: x[0] > 0.2}
+    k = lp.Piecewise(layers, lp.LogNormal(0.5, 0.4))
+    coarse = conduction(lp.interval(0.0, 0.3, 30), k, {"right": 0.0}, C=4.0)
+    problem = lp.Identifier(coarse, FluxPlates({"q": at}, noise=0.3), u0=20.0).problem
+    mesh = HalvedMesh.of(problem)
+    u, fine = (one.state_space.interpolate(lambda x: bend(x[0])) for one in (coarse, mesh.model))
+    q = coarse.initial_parameter({"k": [0.7, 0.2]})
+    difference = (fine - mesh.prolong(u[None])[0])[None]
+    (found,) = mesh.in_readings(u[None], q[None], u[None], difference, lambda k: NOW)
+    there, here = mesh.model.latent.value(mesh.unknowns @ q), coarse.latent.value(q)
+    expected = mesh.observed.predict(fine, there, NOW) - problem.observed.predict(u, here, NOW)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_plate_at_an_end_is_judged_by_the_error_that_the_mesh_makes() -> None:
+    """The mesh moves k by .02 %: an interval of .1 % is nearly as wide as without its error."""
+    mesh, times = lp.interval(0.0, 1.0, 40), np.linspace(0.0, 4.0, 161)
+    ends = {"left": lp.Channel("T_in"), "right": 0.0}
+    model = conduction(mesh, lp.LogNormal(1.0, 0.4), ends, C=lp.LogNormal(4.0, 1.0))
+    fine = conduction(lp.interval(0.0, 1.0, 320), lp.Normal(1.0, 1.0), ends, C=lp.Normal(4.0, 1.0))
+    sensors = Combined([lp.Points({"T": 0.4}, noise=0.01), FluxPlates({"q": "left"}, noise=0.05)])
+    twin = lp.streams.Twin(
+        model=fine,
+        observation=sensors,
+        q_true={"k": 0.8, "C": 5.0},
+        u0=0.0,
+        times=times,
+        inputs=lambda t: {"T_in": math.sin(t) ** 2},
+        dt_max=0.005,
+    )
+    samples, stds = list(twin), []
+    for shadows in (None, lp.laws.Shadows()):
+        law = lp.SensitivityLaw(shadows=shadows)
+        result = lp.Identifier(model, sensors, law, u0=0.0).run(samples)
+        stds.append(result.last.parameters["C"][1])
+        assert all(finding.what != "discretisation" for finding in result.verdict.findings)
+    assert stds[1] < 1.5 * stds[0]

@@ -309,7 +309,7 @@ def close(one: lp.Estimate, other: lp.Estimate, size: float = 1.0, rtol: float =
 
 
 @pytest.mark.slow
-@drawn(4)
+@drawn(2)
 def test_a_run_that_is_restored_continues_to_the_bit(examples):
     def same(o: Options) -> None:
         taken, who, other = samples(o), identifier(o), identifier(o)
@@ -402,7 +402,7 @@ FRAMES = {
 
 
 @pytest.mark.slow
-@drawn(4)
+@drawn(2)
 @pytest.mark.parametrize("name", FRAMES)
 def test_order_units_and_origin_change_nothing(name, examples):
     frame = FRAMES[name]

@@ -282,8 +282,23 @@ def test_every_law_is_among_the_cases():
     assert {type(CASES[name].law) for name in COPIED} == concrete
 
 
+# One of each law, and those that factorise, solve and inherit most.
+OFTEN = (
+    "gradient",
+    "gradient, nonlinear plate",
+    "gradient, blocks",
+    "auto gain",
+    "sensitivity",
+    "sensitivity, inputs",
+    "sensitivity, nonlinear",
+    "sensitivity, large square",
+    "guards and jumps",
+)
+RARELY = (pytest.param(name, marks=pytest.mark.long) for name in CASES if name not in OFTEN)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [*OFTEN, *RARELY])
 def test_identifiers_of_one_model_step_in_threads(name):
     case = CASES[name]
     model = case.model()

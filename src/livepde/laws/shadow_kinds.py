@@ -37,6 +37,7 @@ from livepde.stepping import (
 # shift the unknowns by less than 0.3 standard deviations (tests/test_step_choice.py).
 ALLOWED = 0.03
 ALIKE = 3.0  # ratio of the errors of two steps that others between them have, too
+ROUNDING = 1e-9  # of the largest entry of an observation matrix
 MESH = 4.0 / 3.0  # error of elements of first order over its difference to the halved mesh
 HELD = "hold"  # kind of the shift by inputs that are held: no error if they are what is stated
 SHORT = 1.0 / 16.0  # of the interval before: a shorter one shows no curvature
@@ -47,6 +48,7 @@ SMOOTH = 0.5  # differences of changes over changes, squared: below, an input ch
 class HalvedMesh:
     """A model on the halved mesh, its sensors, and the maps between both meshes."""
 
+    given: Problem  # the process on the given mesh
     # The process, its observation, and its implicit stage.
     model: Model
     observed: Observed
@@ -77,7 +79,7 @@ class HalvedMesh:
         alone = np.flatnonzero(np.abs(P.max(axis=1).toarray().ravel() - 1.0) < 1e-9)
         at = np.empty(P.shape[1], dtype=np.int64)
         at[np.asarray(P[alone].argmax(axis=1)).ravel()] = alone
-        return cls(fine, observed, stage, compact(P), unknowns, at)
+        return cls(problem, fine, observed, stage, compact(P), unknowns, at)
 
     @cached_property
     def G(self) -> sp.csr_array | Array | None:
@@ -85,6 +87,16 @@ class HalvedMesh:
         if type(self.observed) is not Observed or self.observed.observation.inputs:
             return None
         return compact(self.observed.G)
+
+    @cached_property
+    def _apart(self) -> Array | sp.csr_array | None:
+        """What constant sensors read of a state on the halved mesh, less what they read of it.
+
+        Shape (sensors, n); None for nothing but rounding.
+        """
+        apart = sp.csr_array(self.observed.G @ sp.csr_array(self.P) - self.given.observed.G)
+        size = float(abs(self.given.observed.G).max())
+        return compact(apart) if abs(apart).max() > ROUNDING * size else None
 
     def prolong(self, u: Array) -> Array:
         """Return states on the halved mesh, shape (members, N) for (members, n)."""
@@ -103,17 +115,34 @@ class HalvedMesh:
         return np.asarray(self.model.initial(given, moment) - coarse)
 
     def in_readings(
-        self, u: Array, q: Array, difference: Array, moment: Callable[[int], Moment]
+        self,
+        u: Array,
+        q: Array,
+        coarse: Array,
+        difference: Array,
+        moment: Callable[[int], Moment],
     ) -> Array:
-        """Return the readings of differences on the halved mesh, (members, sensors)."""
+        """Return what sensors on the halved mesh read more than on the given one.
+
+        `coarse` are states on the given mesh, `difference` those on the halved mesh less them, and
+        `u`, `q` where sensors are linearised; the result has the shape (members, sensors). Sensors
+        that read slopes, as flux plates, read another value of the same state there.
+        """
         if self.G is not None:
-            return np.asarray((self.G @ difference.T).T)
+            found = np.asarray((self.G @ difference.T).T)
+            return found if self._apart is None else found + np.asarray((self._apart @ coarse.T).T)
         # Sensors without one constant matrix: their derivative at the prolonged state.
-        at, found = self.prolong(u), []
+        at, both, each = self.prolong(u), self.prolong(coarse), []
         for k, more in enumerate(difference):
-            physical = self.model.latent.value(self.unknowns @ q[k])
-            found.append(self.observed.jacobian(at[k], physical, moment(k))[0] @ more)
-        return np.array(found)
+            latent, when = self.unknowns @ q[k], moment(k)
+            physical = self.model.latent.value(latent)
+            known = self.given.model.latent.value(q[k])
+            apart = self.observed.predict(both[k], physical, when)
+            apart -= self.given.observed.predict(coarse[k], known, when)
+            # A sensor without a reading, as one whose position is missing, is not apart.
+            slope = self.observed.jacobian(at[k], physical, when)[0]
+            each.append(slope @ more + np.nan_to_num(apart))
+        return np.array(each)
 
 
 def refusal(problem: Problem, largest: int) -> str:
@@ -531,7 +560,7 @@ class MeshShadow(Shadow):
             seen = np.zeros((1, self.mesh.observed.size))
         else:
             difference = self.mesh.initial_difference(given, x.q[0], x.u[0], moment)[None]
-            seen = self.mesh.in_readings(x.u, x.q, difference, lambda k: moment)
+            seen = self.mesh.in_readings(x.u, x.q, x.u, difference, lambda k: moment)
         kept = {"blocks": self.coarse.stage.kept(1), "fine_stage": self.fine.stage.kept(1)}
         gains = np.zeros((1, seen.shape[1], x.C.shape[2]))
         return changed(s, u0=x.u, fine=difference, seen=seen, gains=gains, **kept)
@@ -548,7 +577,7 @@ class MeshShadow(Shadow):
         u, kept, wrong = self.fine.propagate(x, start, s.fine_stage, span)
         failed = failed | wrong
         fine = np.where(failed[:, None], s.fine, u - mesh.prolong(coarse))
-        seen = mesh.in_readings(end.u, end.q, fine, span.end.member)
+        seen = mesh.in_readings(end.u, end.q, coarse, fine, span.end.member)
         slope = (seen - s.seen) / (span.t1 - span.t0)[:, None]
         # `gains` weighs the gain of each sample by the time since the block began: times the slope
         # that is the effect of a difference which has grown linearly.
