@@ -85,7 +85,7 @@ class Sobolev:
 
         The prior covariance std^2 G^{-1} is then the Whittle-Matern covariance with variance std^2
         in the interior; within about a length of a free boundary the standard deviation grows, to
-        sqrt(2) std on it.
+        sqrt(2) std on it, and to 2 std at a corner.
 
         Raises
         ------
