@@ -241,6 +241,15 @@ def fitted(**options: int) -> list[str]:
 
 
 @cache
+def guessed(factor: float) -> list[str]:
+    """Return the findings on a law without refit that finds the noise, from a first guess."""
+    law = lp.SensitivityLaw(noise="auto", refit=None, shadows=None)
+    points = lp.Points(jumping.POINTS, noise=factor * jumping.NOISE)
+    stream = jumping.samples(lambda t: 0.3, 60, 0)
+    return kinds(lp.Identifier(jumping.rod(), points, law, u0=0.0).run(stream).verdict)
+
+
+@cache
 def stepped(**options: Any) -> list[str]:
     """Return the findings on a pipe with a front, of which some steps have to be short."""
     law = lp.SensitivityLaw(shadows=lp.laws.Shadows(**options))
@@ -332,6 +341,7 @@ RUNS = {
     "equation_tests: misfit": Pair(partial(gradient, 2.0), partial(gradient, 1.0)),
     "findings: misfit": Pair(partial(one_column, 0.9), partial(one_column, 0.2)),
     "verdict: fit": Pair(partial(fitted, start=0, passes=1), fitted),
+    "verdict: noise": Pair(partial(guessed, 0.1), partial(guessed, 1.0)),
     "verdict: step": Pair(partial(stepped, parts=2), stepped),
     "verdict: start": Pair(partial(begun, 0.0), partial(begun, 999.0)),
     "verdict: untested": Pair(partial(stepped, mesh=False, parts=1), stepped),

@@ -56,6 +56,7 @@ from livepde.laws.verdict import (
     with_discretisation,
     with_errors,
     with_fit,
+    with_noise,
 )
 from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.stepping import (
@@ -521,10 +522,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def deferred(self, work: SensitivityWork, state: SensitivityState) -> Deferred:
         # Kept estimates must not hold ledgers and warm-start data, which are larger than a belief.
         now, fit = kept_for_estimates(state.now), state.fit.member(0)
-        judge = judged(work.filter, state.now, now)
+        judge, level = judged(work.filter, state.now, now), float(now.level[0])
 
         def verdict() -> Verdict:
-            found = with_fit(judge(), fit)
+            found = with_noise(with_fit(judge(), fit), work, level)
             if not self.verdict:
                 return found
             return with_discretisation(found, work.filter.shadows, now.shadows)

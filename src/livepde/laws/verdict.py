@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
@@ -39,6 +40,7 @@ from livepde.verdict import (
 from livepde.verdict.sentences import FINDINGS, percent
 
 COARSE = 10.0  # times the error of a step that is allowed, from which the verdict is a caution
+LARGER = 1.5  # noise over its first guess from which the first samples had too much weight
 LARGE = 1.0  # misfit over noise that is looked into though no test has found it
 COUNTS = len(STATUS_CODES) + 1  # of a `StepLedger`
 
@@ -117,6 +119,19 @@ def with_fit(verdict: Verdict, fit: Fit | None) -> Verdict:
         )
         found.append(Finding("fit", "caution", text, evidence=share, remedy=remedy))
     return verdict.with_findings(found) if found else verdict
+
+
+def with_noise(verdict: Verdict, work: SensitivityWork, level: float) -> Verdict:
+    """Return a verdict that names a noise which was found after samples had used a smaller one.
+
+    `level`: variance of the noise over that of the guess. A refit takes all samples again.
+    """
+    ratio = math.sqrt(level)
+    if work.refit is not None or not work.options.adaptive or not ratio > LARGER:
+        return verdict
+    text, remedy = FINDINGS["noise, found"].filled(ratio=ratio)
+    more = Finding("noise", "caution", text, "", ratio, remedy=remedy)
+    return verdict.with_findings([more])
 
 
 def after_fit(verdict: Verdict, fit: Fit | None) -> Verdict:

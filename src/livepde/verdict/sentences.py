@@ -140,6 +140,11 @@ FINDINGS: dict[str, Sentence] = {
     "noise, large": Sentence(
         "Residual scatter is {ratio:.2g} times the configured noise: `noise` may be too small."
     ),
+    "noise, found": Sentence(
+        "The noise is {ratio:.2g} times the first guess. Without `refit` the first samples keep "
+        "the weight of the guess, and the intervals are too narrow.",
+        "Configure the noise that was found, or allow a refit.",
+    ),
     "stuck": Sentence("{name} appears stuck: same value for {count} samples."),
     "aside": Sentence(
         "{name} is excluded since t = {since}: its readings contradict the model, and the other "
