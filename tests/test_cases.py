@@ -584,7 +584,7 @@ def test_what_is_refused_with_data(rod, old, new, named):
     assert named in str(error.value)
 
 
-def test_interpolation_needs_a_value_in_the_first_sample(rod):
+def test_a_first_row_without_values_is_left_out(rod):
     path = rod()
     lines = (path.parent / "rod.csv").read_text().splitlines()
     first = float(lines[2].partition(",")[0])

@@ -14,7 +14,7 @@ from livepde import cases
 from livepde.cases.case import Prepared
 from livepde.cases.measured import measured
 from livepde.cases.new_case import channels_in
-from livepde.cases.remedies import start_missed, with_settings
+from livepde.cases.remedies import after_gaps, start_missed, with_settings
 from livepde.cli.check import _refused
 from livepde.errors import CaseError
 from livepde.models import EQUATIONS
@@ -51,7 +51,7 @@ def test_a_run_begins_where_all_inputs_have_a_value(tmp_path):
     assert plain.raw is not None
     np.testing.assert_array_equal(found.stream.t, plain.raw.t[20:])
     (note,) = noted(found)
-    assert "20 rows at the start were left out" in note.text
+    assert "20 rows at the start, before its first value, were left out" in note.text
     assert any("T_left: the first 20 rows have no value" in text for text in _refused(found))
 
 
@@ -77,7 +77,7 @@ def test_a_long_gap_of_an_input_is_the_first_to_be_mended(tmp_path, rows, said, 
     key = remedy.partition("=")[0]
     assert any(key in text for text in _refused(prepared)) == bool(remedy)
     refused = Finding("refused", "caution", "The gate rejected readings.", remedy="Check them.")
-    both = with_settings(prepared, Verdict.of([refused, note]))
+    both = after_gaps(Verdict.of([refused, note]), [note])
     shown = next(one for one in both.findings if one.what == "refused")
     assert shown.remedy.startswith(note.remedy or "Check them.")
 
@@ -118,20 +118,20 @@ def test_a_start_that_the_first_readings_miss_is_named(tmp_path):
 def test_jumps_that_are_allowed_already_are_no_advice(tmp_path):
     cause = Cause("jump", "k", "k may have changed", 1.0, "Allow jumps.", "law.jumps=true")
     verdict = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=(cause,))])
-    for jumps, said in ((True, "has found none"), (False, "Allow jumps.")):
+    for jumps, said in ((True, "allowed already"), (False, "Allow jumps."), (["alpha"], "Allow")):
         settings: dict[str, object] = {"law.jumps": jumps}
         prepared = changed(tmp_path / str(jumps), lambda table: None, **settings)
         (shown,) = with_settings(prepared, verdict).findings[0].causes
         assert said in shown.remedy
-        assert bool(shown.setting) != jumps
+        assert bool(shown.setting) == (jumps is not True)
 
 
 def test_a_unit_at_the_end_of_a_name_is_that_of_the_sensor(tmp_path):
     rows = "\n".join(f"{60 * k},{50 + k},{20 + k},{k}" for k in range(9))
     path = tmp_path / "wall.csv"
-    path.write_text(f"time_s,T_12cm_degF,T_20cm,T_K\n{rows}\n")
+    path.write_text(f"time_s,T_12cm_degF,T_20cm,T_in\n{rows}\n")
     found = channels_in(measured(path, "s"), EQUATIONS["heat"])
     given = {one.name: one.given for one in found}
     assert given["T_12cm_degF"]["unit"] == "degF"
     assert "unit" not in given["T_20cm"]
-    assert "unit" not in given["T_K"]
+    assert "unit" not in given["T_in"]

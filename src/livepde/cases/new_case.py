@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import string
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -61,6 +62,7 @@ def documented(text: str) -> tuple[str, dict[str, str]]:
 PLACE = re.compile(r"(?<![\d.,-])(\d+(?:[.,]\d+)?)[ _]?(mm|cm|m|ft)(?![A-Za-z\d/^²³])")
 FRACTION = re.compile(r"\d+\.\d+")  # T_0.05
 SUFFIX = re.compile(r"(?<=\w)_(?P<unit>[A-Za-z]\w*)$")  # Q_W, dH_mm
+NO_UNITS = {*string.ascii_letters, "in"}  # at the end of a sensor's name: T_K, T_in
 NUMBERED = re.compile(r"(.*?)(\d+)")  # u_17
 PLACES = "places.csv"  # the table of positions that is written beside the case
 FAMILY = 8  # so many numbered columns become one line of [channels]
@@ -362,8 +364,8 @@ def _sensor(equation: Equation, key: str, name: str, values: Array) -> FoundChan
     stated, unit = IN_BRACKETS.search(name), ""
     if stated and not PLACE.fullmatch(stated[1].strip()):
         unit = unit_in(name, equation.state.unit, IN_BRACKETS) or f"{BLANK} {stated[1]}"
-    elif not stated and (suffix := SUFFIX.search(name)) and len(suffix["unit"]) > 1:
-        unit = unit_in(name, equation.state.unit, SUFFIX)  # T_in_degF, but not T_K or T_C
+    elif not stated and (suffix := SUFFIX.search(name)) and suffix["unit"] not in NO_UNITS:
+        unit = unit_in(name, equation.state.unit, SUFFIX)  # T_in_degF
     given |= {"unit": unit} if unit not in ("", equation.state.unit) else {}
     return FoundChannel(key, given, (name,), ", ".join(told))
 

@@ -18,7 +18,7 @@ from livepde.cases.schema import BoundarySpec, ChannelSpec, EvolutionSpec, Unkno
 from livepde.errors import CaseError, ModelError, NameClashError, SpaceError
 from livepde.fem.field_blocks import base_name
 from livepde.model import Model
-from livepde.models import Exchange, Flux, Fluxes, Source, Variable, with_conditions
+from livepde.models import EQUATIONS, Exchange, Flux, Fluxes, Source, Variable, with_conditions
 from livepde.models.boundary_conditions import Amount, Multiple
 from livepde.observation.functionals import in_cells
 from livepde.runs.summary import LAYERS, SURFACES
@@ -360,7 +360,8 @@ def conditioned(case: CaseContent) -> CaseContent:
             text = f"the offset of a boundary value of '{equation.name}' cannot be an unknown; "
             raise case.error(key, text + "leave it out, or correct the column with `data.reader`.")
         text = f"the equation '{equation.name}' takes no fluxes and no sources of a case; "
-        raise case.error(keys[0], text + "take another equation, such as 'heat'.")
+        known = [name for name, one in EQUATIONS.items() if one.fluxes is not None]
+        raise case.error(keys[0], f"{text}{', '.join(known)} do.")
     names = _ConditionNames(case)
     boundary = {name: _passing(names, units, name, item) for name, item in given.items()}
     for name, channel in shifted.items():

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from livepde.cases.read import settings_in, toml_key, toml_value
+from livepde.laws import SensitivityLaw
 from livepde.verdict import Cause, Finding, Severity, Verdict, channel_setting
 from livepde.verdict.sentences import ESTIMATED, FINDINGS, LIKELY, amount_of, estimating
 
@@ -25,7 +26,7 @@ KEYS = {kind: key for kind, (_, key) in ESTIMATED.items()}
 SIZED = ("boundary", "channel", "drift", "flux", "lag", "loss", "source")
 STATED = ("factor", "late")  # keys of a channel whose stated value a cause does not replace
 MISSED = 5.0  # times the noise that the first readings may miss a stated start
-JUMPED = "The run may allow for jumps, and has found none."
+JUMPED = "Jumps are allowed already: check the model and the data for another cause."
 NO_SETTING = "This case has no setting to estimate it."
 
 
@@ -37,8 +38,6 @@ def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
 
     def named(cause: Cause) -> Cause:
         settings = freed(prepared, cause)
-        if cause.kind == "jump" and _jumps(prepared.case):
-            settings = ()
         cause = _with_remedy(prepared.case, cause, settings)
         if settings:
             return replace(cause, setting="; ".join(settings))
@@ -49,16 +48,23 @@ def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
     def settled(finding: Finding) -> Finding:
         return replace(finding, causes=tuple(map(named, finding.causes)))
 
-    found = tuple(map(settled, verdict.findings))
-    gaps = next((one.remedy for one in found if one.what == "input" and one.remedy), "")
-    if gaps:  # readings are missed where an input is a guess: they are not what to correct
-        found = tuple(
-            replace(one, remedy=f"{gaps} Then judge the readings again.")
-            if one.what == "refused"
-            else one
-            for one in found
-        )
-    return replace(verdict, findings=found)
+    return replace(verdict, findings=tuple(map(settled, verdict.findings)))
+
+
+def after_gaps(verdict: Verdict, inputs: Iterable[Finding]) -> Verdict:
+    """Return a verdict in which gaps of inputs are to be mended before refused readings.
+
+    Readings are missed where an input is a guess: they are not what to correct. `inputs`: findings
+    on the inputs; those with a remedy are long gaps.
+    """
+    gaps = next((one.remedy for one in inputs if one.remedy), "")
+    if not gaps:
+        return verdict
+    again = f"{gaps} Then judge the readings again."
+    findings = (
+        replace(one, remedy=again) if one.what == "refused" else one for one in verdict.findings
+    )
+    return replace(verdict, findings=tuple(findings))
 
 
 def start_missed(prepared: Prepared, verdict: Verdict) -> list[Finding]:
@@ -80,8 +86,8 @@ def _with_remedy(case: Case, cause: Cause, settings: tuple[str, ...]) -> Cause:
     """Return a cause whose remedy has the setting, for an error of a sensor or of the start."""
     if cause.kind == "initial" and settings and settings != settings_in(cause.setting):
         return replace(cause, remedy=f"Specify its uncertainty: `{settings[0]}`.")
-    if cause.kind == "jump" and _jumps(case):
-        return replace(cause, setting="", remedy=JUMPED)
+    if cause.kind == "jump" and _may_jump(case, cause.subject):
+        return replace(cause, remedy=JUMPED)
     if cause.kind not in KEYS or cause.subject not in case.roles("sensor"):
         return cause
     if settings == settings_in(cause.setting):  # the remedy has the value, and its unit
@@ -92,15 +98,18 @@ def _with_remedy(case: Case, cause: Cause, settings: tuple[str, ...]) -> Cause:
     return replace(cause, remedy=estimating(cause.kind, cause.subject, value))
 
 
-def _jumps(case: Case) -> bool:
-    law = case.spec.law
-    return law.kind == "sensitivity" and bool(law.jumps)
+def _may_jump(case: Case, name: str) -> bool:
+    """Return whether the law of a case tests for jumps of an unknown."""
+    jumps = case.law.jumps if isinstance(case.law, SensitivityLaw) else None
+    return jumps is not None and (not jumps.unknowns or name in jumps.unknowns)
 
 
 def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     """Return the settings that make a cause an unknown of the case; empty if none does."""
     case = prepared.case
     if case.spec.law.kind != "sensitivity":
+        return ()
+    if cause.kind == "jump" and _may_jump(case, cause.subject):
         return ()
     process = {"source": _source, "loss": _loss, "flux": _flux, "boundary": _boundary}
     if cause.kind == "offset" and cause.subject in case.roles("boundary"):

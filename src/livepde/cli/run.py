@@ -320,19 +320,20 @@ def concluded(
 def _judged(prepared: Prepared, driven: Driven, dataset: xr.Dataset) -> Verdict:
     """Return the verdict on a run, with settings of the case that would remedy what was found."""
     from livepde import runs
-    from livepde.cases.remedies import start_missed, with_settings
+    from livepde.cases.remedies import after_gaps, start_missed, with_settings
 
     raw, journal = prepared.raw, driven.journal
 
     def readings() -> tuple[Array, Array]:
         return journal.readings(journal.channels) if raw is None else (raw.t, raw.values)
 
+    inputs = runs.input_findings(journal, prepared.case.roles("boundary", "input"))
     found = [
         *runs.sampling_findings(dataset, readings),
         *runs.clock_findings(journal),
-        *runs.input_findings(journal, prepared.case.roles("boundary", "input")),
+        *inputs,
     ]
-    verdict = runs.verdict(dataset).with_findings(found)
+    verdict = after_gaps(runs.verdict(dataset).with_findings(found), inputs)
     return with_settings(prepared, verdict.with_findings(start_missed(prepared, verdict)))
 
 

@@ -3,7 +3,7 @@
 A log has the shape (members, rows, 2 + 2 sensors + 2 channels): time, measurements, their noise
 (NaN: that of the sensor), inputs, for how long each input has been held without a reading, and in
 how many parts the substeps since the row before were divided.
-Rows of a member that did not take a sample have the time NaN.
+LogRows of a member that did not take a sample have the time NaN.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def trimmed(log: Array, first: int) -> Array:
     return log[:, first:].copy()
 
 
-class Rows(NamedTuple):
+class LogRows(NamedTuple):
     """The rows of one member that have a time, as arrays with the rows as first axis."""
 
     times: Array
@@ -120,7 +120,7 @@ class Rows(NamedTuple):
     parts: IntArray
 
     @classmethod
-    def of(cls, log: Array, sensors: int) -> Rows:
+    def of(cls, log: Array, sensors: int) -> LogRows:
         """Return the rows of a log of one member."""
         rows, (inputs, _) = log[0][np.isfinite(log[0, :, 0])], _inputs(log, sensors)
         return cls(

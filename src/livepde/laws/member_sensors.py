@@ -50,8 +50,7 @@ class MemberSensors:
 
     def _direct(self, at: Moments) -> Array | None:
         """Return D of sensors z = G u + D q that are the same at all times; None for others."""
-        affine = None if self.fixed else self.problem.observed.affine(at.member(0))
-        return None if affine is None else affine[1]
+        return None if self.fixed else self.problem.observed.steady_direct(at.member(0))
 
     def _of_unknowns(self, x: FilterState, D: Array) -> Array:
         """Return D q of each member, (members, sensors)."""

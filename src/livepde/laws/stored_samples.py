@@ -18,7 +18,7 @@ from livepde.laws.assimilation import HALF_LOG, absorb, assimilate
 from livepde.laws.filter import Filter, contraction
 from livepde.laws.filter_state import FilterState, coordinates, extended
 from livepde.laws.gate import Gate
-from livepde.laws.history import Rows, first_interval, intervals_since
+from livepde.laws.history import LogRows, first_interval, intervals_since
 from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array, IntArray, Mask
@@ -67,20 +67,20 @@ class StoredSamples:
     # Parts of the law, the member as it is now, and its rows since the start of the window.
     work: SensitivityWork
     state: SensitivityState
-    rows: Rows
+    rows: LogRows
 
     @classmethod
     def of(cls, work: SensitivityWork, state: SensitivityState) -> StoredSamples:
         """Return the samples in the window of one member."""
         sensors = work.filter.problem.observed.size
-        return cls(work, state, Rows.of(state.log[:, int(state.window[0]) :], sensors))
+        return cls(work, state, LogRows.of(state.log[:, int(state.window[0]) :], sensors))
 
     def __len__(self) -> int:
         return len(self.rows.times) - self._before
 
     @property
     def _before(self) -> int:
-        """Rows before the first sample: the row at the start is one, if it has readings."""
+        """LogRows before the first sample: the row at the start is one, if it has readings."""
         return int(not self.state.opening[0])
 
     @cached_property
@@ -137,7 +137,7 @@ class StoredSamples:
 
     @cached_property
     def alive(self) -> Mask:
-        """Rows of the square root at the start that are not zero, as padding is, shape (r,)."""
+        """LogRows of the square root at the start that are not zero, as padding is, shape (r,)."""
         at = self.placed(np.zeros((1, self.start.C.shape[1])), rows=True)
         return np.asarray(at.C[0].any(axis=1) | at.U[0].any(axis=1))
 

@@ -296,15 +296,12 @@ class Observed:
             self._steady_direct = matrix
         return matrix
 
-    def affine(self, moment: Moment) -> tuple[sp.csr_array, Array | None] | None:
-        """Return G and D if z = G u + D q at all times; D is None if sensors see no unknown.
-
-        None for other sensors.
-        """
+    def steady_direct(self, moment: Moment) -> Array | None:
+        """Return D if z = G u + D q at all times; None for other sensors, or if there is no D."""
         if type(self) is not Observed or self.observation.inputs:
             return None
-        D = self._direct(moment)
-        return (self.G, D) if D is self._steady_direct else None
+        self._direct(moment)
+        return self._steady_direct
 
     def linearised(self, z: Array, u: Array) -> Array:
         """Return readings of equivalent linear sensors, by one Newton step from the state u."""

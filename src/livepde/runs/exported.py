@@ -428,8 +428,9 @@ def _vtk(run: Run, path: Path, at: float | None) -> None:
     data = _with_fields(run)
     k = -1
     if at is not None:
-        first, last = float(data["snapshot"][0]), float(data["time"].max())
-        if not min(first, float(data["time"].min())) <= at <= last:
+        first = min(float(data["snapshot"][0]), float(data["time"].min()))
+        last = float(data["time"].max())
+        if not first <= at <= last:
             raise ConfigurationError(
                 f"{path.name}: t = {at:g} is outside the run, from {first:g} to {last:g}."
             )

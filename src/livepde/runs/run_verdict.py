@@ -56,8 +56,8 @@ INPUT_KINDS = {
     "interpolated": "missing values were interpolated",
     "bridged": "values in long gaps were interpolated",
     "ended": "values at the end were missing: the last one before them was held",
-    "missing": "values were missing: the last one before them was held",
-    "begin": "rows at the start were left out: they have no value of it, and none is known yet",
+    "missing": "values were missing: the last one before them, if any, was held",
+    "begin": "rows at the start, before its first value, were left out",
 }
 
 

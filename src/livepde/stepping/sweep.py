@@ -8,7 +8,7 @@ So is what drives the tangents, once the states are known: they have the same Q.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from livepde.stepping.schemes import Advance, Scheme, advance, safe_point
 BLOCK = 256  # steps that are solved for at once
 WIDEST = 256  # coefficients of a state up to which products are cheaper than stages
 NOTHING = np.zeros(0)
+MOST_ENTRIES = 2e7  # of all matrices of a sweep, 160 MB
 REPEATED = 8  # steps of each length, in the mean, from which its matrix is worth its solves
 
 
@@ -124,7 +125,8 @@ class Sweep:
         if not (isinstance(stage, BandedStage) and stage.repeats and steps.repeat):
             return None
         (members, _, m), n = directions.shape, stage.model.X.dim
-        if n > WIDEST:
+        lengths = np.unique(steps.lengths).tolist()
+        if n > WIDEST or len(lengths) * members * n * n > MOST_ENTRIES:
             return None
         still, matrices = np.zeros((members, n, m)), dict[float, Array]()
         bare = cls(
@@ -132,14 +134,12 @@ class Sweep:
         )
         units = np.zeros((1 + n, 1, members, n))
         units[1:, 0] = np.eye(n)[:, None]
-        for h in np.unique(steps.lengths).tolist():
+        for h in lengths:
             some = np.flatnonzero(steps.lengths == h)[:1]
             matrices[h] = bare._each(units, some, {})[1:, 0].transpose(1, 0, 2).copy()
             if not np.isfinite(matrices[h]).all():
                 return None
-        return cls(
-            stage=stage, scheme=scheme, steps=steps, q=q, directions=directions, matrices=matrices
-        )
+        return replace(bare, directions=directions)
 
     @nonfinite_allowed()
     def blocks(self, columns: Array) -> Iterator[tuple[slice, Array]]:
