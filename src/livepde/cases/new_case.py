@@ -47,6 +47,11 @@ def case_schema() -> dict[str, Any]:
     return {"$schema": DIALECT, **schema, "title": "A case of livepde"}
 
 
+def schema_text() -> str:
+    """Return the file of the JSON schema."""
+    return json.dumps(case_schema(), indent=1, ensure_ascii=False) + "\n"
+
+
 def documented(text: str) -> tuple[str, dict[str, str]]:
     """Return the summary of a docstring, and parameter -> its meaning.
 
@@ -458,10 +463,9 @@ def check_free(folder: Path, names: Iterable[str]) -> None:
 def write_files(folder: Path, files: Mapping[str, str]) -> None:
     """Write files that are not there yet, or none; and the schema of cases, which they name."""
     check_free(folder, files)
-    schema = json.dumps(case_schema(), indent=1, ensure_ascii=False) + "\n"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, text in {**files, SCHEMA_FILE: schema}.items():
+        for name, text in {**files, SCHEMA_FILE: schema_text()}.items():
             (folder / name).write_text(text, encoding="utf-8")
     except OSError as error:
         raise RunError(f"{folder}: cannot be written: {error.strerror or error}.") from error

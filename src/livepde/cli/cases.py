@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
 
+from livepde.cases import new_case
+from livepde.cases.measured import Measured, measured
+from livepde.cases.read import blanks_in, filled, parse, read_toml, toml_value
 from livepde.cli.options import names_in, option
 from livepde.cli.printing import extent, named, print_table, terminal
 from livepde.errors import ConfigurationError
-
-if TYPE_CHECKING:
-    from livepde.cases.measured import Measured
-    from livepde.cases.new_case import FoundChannel
-    from livepde.models import Equation
+from livepde.models import EQUATIONS, Equation
+from livepde.runs import Table
 
 
 def init(
@@ -66,17 +66,13 @@ def init(
     Example:  livepde init mycase
     Your own: livepde init mycase --data measured.csv --equation groundwater
     """
-    from livepde.cases.new_case import check_free, files_for, write_files, write_template
-    from livepde.cases.read import filled, parse
-    from livepde.models import EQUATIONS
-
     console = terminal()
     if not data:
         given = {"--equation": equation, "--time-format": time_format, "--set": settings}
         given |= {"--skip": None if skip is None else "given"}
         for option in (name for name, value in given.items() if value):
             raise ConfigurationError(f"{option} requires --data FILE.csv.")
-        case, table = write_template(folder)
+        case, table = new_case.write_template(folder)
         console.print(f"Wrote {case} and {table}. Next:", soft_wrap=True)
     else:
         if equation is not None and ":" in equation:
@@ -84,36 +80,26 @@ def init(
                 f"--equation accepts built-in equations only. Start with any of them, and write "
                 f"'{equation}' into the case."
             )
-        check_free(folder, ["case.toml"])
+        new_case.check_free(folder, ["case.toml"])
         found = named(equation or "heat", EQUATIONS, "equation")
         case = folder / "case.toml"
-        read = _read(data, found, time_format, skip)
-        files = files_for(read, folder, found)
+        read, *others = (
+            measured(file, found.time_unit, time_format=time_format, skip=skip) for file in data
+        )
+        for other in others:
+            read = read.joined(other)
+        files = new_case.files_for(read, folder, found)
         _show_read(console, read, found)
         files["case.toml"] = filled(files["case.toml"], parse(settings or []), f"{case}")
-        write_files(folder, files)
+        new_case.write_files(folder, files)
         _show_written(console, case, data, files)
     console.print(f"  livepde check {case}\n  livepde run {case}", soft_wrap=True)
-
-
-def _read(data: Sequence[Path], equation: Equation, time_format: str, skip: int | None) -> Measured:
-    """Read the tables, and join them."""
-    from livepde.cases.measured import measured
-
-    first, *others = (
-        measured(file, equation.time_unit, time_format=time_format, skip=skip) for file in data
-    )
-    for other in others:
-        first = first.joined(other)
-    return first
 
 
 def _show_written(
     console: Console, case: Path, data: Sequence[Path], files: Mapping[str, str]
 ) -> None:
     """Print the names of the written files, and the keys to fill in there."""
-    from livepde.cases.read import blanks_in, read_toml, toml_value
-
     blanks = blanks_in(read_toml(files["case.toml"], str(case)))
     places = [f"{key} = {toml_value(value)}" for key, value in blanks.items()]
     places += [f"positions in {case.parent / name}" for name in files if name != "case.toml"]
@@ -127,10 +113,7 @@ def _show_written(
 
 def _show_read(console: Console, read: Measured, equation: Equation) -> None:
     """Print a summary of the tables: times, and columns with roles, units and ranges."""
-    from livepde.cases.new_case import channels_in
-    from livepde.runs import Table
-
-    rows = [_channel_row(item, read, equation) for item in channels_in(read, equation)]
+    rows = [_channel_row(item, read, equation) for item in new_case.channels_in(read, equation)]
     for table in read.tables:
         rows += [(name, "row number", "", "", "", "", "") for name in table.row_numbers]
         rows += [(name, "text", "", "", "", "", "") for name in table.texts]
@@ -140,10 +123,10 @@ def _show_read(console: Console, read: Measured, equation: Equation) -> None:
     print_table(console, Table(f"Times in {' and '.join(read.time)}", headings, rows))
 
 
-def _channel_row(item: FoundChannel, read: Measured, equation: Equation) -> tuple[Any, ...]:
+def _channel_row(
+    item: new_case.FoundChannel, read: Measured, equation: Equation
+) -> tuple[Any, ...]:
     """Return columns, role, name, unit, range and number of missing values of a channel."""
-    import numpy as np
-
     role, given = item.given["role"], item.given.get("unit", "")
     state = equation.inputs[item.name] if role == "input" else equation.state
     block = np.array([read.columns[name] for name in item.columns])
@@ -166,9 +149,6 @@ def equations(
 
     Example:  livepde equations heat
     """
-    from livepde.models import EQUATIONS
-    from livepde.runs import Table
-
     console = terminal()
     if name == "list":
         for item in EQUATIONS.values():
@@ -212,7 +192,5 @@ def schema() -> None:
 
     Example:  livepde schema > livepde.schema.json
     """
-    from livepde.cases.new_case import case_schema
-
-    text = json.dumps(case_schema(), indent=1, ensure_ascii=False)
+    text = new_case.schema_text().rstrip()
     terminal().print(text, markup=False, highlight=False, soft_wrap=True)

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
 
+from livepde.cases import Case, Prepared
+from livepde.cases.data import policy_of, source_text
+from livepde.cases.preview import MOST_SAMPLES, advise, preview
 from livepde.cli.options import CaseArgument, CodeOption, SetOption, load_case, option
 from livepde.cli.printing import CHECK_FAILED, extent, print_table, terminal
+from livepde.runs import Table, sampling_findings
+from livepde.stepping import ForwardStage
+from livepde.streams import DataTable
 from livepde.streams.oddities import sentinels, switches
-
-if TYPE_CHECKING:
-    from livepde.cases import Case, Prepared
-    from livepde.streams import DataTable
+from livepde.verdict.sentences import LONGER_DATA
 
 MOST_CHANNELS = 40  # rows of the table of channels
 
@@ -29,7 +32,7 @@ def check(
     ] = None,
     allow_code: CodeOption = False,
     settings: SetOption = None,
-    advise: Annotated[
+    advised: Annotated[
         bool, typer.Option("--advise", help="Recommend a position for one more point sensor.")
     ] = False,
 ) -> None:
@@ -56,7 +59,7 @@ def check(
         *_switching(loaded, samples),
         *_show_preview(console, prepared),
     ]
-    if advise:
+    if advised:
         _show_advice(console, prepared)
     for note in notes:
         console.print(f"[yellow]Note:[/] {escape(note)}", soft_wrap=True)
@@ -106,8 +109,6 @@ def _sampling(prepared: Prepared, samples: DataTable) -> list[str]:
     """Return sentences on times that change their unit or leap, and on pauses."""
     import xarray as xr
 
-    from livepde.runs import sampling_findings
-
     unit = {"units": prepared.case.equation.time_unit}
     attrs = {} if prepared.origin is None else {"origin": prepared.origin.isoformat(sep=" ")}
     times = xr.Dataset(coords={"time": ("time", samples.t, unit)}, attrs=attrs)
@@ -129,10 +130,6 @@ def _switching(case: Case, samples: DataTable) -> list[str]:
 
 def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
     """Print how well the sensors can identify the unknowns; return sentences on it."""
-    from livepde.cases.preview import MOST_SAMPLES, preview
-    from livepde.runs import Table
-    from livepde.verdict.sentences import LONGER_DATA
-
     found = preview(prepared, prepared.stream)
     late = {item.name: item.left for item in found.last}
     rows = [
@@ -167,9 +164,6 @@ def _percent(share: float) -> str:
 
 def _show_advice(console: Console, prepared: Prepared) -> None:
     """Print where one more sensor would help most."""
-    from livepde.cases.preview import advise
-    from livepde.runs import Table
-
     found = advise(prepared, prepared.stream)
     unit = prepared.case.equation.length_unit
     at = ", ".join(f"{x:.3g}" for x in found.position)
@@ -186,9 +180,6 @@ def _show_advice(console: Console, prepared: Prepared) -> None:
 
 def _show_wiring(console: Console, case: Case) -> None:
     """Print the source of a process's samples, and the intake policy of each channel."""
-    from livepde.cases.data import policy_of, source_text
-    from livepde.runs import Table
-
     policy, unit = policy_of(case), case.equation.time_unit
     rows: list[tuple[str, ...]] = []
     for name, column in case.columns.items():
@@ -220,8 +211,6 @@ def _show_wiring(console: Console, case: Case) -> None:
 def _show_model(console: Console, case: Case) -> None:
     model = case.model
     console.print(f"[bold]{escape(case.title)}[/]\n{escape(case.equation.formula)}")
-    from livepde.stepping import ForwardStage
-
     engine = ForwardStage(model).engine
     console.print(
         f"State: {model.X.dim} coefficients; parameter: {model.Q.dim}; "
@@ -231,8 +220,6 @@ def _show_model(console: Console, case: Case) -> None:
 
 
 def _show_data(console: Console, case: Case, prepared: Prepared, samples: DataTable) -> None:
-    from livepde.runs import Table
-
     steps = np.diff(samples.t)
     unit = case.equation.time_unit
     begin = f" from {prepared.origin}" if prepared.origin else ""

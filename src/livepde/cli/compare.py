@@ -10,11 +10,26 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
+from threadpoolctl import threadpool_limits
 
+from livepde import runs
+from livepde.atomic_write import write_bytes
+from livepde.cases.read import filled, parse, read_text
+from livepde.cases.variants import (
+    AS_STATED,
+    LastEstimate,
+    Variant,
+    VariantRun,
+    conclusions,
+    proposed,
+    recommended,
+    run_variant,
+    variant_of,
+)
 from livepde.cli.options import (
     CodeOption,
     JsonOption,
@@ -26,10 +41,10 @@ from livepde.cli.options import (
 )
 from livepde.cli.printing import present
 from livepde.errors import ConfigurationError, RunError
-
-if TYPE_CHECKING:
-    from livepde.cases.variants import LastEstimate, Variant, VariantRun
-    from livepde.runs import Table
+from livepde.plots.style import figure_class
+from livepde.progress import watched
+from livepde.runs import Table
+from livepde.runs.summary import digits, shown
 
 WIDE = 3  # panels beside each other
 COLUMNS = 4  # unknowns of the case in the table of variants; the others have one of their own
@@ -83,15 +98,6 @@ def compare(
     By hand:  livepde compare mycase/case.toml --variant "offset: channels.T_10.offset='0.2 K'"
     Of a run: livepde compare runs/mycase --write mycase/better.toml
     """
-    from livepde.cases.variants import (
-        AS_STATED,
-        Variant,
-        conclusions,
-        proposed,
-        recommended,
-        variant_of,
-    )
-
     given = [variant_of(text) for text in variants or ()]
     named = case
     case, settings, data = _of_run(named, settings or [], data)
@@ -142,8 +148,6 @@ def _of_run(
     """Return case file, settings and data: those of a run if its directory is named."""
     if not case.is_dir():
         return case, list(settings), data
-    from livepde import runs
-
     opened = runs.open(case)
     return opened.case_file(), [*opened.settings, *settings], data or opened.data_file
 
@@ -152,11 +156,8 @@ def _all(
     run: Callable[[Variant], VariantRun], variants: Sequence[Variant], jobs: int, quiet: bool
 ) -> list[VariantRun]:
     """Return how the runs of variants ended, in their order; each in its own process."""
-    from livepde.progress import watched
 
     def apart(variant: Variant) -> VariantRun:
-        from livepde.cases.variants import VariantRun
-
         spawn = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(1, mp_context=spawn) as process:
             try:
@@ -176,18 +177,12 @@ def _run(
     case: Path, settings: Sequence[str], variant: Variant, *, data: str | None, allow_code: bool
 ) -> VariantRun:
     """Run one variant: what a process does."""
-    from threadpoolctl import threadpool_limits
-
-    from livepde.cases.variants import run_variant
-
     with threadpool_limits(1):
         return run_variant(case, settings, variant, data, allow_code)
 
 
 def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> list[Table]:
     """Return the variants, that of the best evidence first, and those that failed."""
-    from livepde.runs import Table
-    from livepde.runs.summary import shown
 
     def rank(one: VariantRun) -> tuple[bool, float]:
         gained = one.gained(base)
@@ -259,8 +254,6 @@ def _draw(runs: Sequence[VariantRun], best: VariantRun, target: Path) -> None:
 
 def _interval(known: LastEstimate | None) -> str:
     """Return an estimate with its interval as text, a dash where there is none."""
-    from livepde.runs.summary import digits
-
     if known is None:
         return "–"
     if not math.isfinite(known.high - known.low):
@@ -283,8 +276,6 @@ def _check_target(target: Path, case: Path, force: bool) -> None:
 
 def _check_figure(target: Path) -> None:
     """Refuse a figure that cannot be written, before anything runs."""
-    from livepde.plots.style import figure_class
-
     known = figure_class()().canvas.get_supported_filetypes()
     if target.suffix.removeprefix(".").lower() not in known:
         raise ConfigurationError(f"--figure {target}: name a file that ends in .png, .pdf or .svg.")
@@ -294,9 +285,6 @@ def _check_figure(target: Path) -> None:
 
 def _written(target: Path, case: Path, *settings: Sequence[str]) -> str:
     """Write a case with settings, one part after the other, and return a sentence on it."""
-    from livepde.atomic_write import write_bytes
-    from livepde.cases.read import filled, parse, read_text
-
     text = read_text(case)
     for each in settings:
         text = filled(text, parse(each), str(case))

@@ -7,19 +7,16 @@ from collections.abc import Callable, Iterable, Sequence
 from enum import StrEnum
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+from rich.console import Console
 from rich.markup import escape
 
 from livepde import __version__
 from livepde.cli.options import JsonOption, OutOption, names_in, option
 from livepde.cli.printing import can_draw, named, report_outcome, show, terminal
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from livepde.runs import Outcome, RunWriter
+from livepde.runs import Outcome, RunWriter, free_path
 
 # The facts are those of CITATION.cff, as a test checks; the year is that of the release.
 BIBTEX = """\
@@ -57,7 +54,6 @@ def demo(out: OutOption = None) -> None:
     Example:  livepde demo
     """
     from livepde.reproduce import EXPERIMENTS
-    from livepde.runs import RunWriter, free_path
 
     console = terminal()
     console.print(
@@ -83,8 +79,6 @@ def run_experiment(
     run: Callable[[], Outcome], out: Path | None, command: Sequence[str], title: str
 ) -> Outcome:
     """Run an experiment, keep its outcome in a new run directory if one is named, and return it."""
-    from livepde.runs import RunWriter
-
     writer = None
     if out is not None:
         writer = RunWriter.create(out, version=__version__, command=list(command), title=title)

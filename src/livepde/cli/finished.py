@@ -12,9 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
+from livepde import runs
 from livepde.cli import options
 from livepde.cli.printing import CHECK_FAILED, can_draw, figures_of, present, terminal
-from livepde.errors import ConfigurationError
+from livepde.dates import dated
+from livepde.errors import ConfigurationError, RunError
+from livepde.runs.directory import attempted, drawn_into, markdown, write_text
+from livepde.runs.web import Address
+from livepde.units import convert
 
 if TYPE_CHECKING:
     from xarray import Dataset
@@ -43,14 +48,9 @@ def report(
     Example:  livepde report runs/mycase
     Theory:   livepde report runs/mycase --theory
     """
-    from livepde import runs
-    from livepde.errors import RunError
-
     if theory:
         _report_theory(runs.open(folder), data, as_json, allow_code)
         return
-    from livepde.runs.directory import attempted, drawn_into, markdown, write_text
-
     opened = runs.open(folder)
     found, checks, notes = opened.dataset, opened.checks, opened.notes
     nothing: list[Any] = []
@@ -86,7 +86,10 @@ def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: boo
     """Process the samples of a run again; print and write the theory report."""
     from livepde.diagnostics import theory_report
 
-    prepared = options.prepare_again(opened, data, allow_code)
+    case = opened.case_file()
+    with options.of_a_run(case.parent == opened.path):
+        loaded = options.load_case(case, allow_code, opened.settings)
+        prepared = loaded.prepare(data or opened.data_file)
     found = theory_report(prepared.identifier, prepared.stream)
     target = opened.path / "theory.md"
     target.write_text(found.markdown(f"Theory: {opened.title}"), encoding="utf-8")
@@ -117,7 +120,6 @@ def export(
     Example:  livepde export runs/mycase mycase.nc mycase.csv mycase.html
     ParaView: livepde export runs/mycase mycase.xdmf
     """
-    from livepde import runs
     from livepde.runs.exported import FORMATS, NEEDS, need, refuse_file
     from livepde.runs.exported import export as write
 
@@ -147,9 +149,6 @@ def export(
 
 def _moment(text: str, data: Dataset) -> float:
     """Return a time of the command line in the run's unit."""
-    from livepde.dates import dated
-    from livepde.units import convert
-
     unit = str(data["time"].attrs.get("units", ""))
     try:
         return float(text)
@@ -187,7 +186,7 @@ def fmu(
     out: Annotated[
         Path | None, options.option("File to write. Default: named after the case.")
     ] = None,
-    fmi: Annotated[Standard, typer.Option(help="Version of FMI: 2 or 3.")] = (Standard.two),
+    fmi: Annotated[Standard, typer.Option(help="Version of FMI: 2 or 3.")] = Standard.two,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
     allow_code: options.CodeOption = False,
@@ -243,9 +242,7 @@ def watch(
     Example:    livepde watch runs/mycase
     Elsewhere:  livepde watch runs/mycase --address 0.0.0.0:8050
     """
-    from livepde import runs
     from livepde.dashboard import serve
-    from livepde.runs.web import Address
 
     if not runs.run_names(folder) or (folder / runs.RECORD).exists():
         runs.open(folder)  # a folder that is not a run is reported before all else

@@ -16,18 +16,20 @@ import typer
 from rich.markup import escape
 from threadpoolctl import threadpool_limits
 
+from livepde import runs
+from livepde.cases import Case, Prepared
+from livepde.cases.member_blocks import MemberBlock, blocks
 from livepde.cli.options import CaseArgument, CodeOption, JsonOption, SetOption, load_case, option
 from livepde.cli.printing import CHECK_FAILED, INTERRUPTED, present
 from livepde.cli.run import concluded, run_batch, writer_of
 from livepde.errors import ConfigurationError, DataError, LivepdeError, RunError
+from livepde.records import STATUS_CODES
+from livepde.runs import JOURNAL, Check, Driven, Run, RunWriter, Table
+from livepde.streams import DataTable
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
-
-    from livepde.cases import Case, Prepared
-    from livepde.cases.member_blocks import MemberBlock
-    from livepde.runs import Check, Driven, Run, RunWriter
 
 SUMMARY = "fleet.csv"
 NAME, DATA = "name", "data"  # columns of the table; every other one is a key of the case
@@ -108,17 +110,15 @@ def fleet(
 
     Example:  livepde fleet rod/case.toml --members rods.csv --out rods --jobs 4
     """
-    from livepde.runs import free_path, refuse_taken
-
     if resume and out is None:
         raise ConfigurationError("--resume requires --out: the folder of the runs to resume.")
     if jobs == 0:
         raise ConfigurationError("--jobs 0: give at least 1, or -1 for one on each processor.")
     rows = _read(members)
     name = load_case(case, allow_code, settings).name
-    folder = out or free_path(Path("runs") / name)
+    folder = out or runs.free_path(Path("runs") / name)
     for row in () if resume else rows:
-        refuse_taken(folder / row.name)
+        runs.refuse_taken(folder / row.name)
     run = FleetRunner(case, folder, allow_code, tuple(settings or ()), resume, separately)
     _report(folder, *_each(run, rows, jobs, backend), as_json=as_json)
 
@@ -131,8 +131,6 @@ def _report(
     as_json: bool,
 ) -> None:
     """Print the outcomes of all members; a member that failed ends the command with an error."""
-    from livepde.runs import Table
-
     wrong = [item for item in ended if item.status == "failed" or item.failed]
     notes = [*_how(ended), *told, *_complaints(ended)]
     lines = [f"[bold]Run directories: {escape(str(folder))}[/]"]
@@ -253,8 +251,6 @@ class FleetRunner:
         self, rows: Sequence[Member]
     ) -> tuple[dict[str, Prepared], dict[str, MemberOutcome]]:
         """Return the members whose case and data could be read, and how the others ended."""
-        from livepde import runs
-
         ended: dict[str, MemberOutcome] = {}
         ready: dict[str, Prepared] = {}
         # Members with the same settings share a case, which is then read and checked only once.
@@ -277,9 +273,6 @@ class FleetRunner:
 
     def _plan(self, ready: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str, str]]:
         """Return the blocks to step together, and why each other member runs on its own."""
-        from livepde.cases.member_blocks import blocks
-        from livepde.runs import JOURNAL
-
         begun = {name for name in ready if (self._target(name) / JOURNAL).exists()}
         new = {name: one for name, one in ready.items() if name not in begun}
         found, apart = ([], dict.fromkeys(new, ASKED)) if self.separately else blocks(new)
@@ -292,8 +285,6 @@ class FleetRunner:
 
         Runs that are still marked as running get this status and reason.
         """
-        from livepde import runs
-
         found = {}
         for name in (row.name for row in rows if row.name not in ended):
             target = self._target(name)
@@ -334,8 +325,6 @@ class FleetRunner:
         self, block: MemberBlock, members: Mapping[str, Member]
     ) -> dict[str, MemberOutcome]:
         """Run members as a block."""
-        from livepde.runs import JOURNAL
-
         ended = {}
         try:
             writers = {
@@ -371,9 +360,6 @@ class FleetRunner:
 
     def _through(self, member: Member, prepared: Prepared) -> MemberOutcome | None:
         """Return how a run ended that has taken all of its samples before; None if it has not."""
-        from livepde import runs
-        from livepde.streams import DataTable
-
         target, table = self._target(member.name), prepared.stream
         if not (self.resume and (target / runs.RECORD).exists() and isinstance(table, DataTable)):
             return None
@@ -391,9 +377,6 @@ def _interrupted(ended: Mapping[str, MemberOutcome]) -> bool:
 def _outcome_of(
     name: str, run: Driven | Run, dataset: xr.Dataset, checks: Sequence[Check]
 ) -> MemberOutcome:
-    from livepde.records import STATUS_CODES
-    from livepde.runs import verdict
-
     unknowns = {
         label: (float(dataset[label][-1]), float(dataset[f"{label}_std"][-1]))
         for label in filter(None, dataset.attrs["scalars"].split("\n"))
@@ -407,7 +390,7 @@ def _outcome_of(
         name,
         run.status,
         samples,
-        level=verdict(dataset).level if samples else "",
+        level=runs.verdict(dataset).level if samples else "",
         unknowns=unknowns,
         failed=failed,
         lost=lost,

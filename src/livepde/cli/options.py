@@ -6,13 +6,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-if TYPE_CHECKING:
-    from livepde.cases import Case, Prepared
-    from livepde.runs import Run
+from livepde import cases
+from livepde.cases import Case
+from livepde.cases.read import parse
+from livepde.errors import CaseError, RunError
 
 
 def option(text: str, *names: str, **more: Any) -> Any:
@@ -72,25 +73,12 @@ def names_in(place: str) -> Callable[[str], list[str]]:
 
 def load_case(case: Path, allow_code: bool, settings: Sequence[str] | None) -> Case:
     """Read a case with the settings of the command line."""
-    from livepde import cases
-    from livepde.cases.read import parse
-
     return cases.load(case, allow_code=allow_code, settings=parse(settings or ()))
-
-
-def prepare_again(opened: Run, data: str | None, allow_code: bool) -> Prepared:
-    """Read the case and the data of a run, with its settings."""
-    case = opened.case_file()
-    with of_a_run(case.parent == opened.path):
-        loaded = load_case(case, allow_code, opened.settings)
-        return loaded.prepare(data or opened.data_file)
 
 
 @contextmanager
 def of_a_run(stored: bool) -> Iterator[None]:
     """Raise an error of a case as one of its run, if the case is the one that the run stored."""
-    from livepde.errors import CaseError, RunError
-
     try:
         yield
     except CaseError as error:

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from livepde import __version__
+from livepde import __version__, plots, runs
+from livepde.cases.read import did_you_mean
 from livepde.errors import ConfigurationError
-
-if TYPE_CHECKING:
-    from livepde.runs import Check, Journal, Outcome, Table
+from livepde.runs import Check, Journal, Outcome, Table
+from livepde.runs.directory import plain
 
 MOST_CURVES = 100_000  # samples of a run whose readings are drawn
 CHECK_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
@@ -31,42 +34,33 @@ def terminal(*, err: bool = False) -> Console:
 def named(name: str, known: Mapping[str, Any], what: str) -> Any:
     """Return an item by name; one sentence with the closest name if there is none."""
     if name not in known:
-        from livepde.cases.read import did_you_mean
-
         raise ConfigurationError(f"there is no {what} '{name}'; {did_you_mean(name, known)}")
     return known[name]
 
 
 def can_draw(console: Console) -> bool:
     """Return whether figures can be drawn; if not, print why."""
-    import importlib.util
-
     found = importlib.util.find_spec("matplotlib") is not None
     if not found:
         console.print(escape(FIGURES_MISSING))
     return found
 
 
-def figures_of(dataset: Any, title: str, journal: Journal | None = None) -> dict[str, Any]:
-    """Return the figures of a run: name -> function that draws.
-
-    A journal has the readings for the first panels.
-    """
-    from livepde import plots
-
+def figures_of(dataset: Any, title: str, journal: Journal | None) -> dict[str, Any]:
+    """Return the figures of a run: name -> function that draws, with readings of the journal."""
     if not dataset.sizes["time"]:
         return {}
     kinds = [of for of in ("sensor", "validation") if of in dataset]
     names = [str(name) for of in kinds for name in dataset[of].values]
     few = journal is not None and names and len(journal) <= MOST_CURVES
-    measured = journal.readings(names) if journal is not None and few else None
+    measured = journal.readings(names) if few and journal is not None else None
     return {"overview": lambda: plots.overview(dataset, title=title, measured=measured)}
 
 
 def report_outcome(outcome: Outcome, command: Sequence[str], as_json: bool) -> None:
     """Print an outcome; with `as_json` a failed check ends the command with exit code 1."""
-    results = outcome.tables, outcome.checks, outcome.notes
-    present(*results, as_json=as_json, command=" ".join(command))
+    shown = outcome.tables, outcome.checks, outcome.notes
+    present(*shown, as_json=as_json, command=" ".join(command))
     if as_json and not outcome.ok:
         raise typer.Exit(CHECK_FAILED)
 
@@ -95,14 +89,11 @@ def present(
         for line in lines:
             console.print(line, soft_wrap=True)
         return
-    from livepde.runs import measures, verdict
-    from livepde.runs.directory import plain
-
     content: dict[str, Any] = {"livepde": __version__, **facts}
     content["checks"] = [item.to_dict() for item in checks]
     if dataset is not None:
-        content["measures"] = measures(dataset)
-        content["verdict"] = verdict(dataset).to_dict()
+        content["measures"] = runs.measures(dataset)
+        content["verdict"] = runs.verdict(dataset).to_dict()
     content["tables"] = [item.to_dict() for item in shown]
     content["notes"] = list(notes)
     sys.stdout.write(json.dumps(plain(content), ensure_ascii=False) + "\n")
@@ -126,8 +117,6 @@ def show(
 
 def extent(values: Any) -> tuple[str, str, int]:
     """Return the least and the largest of the values that are present, and how many are not."""
-    import numpy as np
-
     present = values[np.isfinite(values)]
     ends = (f"{present.min():.4g}", f"{present.max():.4g}") if present.size else ("–", "–")
     return *ends, values.size - present.size
@@ -139,8 +128,6 @@ def print_table(console: Console, table: Table) -> None:
     A table without rows is its title. A table whose numbers alone are wider than the terminal is
     printed as wide as they are.
     """
-    from rich.box import SIMPLE_HEAD
-
     if not table.rows:
         console.print(f"[bold]{escape(table.title)}[/]", soft_wrap=True)
         return

@@ -22,21 +22,25 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 from rich.markup import escape
 
-from livepde import __version__
+from livepde import __version__, runs
+from livepde.cases import Case, LiveCase, Prepared
+from livepde.cases.remedies import after_gaps, start_missed, with_settings
 from livepde.cli import options, printing
 from livepde.errors import ConfigurationError, DataError, LivepdeError
+from livepde.identifier import Identifier
+from livepde.laws import SensitivityLaw
+from livepde.linalg import Array
+from livepde.result import Estimate
+from livepde.runs import JOURNAL, RECORD, Check, Driven, Journal, RunWriter, Sink, Table
+from livepde.runs.directory import attempted
+from livepde.runs.monitor import JsonLinesSink, Metrics, Monitor
+from livepde.runs.monitor import configure as configure_logging
+from livepde.runs.web import Address
+from livepde.streams import DataTable
+from livepde.verdict import Verdict
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from livepde.cases import Case, Prepared
-    from livepde.cases.live_case import LiveCase
-    from livepde.identifier import Identifier
-    from livepde.linalg import Array
-    from livepde.result import Estimate
-    from livepde.runs import Check, Driven, RunWriter, Table
-    from livepde.runs.live_loop import Sink
-    from livepde.verdict import Verdict
 LOG = logging.getLogger("livepde.run")
 BEAT = 60.0  # seconds between two lines of the log that say how far a run is
 METRICS_PORT = 9100
@@ -122,8 +126,6 @@ def run(
     Replay:   livepde run mycase/case.toml --realtime --speed 3600 --watch 8050
     Service:  livepde run mycase/case.toml --realtime --out runs/mycase --resume --listen 9100
     """
-    from livepde.runs.monitor import configure
-
     loaded = options.load_case(case, allow_code, settings)
     source = sys.stdin if data == "-" else data
     own = loaded.goes_on(data)
@@ -137,7 +139,7 @@ def run(
     write = partial(writer_of, loaded, folder, settings or (), resume, ["livepde", *sys.argv[1:]])
     with ExitStack() as stack:
         if live:
-            configure(log.value)
+            configure_logging(log.value)
             writer, taken = run_live(loaded, how, folder, write, stack)
         else:
             writer, taken = run_batch(loaded.prepare(source), folder, write, stack, quiet=as_json)
@@ -157,14 +159,12 @@ def run(
 
 def _run_directory(loaded: Case, out: Path | None, resume: bool) -> Path:
     """Return the folder of the run: the given one, which must be free for a new run, or another."""
-    from livepde.runs import free_path, refuse_taken
-
     if out is None:
         if resume:
             raise ConfigurationError("--resume requires --out: the run directory to resume.")
-        return free_path(Path("runs") / loaded.name)
+        return runs.free_path(Path("runs") / loaded.name)
     if not resume:
-        refuse_taken(out)
+        runs.refuse_taken(out)
     return out
 
 
@@ -207,8 +207,6 @@ def writer_of(
     loaded: Case, folder: Path, settings: Sequence[str], resume: bool, command: Sequence[str]
 ) -> RunWriter:
     """Return the writer of the run directory, a new or a resumed one."""
-    from livepde.runs import RECORD, RunWriter
-
     about: dict[str, Any] = {
         "version": __version__,
         "command": command,
@@ -230,9 +228,6 @@ def run_batch(
     quiet: bool,
 ) -> tuple[RunWriter, tuple[Prepared, Driven]]:
     """Run a case on finished data; an unusable sample ends the run."""
-    from livepde.runs import JOURNAL, Journal, drive
-    from livepde.streams import DataTable
-
     identifier = prepared.identifier  # raises on inconsistent data before anything is written
     writer, path = write(), folder / JOURNAL
     table = prepared.stream if isinstance(prepared.stream, DataTable) else None
@@ -242,7 +237,7 @@ def run_batch(
         journal = stack.enter_context(prepared.journal(path))
         for (kind, channel), number in (table.remarks if table else {}).items():
             journal.count(kind, channel, number)
-    driven = drive(
+    driven = runs.drive(
         identifier,
         prepared.stream,
         progress=not quiet,
@@ -271,40 +266,41 @@ def concluded(
     draw: bool = True,
 ) -> Conclusion:
     """Write the results of a run, with figures if `draw`, and return them."""
-    from livepde.runs import arrivals, checks_of, tables, verdict_table
-    from livepde.runs.directory import attempted
-    from livepde.verdict import Verdict
+    from livepde.diagnostics import identifiability
 
-    loaded = prepared.case
+    loaded, journal = prepared.case, driven.journal
     notes: list[str] = []
     nothing: list[Any] = []
     ended = attempted("The final estimate", driven.result.dataset, None, notes)
-    dataset = driven.journal.dataset() if ended is None else ended
+    dataset = journal.dataset() if ended is None else ended
     # The estimates are written first: they are safe if something below fails or takes long.
     writer.finish(status=driven.status, dataset=dataset, identifier=identifier, notes=loaded.notes)
     judged = partial(_judged, prepared, driven, dataset)
     found = attempted("The verdict", judged, Verdict.unjudged(), notes)
     dataset.attrs["verdict"] = json.dumps(found.to_dict())
     shown = [
-        *([verdict_table(found)] if len(driven.result) else []),
-        *attempted("The tables", lambda: tables(dataset), nothing, notes),
-        *attempted("The table of irregular rows", lambda: arrivals(driven.journal), nothing, notes),
+        *([runs.verdict_table(found)] if len(driven.result) else []),
+        *attempted("The tables", lambda: runs.tables(dataset), nothing, notes),
+        *attempted("The table of irregular rows", lambda: runs.arrivals(journal), nothing, notes),
     ]
-    checks = attempted("The checks", lambda: checks_of(loaded.expected, dataset), nothing, notes)
+    expected = loaded.expected
+    checks = attempted("The checks", lambda: runs.checks_of(expected, dataset), nothing, notes)
     notes[:0] = [*loaded.notes, *found.sentences]
-    if len(driven.result):
-        notes += attempted("Identifiability", lambda: _traded(loaded, identifier), nothing, notes)
-        if loaded.spec.output.smoothed:
-            smooth = partial(_with_smoothed, prepared, driven, dataset)
-            dataset, told = attempted("The smoother", smooth, (dataset, nothing), notes)
-            notes += told
+    if len(driven.result) and isinstance(loaded.law, SensitivityLaw):
+        notes += attempted(
+            "Identifiability", lambda: identifiability(identifier).sentences, nothing, notes
+        )
+    if len(driven.result) and loaded.spec.output.smoothed:
+        smooth = partial(_with_smoothed, prepared, driven, dataset)
+        dataset, told = attempted("The smoother", smooth, (dataset, nothing), notes)
+        notes += told
     if driven.status == "interrupted":
         notes.append(f"Interrupted after {len(driven.result)} samples.")
     if driven.error is not None:
         notes.append(f"Stopped after {len(driven.result)} samples: {driven.error}")
     figures: dict[str, Any] = {}
     if draw and printing.can_draw(printing.terminal(err=True)):
-        figures = printing.figures_of(dataset, loaded.title, driven.journal)
+        figures = printing.figures_of(dataset, loaded.title, journal)
     writer.finish(
         status=driven.status,
         dataset=dataset,
@@ -319,20 +315,13 @@ def concluded(
 
 def _judged(prepared: Prepared, driven: Driven, dataset: xr.Dataset) -> Verdict:
     """Return the verdict on a run, with settings of the case that would remedy what was found."""
-    from livepde import runs
-    from livepde.cases.remedies import after_gaps, start_missed, with_settings
-
     raw, journal = prepared.raw, driven.journal
 
     def readings() -> tuple[Array, Array]:
         return journal.readings(journal.channels) if raw is None else (raw.t, raw.values)
 
     inputs = runs.input_findings(journal, prepared.case.roles("boundary", "input"))
-    found = [
-        *runs.sampling_findings(dataset, readings),
-        *runs.clock_findings(journal),
-        *inputs,
-    ]
+    found = [*runs.sampling_findings(dataset, readings), *runs.clock_findings(journal), *inputs]
     verdict = after_gaps(runs.verdict(dataset).with_findings(found), inputs)
     return with_settings(prepared, verdict.with_findings(start_missed(prepared, verdict)))
 
@@ -354,28 +343,18 @@ def _with_smoothed(
     return with_smoothed(dataset, smoothed), []
 
 
-def _traded(loaded: Case, identifier: Identifier) -> list[str]:
-    """Return sentences on the identifiability of the unknowns by the whole run."""
-    from livepde.diagnostics import identifiability
-    from livepde.laws import SensitivityLaw
-
-    if not isinstance(loaded.law, SensitivityLaw):
-        return []
-    return identifiability(identifier).sentences
-
-
 @dataclass(frozen=True)
 class LiveOptions:
     """Options of a live run, as given to the command."""
 
-    data: str | Iterable[str] | None = None  # instead of the case's own source
-    goes_on: bool = False  # whether the source continues by itself, at its own pace
-    speed: float | None = None
-    listen: str | None = None
-    page: str | None = None
-    token: str = ""
-    estimates: bool = False
-    allow_env: tuple[str, ...] = ()
+    data: str | Iterable[str] | None  # instead of the case's own source
+    goes_on: bool  # whether the source continues by itself, at its own pace
+    speed: float | None
+    listen: str | None
+    page: str | None
+    token: str
+    estimates: bool
+    allow_env: tuple[str, ...]
 
     @property
     def pace(self) -> float:
@@ -393,9 +372,6 @@ def run_live(
     `write`: makes the run directory; called when the source is connected.
     `stack`: closes all opened resources, among them the journal, from which the result reads.
     """
-    from livepde.cases.live_case import LiveCase
-    from livepde.runs import JOURNAL, conduct, stopped_by_signals
-
     wiring = stack.enter_context(
         LiveCase(case, how.data, path=folder / JOURNAL, pace=how.pace, allow_env=how.allow_env)
     )
@@ -407,14 +383,14 @@ def run_live(
         import_module(library)
     if how.page is not None:
         _show(how.page, how.token, folder, stack)
-    with stopped_by_signals(stopping, lambda: True):
+    with runs.stopped_by_signals(stopping, lambda: True):
         try:
             live = wiring.live(sinks, stopping)
         except DataError as error:
             writer.finish(status="failed", notes=[str(error)])
             raise
         if live is not None and wiring.prepared is not None:
-            return writer, (wiring.prepared, conduct(live, patient=True))
+            return writer, (wiring.prepared, runs.conduct(live, patient=True))
     writer.finish(status="interrupted", notes=["Ended before the first sample."])
     raise typer.Exit(printing.INTERRUPTED)
 
@@ -457,8 +433,6 @@ def _observers(
     case: Case, how: LiveOptions, stack: ExitStack, health: Callable[[], Mapping[str, Any]]
 ) -> list[Sink]:
     """Start servers and outputs of a live run, and return their sinks."""
-    from livepde.runs.web import Address
-
     if how.page is not None:
         from livepde.dashboard import check_installed
 
@@ -466,12 +440,8 @@ def _observers(
         check_installed()
     sinks: list[Sink] = [_Heartbeat()]
     if how.estimates:
-        from livepde.runs.monitor import JsonLinesSink
-
         sinks.append(JsonLinesSink(sys.stdout))
     if how.listen is not None:
-        from livepde.runs.monitor import Metrics, Monitor
-
         metrics = Metrics(case.sensors, case.clock.second)
         monitor = Monitor(Address.read(how.listen, METRICS_PORT, how.token), health, metrics)
         stack.callback(monitor.close)
