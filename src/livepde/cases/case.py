@@ -485,7 +485,7 @@ def _noise(case: CaseContent, spec: SensitivitySpec) -> float | str | None:
     """Return the noise of the law, which needs it here or from every sensor."""
     if spec.noise is not None and spec.noise != "auto":
         return case.positive(spec.noise, case.equation.state.unit, "law.noise")
-    if case_channels.noise_of(case, "sensor") is None:
+    if case_channels.noise_of(case) is None:
         if spec.noise == "auto":
             text = "got 'auto', which begins with a guess: give every sensor its noise."
             raise case.error("law.noise", text)

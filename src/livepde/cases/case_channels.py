@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -36,41 +37,26 @@ MEMBERS = 10_000  # channels of one `each`
 
 
 def columns_of(case: CaseContent) -> dict[str, Column]:
-    """Return channel -> its column in the data."""
-    found = {}
+    """Return channel -> its column in the data, and the column of the noise of its readings."""
+    found, decimal = {}, case.spec.data.decimal
     for name, channel in case.spec.channels.items():
         unit = case.unit(name)
         rule = conversion(channel.unit or unit, unit, case.where(f"channels.{name}.unit"))
         valid = (-np.inf, np.inf)
         if channel.valid is not None:
             valid = case.pair(channel.valid, unit, f"channels.{name}.valid")
-        needed = channel.gaps == "skip"
-        factor = 1.0 if channel.factor is None else channel.factor
-        found[name] = Column(
-            channel.sources,
-            factor * rule.factor,
-            rule.offset,
-            valid,
-            needed,
-            decimal=case.spec.data.decimal,
-            between=channel.between,
-        )
-        if channel.noise_column is not None:
-            found[noise_channel(name)] = _noise_column(case, name, channel, factor * rule.factor)
+        needed, factor = channel.gaps == "skip", (channel.factor or 1.0) * rule.factor
+        common: dict[str, Any] = {"decimal": decimal, "between": channel.between}
+        found[name] = Column(channel.sources, factor, rule.offset, valid, needed, **common)
+        if channel.noise_column is None:
+            continue
+        key, noise = f"channels.{name}.noise_column", noise_channel(name)
+        if isinstance(case.spec.law, schema.GradientSpec):
+            raise case.error(key, "the gradient law does not weight readings: leave it out.")
+        if noise in case.spec.channels:
+            raise case.error(key, f"another channel is called '{noise}': rename it.")
+        found[noise] = Column((channel.noise_column,), factor, decimal=decimal, noise_of=name)
     return found
-
-
-def _noise_column(
-    case: CaseContent, name: str, channel: schema.ChannelSpec, factor: float
-) -> Column:
-    """Return where the noise of the readings of a channel comes from, in its unit."""
-    key = f"channels.{name}.noise_column"
-    if isinstance(case.spec.law, schema.GradientSpec):
-        raise case.error(key, "the gradient law does not weight readings: leave it out.")
-    if noise_channel(name) in case.spec.channels:
-        raise case.error(key, f"another channel is called '{noise_channel(name)}': rename it.")
-    decimal = case.spec.data.decimal
-    return Column((str(channel.noise_column),), factor, decimal=decimal, noise_of=name)
 
 
 def observation_of(case: CaseContent, *roles: str) -> observation.Observation | None:
@@ -83,7 +69,7 @@ def observation_of(case: CaseContent, *roles: str) -> observation.Observation | 
     for name, channel in channels.items():
         kinds.setdefault((_kind(channel), channel.of), {})[name] = channel
     names = [*chain.from_iterable(kinds.values())]
-    levels = noise_of(case, *roles) if assimilated else None
+    levels = noise_of(case) if assimilated else None
     units = {case.unit(name) for name in names}
     outer: dict[str, Any] = {
         "noise": levels and [levels[name] for name in names],
@@ -130,15 +116,6 @@ def _regions(case: CaseContent, channels: Mapping[str, schema.ChannelSpec]) -> d
     return regions
 
 
-def _lines(case: CaseContent, channels: Mapping[str, schema.ChannelSpec]) -> dict[str, Any]:
-    """Return the ends of lines along which means are taken."""
-    return {
-        name: tuple(_inside_mesh(case, end, f"channels.{name}.along") for end in item.along)
-        for name, item in channels.items()
-        if item.along is not None
-    }
-
-
 def _followed(
     case: CaseContent, channels: Mapping[str, schema.ChannelSpec]
 ) -> dict[str, tuple[str, ...]]:
@@ -150,10 +127,8 @@ def _followed(
         for channel in given:
             text = f"there is no channel '{channel}' of role position"
             case.require(channel, known, f"channels.{name}.follows", text)
-        if len(given) != len(case.mesh.p):
-            text = (
-                f"got {len(given)} channels; needs one for each of {len(case.mesh.p)} coordinates."
-            )
+        if len(given) != (needed := len(case.mesh.p)):
+            text = f"got {len(given)} channels; needs one for each of {needed} coordinates."
             raise case.error(f"channels.{name}.follows", text)
         positions[name] = given
     return positions
@@ -175,7 +150,11 @@ def _part(
     if kind == "over":
         return observation.Averages(_regions(case, channels), **common)
     if kind == "along":
-        return observation.LineIntegrals(_lines(case, channels), mean=True, **common)
+        lines: dict[str, Any] = {
+            name: tuple(_inside_mesh(case, at, f"channels.{name}.along") for at in item.along or ())
+            for name, item in channels.items()
+        }
+        return observation.LineIntegrals(lines, mean=True, **common)
     if kind == "follows":
         return observation.Moving(_followed(case, channels), **common)
     points = {name: _position(case, name, item) for name, item in channels.items()}
@@ -187,7 +166,8 @@ def _part(
         for name, item in channels.items()
         if item.quantity is not None
     }
-    uncertain = {name: std for name, std in _shifted(case).items() if name in channels}
+    stds = _stated(case, "at_std", "sensor")
+    uncertain = {name: std for name, std in stds.items() if name in channels}
     # A family of point sensors of which one names a component has one for each.
     numbers = [item.component for item in channels.values()]
     if any(number is not None for number in numbers):
@@ -222,7 +202,7 @@ def _reconstruction(case: CaseContent) -> observation.Reconstruction:
         return observation.Pseudoinverse()
     spec = schema.TikhonovSpec() if given is True else given
     alpha = observation.Discrepancy(spec.tau) if spec.alpha == "discrepancy" else spec.alpha
-    if spec.alpha == "discrepancy" and noise_of(case, "sensor") is None:
+    if spec.alpha == "discrepancy" and noise_of(case) is None:
         text = "the discrepancy principle needs the noise of every sensor; or give alpha a number."
         raise case.error("law.tikhonov.alpha", text)
     return observation.Tikhonov(spec.norm, alpha)
@@ -230,14 +210,12 @@ def _reconstruction(case: CaseContent) -> observation.Reconstruction:
 
 def _position(case: CaseContent, name: str, channel: schema.ChannelSpec) -> Any:
     """Return where a point sensor sits: a number, or a list of coordinates."""
-    key = f"channels.{name}.at"
-    low, high = case.mesh.p.min(axis=1), case.mesh.p.max(axis=1)
-    if channel.quantity is not None:
-        known, asked = case.equation.quantities, channel.quantity
-        text = f"'{case.equation.name}' has no quantity '{asked}'"
-        case.require(asked, known, f"channels.{name}.quantity", text)
-        return known[asked].at(float(low[0]), float(high[0]))
-    return _inside_mesh(case, channel.at, key)
+    if channel.quantity is None:
+        return _inside_mesh(case, channel.at, f"channels.{name}.at")
+    known, asked, x = case.equation.quantities, channel.quantity, case.mesh.p[0]
+    text = f"'{case.equation.name}' has no quantity '{asked}'"
+    case.require(asked, known, f"channels.{name}.quantity", text)
+    return known[asked].at(float(x.min()), float(x.max()))
 
 
 def _inside_mesh(case: CaseContent, at: Any, key: str) -> Any:
@@ -260,13 +238,8 @@ def _inside_mesh(case: CaseContent, at: Any, key: str) -> Any:
     return place[0] if len(place) == 1 else place
 
 
-def sensor_notes(case: CaseContent) -> list[str]:
-    """Return notes on positions of sensors that are allowed and yet doubtful."""
-    return [*_noisy_fluxes(case), *_crowded(case)]
-
-
-def _noisy_fluxes(case: CaseContent) -> Iterator[str]:
-    """Yield a note on each flux that is measured at a boundary with a noisy value."""
+def sensor_notes(case: CaseContent) -> Iterator[str]:
+    """Yield notes on fluxes at a boundary with a noisy value, and on sensors all in one cell."""
     noisy = {item.at: name for name, item in case.roles("boundary").items() if item.noise}
     for name, item in case.roles("sensor").items():
         if item.is_flux and item.at in noisy:
@@ -276,27 +249,23 @@ def _noisy_fluxes(case: CaseContent) -> Iterator[str]:
                 f"'{item.at}'. Make {other} a sensor at that end, and the flux an unknown that "
                 f"moves: boundary.{item.at} = {{ flux = 'J' }} with unknowns.J.evolution."
             )
-
-
-def _crowded(case: CaseContent) -> list[str]:
-    """Return a note if all sensors lie in one cell."""
     shown = case.roles(*schema.SENSORS).items()
     channels = {name: item for name, item in shown if not item.is_flux}
     if len(case.mesh.p) != 1 or not channels or any(item.at is None for item in channels.values()):
-        return []
+        return
     at = {float(_position(case, name, item)) for name, item in channels.items()}
-    if len(at) == 1 or len(set(np.searchsorted(np.sort(case.mesh.p[0]), list(at)).tolist())) > 1:
-        return []
-    return [
-        f"All sensors ({', '.join(channels)}) lie in one cell of the mesh, which barely "
-        "distinguishes them. Increase `mesh.cells`, or refine the left end with "
-        "`mesh.spacing = 'geometric'`."
-    ]
+    cells = set(np.searchsorted(np.sort(case.mesh.p[0]), list(at)).tolist())
+    if len(at) > 1 and len(cells) == 1:
+        yield (
+            f"All sensors ({', '.join(channels)}) lie in one cell of the mesh, which barely "
+            "distinguishes them. Increase `mesh.cells`, or refine the left end with "
+            "`mesh.spacing = 'geometric'`."
+        )
 
 
-def noise_of(case: CaseContent, *roles: str) -> dict[str, float] | None:
-    """Return the noise of each sensor of some roles; None if none is given."""
-    channels, levels = case.roles(*roles), _stated(case, "noise", *roles)
+def noise_of(case: CaseContent) -> dict[str, float] | None:
+    """Return the noise of each assimilated sensor; None if none is given."""
+    channels, levels = case.roles("sensor"), _stated(case, "noise", "sensor")
     if levels and len(levels) < len(channels):
         missing = next(name for name, item in channels.items() if item.noise is None)
         text = "give every sensor its noise, or none and law.noise instead."
@@ -316,38 +285,31 @@ def between_of(case: CaseContent) -> dict[str, Between]:
 
 
 def initial_of(case: CaseContent, first: Sample) -> Any:
-    """Return the initial state: a number (of each component), or the first sample interpolated.
-
-    Validation channels take no part.
-    """
-    if case.spec.initial is None:
+    """Return the initial state: a number (of each component), or the first sample interpolated."""
+    stated, unit = case.spec.initial, case.equation.state.unit
+    if stated is None:
         raise case.missing("initial", "a number, or 'interpolate' from the first sample.")
-    if isinstance(case.spec.initial, dict):
-        unit, parts = case.equation.state.unit, case.spec.initial.items()
-        return {name: case.convert(v, unit, f"initial.{name}") for name, v in parts}
-    initial = case.spec.initial.start
+    if isinstance(stated, dict):
+        return {name: case.convert(v, unit, f"initial.{name}") for name, v in stated.items()}
+    initial = stated.start
     if initial not in INTERPOLATED:
         if isinstance(initial, str) and not any(letter.isdigit() for letter in initial):
             text = f"got '{initial}'; {did_you_mean(initial, [*INTERPOLATED, 'a number'])}"
             raise case.error("initial", text)
-        return case.convert(initial, case.equation.state.unit, "initial")
+        return case.convert(initial, unit, "initial")
     if len(case.mesh.p) != 1:
         raise case.error("initial", f"'{initial}' needs an interval; give a number.")
-    at, level = _level(_initial_readings(case, first))
-    return partial(_interpolated, at, level)
+    return partial(_interpolated, *_level(_initial_readings(case, first)))
 
 
 def initial_weights(case: CaseContent, first: Sample) -> dict[str, Any]:
-    """Return channel -> how an interpolated initial state changes with its reading, and its noise.
+    """Return channel -> change x -> u of an interpolated start with its reading, and its noise.
 
-    As x -> u, and NaN for that of the sensor. Empty where readings are taken as exact (`initial =
-    "interpolate-exact"`).
+    The noise is NaN where it is that of the sensor. Empty where readings are taken as exact.
     """
     if not _made_of_readings(case):
         return {}
-    readings = _initial_readings(case, first)
-    given = by_name(first.z, ())
-    found = {}
+    readings, given, found = _initial_readings(case, first), by_name(first.z, ()), {}
     for number, one in enumerate(readings):
         # Interpolation is linear: its derivative by a reading is that of 1 there and 0 elsewhere.
         unit = [other._replace(value=float(n == number)) for n, other in enumerate(readings)]
@@ -365,11 +327,7 @@ def _made_of_readings(case: CaseContent) -> bool:
 
 
 def initial_errors(case: CaseContent, first: Sample) -> tuple[Any, ...]:
-    """Return the errors of the initial state itself, each a function of x: see `random_field`.
-
-    Between readings they are as large as stated, or by the spread of the readings. A stated profile
-    has none unless they are stated.
-    """
+    """Return the errors of the initial state itself, each a function of x: see `random_field`."""
     initial = case.spec.initial
     if initial is None or isinstance(initial, dict):
         return ()
@@ -396,10 +354,8 @@ def check_initial(case: CaseContent) -> None:
         raise case.error(key, "requires the standard deviation of the start; add initial.std.")
     if case.equation.components:
         raise case.error(key, "is only valid for a state of one component; leave it out.")
-    if case.spec.law.kind != "sensitivity":
-        raise case.error(
-            key, f"law.kind = '{case.spec.law.kind}' has no covariance for it; leave it out."
-        )
+    if (kind := case.spec.law.kind) != "sensitivity":
+        raise case.error(key, f"law.kind = '{kind}' has no covariance for it; leave it out.")
 
 
 def _interpolated(at: Sequence[float], values: Sequence[float], x: Any) -> Any:
@@ -429,8 +385,7 @@ def _initial_readings(case: CaseContent, first: Sample) -> list[_Reading]:
         if channel.role == "boundary" and channel.at in ends:
             found.append(_Reading(ends[str(channel.at)], values[name], name))
         elif channel.role == "sensor" and channel.at is not None and not channel.is_flux:
-            place = _position(case, name, channel)
-            found.append(_Reading(place, values[name], name))
+            found.append(_Reading(_position(case, name, channel), values[name], name))
     present = [one for one in found if np.isfinite(one.value)]
     if not present:
         raise MissingInputError(
@@ -456,8 +411,7 @@ def expanded(case: CaseContent) -> CaseContent:
                 raise case.error(key, f"there is a channel '{label}' already; rename it.")
             member = {"each": None, "positions": None, "at": at, "column": column}
             channels[label] = channel.model_copy(update=member)
-    spec: schema.CaseSpec = case.spec.model_copy(update={"channels": channels})
-    return CaseContent(case.path, spec, case.equation, case.reader)
+    return replace(case, spec=case.spec.model_copy(update={"channels": channels}))
 
 
 def _evenly(
@@ -483,10 +437,10 @@ def _listed(
     table = _positions_table(case, key, file)
     axes = [axis for axis in "xyz" if axis in table.columns]
     found: dict[str, tuple[Any, str]] = {}
+    # Row 1 of the file is its header.
     blank = [k for k, row in enumerate(table[axes].to_numpy(), 2) if any(map(is_blank, row))]
     if blank:
         raise CaseError("\n".join(f"{file}, row {k}: replace '?' by a value." for k in blank))
-    # Row 1 of the file is its header.
     for row, label in enumerate(table["name"], 2):
         if not label or label in found:
             what = f"the name '{label}' occurs twice" if label else "the name is missing"
@@ -535,18 +489,22 @@ def unknowns_of(case: CaseContent) -> dict[str, fem.Unknown]:
         prior = fem.Normal(0.0, _common(case, offsets, "offset"))
         found["offset"] = fem.Scalars(tuple(offsets), prior, unit=unit)
     # A gain is a factor without a unit, 1 for an exact sensor.
-    if gains := _stated(case, "gain", "sensor", unit=""):
+    if gains := _stated(case, "gain", "sensor"):
         found["gain"] = fem.Scalars(tuple(gains), fem.Normal(1.0, _common(case, gains, "gain")))
-    if stds := _shifted(case):
-        places = {name: case.spec.channels[name].at for name in stds}
-        names = [
-            shift
-            for name, at in places.items()
-            for shift in shift_names(name, len(at) if isinstance(at, tuple) else 1)
-        ]
+    if stds := _stated(case, "at_std", "sensor"):
+        dimension = len(case.mesh.p)
+        names = [shift for name in stds for shift in shift_names(name, dimension)]
         prior = fem.Normal(0.0, _common(case, stds, "at_std"))
         found[POSITION] = fem.Scalars(names, prior, unit=case.equation.length_unit)
-    if errors := _correlated(case):
+    errors = {
+        name: (
+            case.positive(fading.std, state, f"channels.{name}.correlated.std"),
+            case.positive(fading.time, case.equation.time_unit, f"channels.{name}.correlated.time"),
+        )
+        for name, item in case.roles("sensor").items()
+        if (fading := item.correlated) is not None
+    }
+    if errors:
         std, time = _common(case, errors, "correlated")
         # An Ornstein-Uhlenbeck process: stationary standard deviation and correlation time.
         prior, fades = fem.Normal(0.0, std), fem.MeanReverting(time)
@@ -554,29 +512,11 @@ def unknowns_of(case: CaseContent) -> dict[str, fem.Unknown]:
     return found
 
 
-def _shifted(case: CaseContent) -> dict[str, float]:
-    """Return the standard deviation of the position of each sensor that states one."""
-    return _stated(case, "at_std", "sensor", unit=case.equation.length_unit)
-
-
-def _correlated(case: CaseContent) -> dict[str, tuple[float, float]]:
-    """Return standard deviation and correlation time of the errors of sensors that fade."""
-    found = {}
-    for name, item in case.roles("sensor").items():
-        if item.correlated is not None:
-            key = f"channels.{name}.correlated"
-            std = case.positive(item.correlated.std, case.equation.state.unit, f"{key}.std")
-            time = case.positive(item.correlated.time, case.equation.time_unit, f"{key}.time")
-            found[name] = (std, time)
-    return found
-
-
-def _stated(case: CaseContent, key: str, *roles: str, unit: str | None = None) -> dict[str, float]:
-    """Return a number > 0 of each channel that states one, in the channel's unit or another."""
+def _stated(case: CaseContent, key: str, *roles: str) -> dict[str, float]:
+    """Return a number > 0 of each channel that states one, in the unit of the key or channel."""
+    units = {"gain": "", "at_std": case.equation.length_unit}
     return {
-        name: case.positive(
-            value, case.unit(name) if unit is None else unit, f"channels.{name}.{key}"
-        )
+        name: case.positive(value, units.get(key, case.unit(name)), f"channels.{name}.{key}")
         for name, item in case.roles(*roles).items()
         if (value := getattr(item, key)) is not None
     }
