@@ -99,11 +99,12 @@ class Prepared:
         case = self.case
         if isinstance(law, laws.GradientLaw):  # it has no covariance
             return {}
-        found: dict[str, Any] = {"input_noise": case_channels.input_noise_of(case)}
-        if self.u0 is not None:
-            found["u0_from"] = case_channels.initial_weights(case, self.first)
-            found["u0_errors"] = case_channels.initial_errors(case, self.first)
-        return found
+        noise = {"input_noise": case_channels.input_noise_of(case)}
+        if self.u0 is None:
+            return noise
+        weights = case_channels.initial_weights(case, self.first)
+        errors = case_channels.initial_errors(case, self.first)
+        return {**noise, "u0_from": weights, "u0_errors": errors}
 
     @cached_property
     def u0(self) -> Any:
@@ -132,13 +133,12 @@ class Prepared:
 
     def described(self, found: Layout) -> Layout:
         """Return a layout with the references, unit of length and attributes of the case."""
-        references = {
-            label: {**found.numbers[label], "reference": value}
-            for label, value in self.case.references.items()
-        }
+        numbers = dict(found.numbers)
+        for label, value in self.case.references.items():
+            numbers[label] = {**numbers[label], "reference": value}
         return replace(
             found,
-            numbers={**found.numbers, **references},
+            numbers=numbers,
             length_unit=self.case.equation.length_unit,
             attrs={**found.attrs, **self.attributes},
         )
@@ -313,7 +313,14 @@ class Case(CaseContent):
     @cached_property
     def law(self) -> laws.AnyLaw:
         """The update law."""
-        return law_of(self)
+        spec = self.spec.law
+        with self.located("law", LawError):
+            if not isinstance(spec, GradientSpec):
+                return _sensitivity(self, spec)
+            damping: laws.Damping = laws.ResidualDamping(1.0 if spec.c1 is None else spec.c1)
+            if spec.mu is not None:
+                damping = laws.ConstantDamping(spec.mu)
+            return laws.GradientLaw(spec.gain, damping, nu=spec.nu, sigma=spec.sigma)
 
     @cached_property
     def scheme(self) -> Scheme:
@@ -346,20 +353,16 @@ class Case(CaseContent):
                 "The gradient law is made for observed subdomains and averages; a few noisy point "
                 "sensors mislead it. Use law.kind = 'sensitivity' for points."
             )
-        return found + self._expected_notes()
-
-    def _expected_notes(self) -> list[str]:
-        """Name expected numbers that no run of this case can have; see `runs.measures`."""
-        labels = list(self.model.parameter_space.labels)
-        scored = list(self.roles(*SENSORS))
+        # Numbers of a run, see `runs.measures`.
+        labels = self.model.parameter_space.labels
         known = [
             *labels,
             *(f"{label}.std" for label in labels),
             *(f"{label}.{of}" for label in self.references for of in ("error", "deviations")),
             *TOTALS,
-            *(f"rmse.{name}" for name in (*ROLES, *scored)),
+            *(f"rmse.{name}" for name in (*ROLES, *self.roles(*SENSORS))),
         ]
-        return [
+        return found + [
             f"expect.{name}: a run of this case has no such number; {did_you_mean(name, known)}"
             for name in self.expected
             if name not in known
@@ -385,17 +388,16 @@ class Case(CaseContent):
     def read(self, source: str | Iterable[str] | None = None) -> Prepared:
         """Return the case with its data, as `prepare` does, before an identifier is built."""
         raw = read_data(self, self.columns, self.clock, source)
-        data = without_gaps(self, raw) if isinstance(raw, DataTable) else raw
-        # The first sample is needed before the run. A stream can be read only once, so it is put
-        # back.
+        table = raw if isinstance(raw, DataTable) else None
+        data = raw if table is None else without_gaps(self, table)
         samples: Iterator[Sample] = iter(data)
         first = next(samples, None)
         if first is None:
             raise DataError(f"{self.path}: the data contain no sample between start and stop.")
         start = assimilation_start(self, self.clock, data.origin)
-        if isinstance(data, DataTable) and isinstance(raw, DataTable):
-            return Prepared(self, first, data, start, data.origin, raw)
-        return Prepared(self, first, chain([first], samples), start, data.origin)
+        # A stream can be read only once, so its first sample is put back.
+        stream = chain([first], samples) if table is None else data
+        return Prepared(self, first, stream, start, data.origin, table)
 
     @property
     def live(self) -> bool:
@@ -431,18 +433,6 @@ class Case(CaseContent):
         prepared = Prepared(self, first, (), start, origin, live=live)
         prepared.identifier_with(self.law).step(first.t, first.z)  # raises on missing values
         return prepared
-
-
-def law_of(case: CaseContent) -> laws.AnyLaw:
-    """Return the law; raises `CaseError`."""
-    spec = case.spec.law
-    with case.located("law", LawError):
-        if not isinstance(spec, GradientSpec):
-            return _sensitivity(case, spec)
-        damping: laws.Damping = laws.ResidualDamping(1.0 if spec.c1 is None else spec.c1)
-        if spec.mu is not None:
-            damping = laws.ConstantDamping(spec.mu)
-        return laws.GradientLaw(spec.gain, damping, nu=spec.nu, sigma=spec.sigma)
 
 
 def _sensitivity(case: CaseContent, spec: SensitivitySpec) -> laws.SensitivityLaw:

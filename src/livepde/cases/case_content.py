@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import inspect
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -139,9 +139,8 @@ class CaseContent:
     def only(self, given: Iterable[str], known: Iterable[str], key: str) -> None:
         """Raise unless every name given is known to the equation."""
         for name in given:
-            self.require(
-                name, known, key, f"the equation '{self.equation.name}' has no '{name}' here"
-            )
+            text = f"the equation '{self.equation.name}' has no '{name}' here"
+            self.require(name, known, key, text)
 
     def require(self, name: str, known: Iterable[str], key: str, text: str) -> None:
         """Raise an error that begins with `text` unless a name is one of `known`."""
@@ -154,11 +153,12 @@ class CaseContent:
 
     def unit(self, channel: str) -> str:
         """Return the model's unit of a channel."""
-        if self.spec.channels[channel].role == "input":
+        spec = self.spec.channels[channel]
+        if spec.role == "input":
             return self.equation.inputs[channel].unit
-        if self.spec.channels[channel].role == "position":
+        if spec.role == "position":
             return self.equation.length_unit
-        if self.spec.channels[channel].is_flux and self.equation.fluxes is not None:
+        if spec.is_flux and self.equation.fluxes is not None:
             return self.equation.fluxes.flux
         return self.equation.state.unit
 
@@ -166,20 +166,22 @@ class CaseContent:
 def _rectangle(case: CaseContent, x: Iterable[float | str], y: Iterable[float | str]) -> Any:
     """Return a rectangle: of the nodes on two sides, or of their ends and numbers of cells."""
     spec, unit = case.spec.mesh, case.equation.length_unit
-    sides = (
-        [case.convert(node, unit, "mesh.x") for node in x],
-        [case.convert(node, unit, "mesh.y") for node in y],
-    )
+    given = (("mesh.x", x), ("mesh.y", y))
+    sides = [[case.convert(node, unit, key) for node in nodes] for key, nodes in given]
     if not isinstance(spec.cells, tuple):
         _check_cells(float(len(sides[0])) * len(sides[1]), case.where("mesh"))
         with case.located("mesh", SpaceError):
             return fem.grid(*sides)
     _check_cells(float(spec.cells[0]) * spec.cells[1], case.where("mesh.cells"))
     with case.located("mesh", SpaceError):
-        if isinstance(spec.spacing, tuple):
-            return _graded(case, sides, spec.cells, [one == "geometric" for one in spec.spacing])
-        (x0, x1), (y0, y1) = sides
-        return fem.rectangle((x0, x1), (y0, y1), spec.cells)
+        if not isinstance(spec.spacing, tuple):
+            (x0, x1), (y0, y1) = sides
+            return fem.rectangle((x0, x1), (y0, y1), spec.cells)
+        nodes = []
+        for (start, stop), number, spacing in zip(sides, spec.cells, spec.spacing, strict=True):
+            geometric = _is_graded(case, spacing, start)
+            nodes.append(fem.interval(start, stop, number, geometric=geometric).p[0])
+        return fem.grid(*nodes)
 
 
 def _interval(case: CaseContent) -> Any:
@@ -191,8 +193,7 @@ def _interval(case: CaseContent) -> Any:
     stop = case.convert(spec.stop, unit, "mesh.to")
     if not start < stop:
         raise case.error("mesh", f"got from {start:g} to {stop:g} {unit}; needs from < to.")
-    geometric = spec.spacing == "geometric"
-    _check_graded(case, start, geometric)
+    geometric = _is_graded(case, spec.spacing, start)
     # The nodes nearest to ends of layers move there, because a jump of an unknown inside of a cell
     # would be blurred. If two ends share a nearest node, the second becomes a node of its own.
     plain = fem.interval(start, stop, cells, geometric=geometric)
@@ -203,23 +204,10 @@ def _interval(case: CaseContent) -> Any:
     return fem.line(sorted({*mesh.p[0].tolist(), *own})) if own else mesh
 
 
-def _graded(
-    case: CaseContent,
-    sides: Iterable[Sequence[float]],
-    cells: Iterable[int],
-    graded: Iterable[bool],
-) -> Any:
-    """Return a rectangle with geometric or uniform spacing along each side."""
-    nodes = []
-    for (start, stop), number, geometric in zip(sides, cells, graded, strict=True):
-        _check_graded(case, start, geometric)
-        nodes.append(fem.interval(start, stop, number, geometric=geometric).p[0])
-    return fem.grid(*nodes)
-
-
-def _check_graded(case: CaseContent, start: float, geometric: bool) -> None:
-    if geometric and not start > 0:
+def _is_graded(case: CaseContent, spacing: Any, start: float) -> bool:
+    if spacing == "geometric" and not start > 0:
         raise case.error("mesh.spacing", "'geometric' needs from > 0.")
+    return bool(spacing == "geometric")
 
 
 def _layer_edges(case: CaseContent) -> list[tuple[str, float]]:
@@ -303,9 +291,8 @@ def inside(
 def sides_of(case: CaseContent, given: Any, dimension: int, key: str) -> list[tuple[float, float]]:
     """Return (low, high) for each coordinate."""
     if len(given) != 2 * dimension:
-        expected = {1: "[from, to]", 2: "[x0, x1, y0, y1]"}.get(
-            dimension, "the name of a subdomain"
-        )
+        known = {1: "[from, to]", 2: "[x0, x1, y0, y1]"}
+        expected = known.get(dimension, "the name of a subdomain")
         raise case.error(key, f"got {list(given)}; expected {expected}.")
     unit = case.equation.length_unit
     return [case.pair((given[k], given[k + 1]), unit, key) for k in range(0, len(given), 2)]
@@ -429,18 +416,8 @@ def check_options(function: Any, given: Iterable[str], where: str) -> None:
     names = [item.name for item in known]
     for name in given:
         if name not in names:
-            raise CaseError(
-                f"{where}: '{function.__name__}' has no option '{name}'; "
-                f"{did_you_mean(name, names)}"
-            )
-
-
-def _no_code(path: Path, source: str, folder: Path) -> str:
-    """Return a sentence on a missing code file, with a hint if the working directory has it."""
-    if Path(source).is_file():
-        there = beside(Path(source), folder).as_posix()
-        return f"there is no file '{path}', next to the case; did you mean '{there}'?"
-    return str(no_file(path))
+            text = f"{where}: '{function.__name__}' has no option '{name}'"
+            raise CaseError(f"{text}; {did_you_mean(name, names)}")
 
 
 def _module(source: str, folder: Path, where: str) -> Any:
@@ -449,7 +426,11 @@ def _module(source: str, folder: Path, where: str) -> Any:
             return importlib.import_module(source)
         path = folder / source
         if not path.is_file():
-            raise CaseError(f"{where}: {_no_code(path, source, folder)}")
+            text = str(no_file(path))
+            if Path(source).is_file():  # in the working directory
+                there = beside(Path(source), folder).as_posix()
+                text = f"there is no file '{path}', next to the case; did you mean '{there}'?"
+            raise CaseError(f"{where}: {text}")
         # A file beside the case belongs to no package, so it is loaded by its path.
         loader = importlib.util.spec_from_file_location(path.stem, path)
         if loader is None or loader.loader is None:

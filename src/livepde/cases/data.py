@@ -6,10 +6,9 @@ import logging
 import math
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 from zoneinfo import ZoneInfo
@@ -104,7 +103,14 @@ def read_data(
         refuse_late(case)
         return found
     tables = _on_time(case, columns, found)
-    return tables[0] if len(tables) == 1 else _merged(case, tables, columns)
+    if len(tables) == 1:
+        return tables[0]
+    from livepde.streams.join import join_tables
+
+    second, sensors = clock_of(case).second, case.roles(*SENSORS)
+    needed = [name for name, column in columns.items() if column.needed]
+    between = {name: column.between for name, column in columns.items()}
+    return join_tables(tables, second, sensors, needed, case.where("data.file"), between)
 
 
 def _on_time(
@@ -137,10 +143,7 @@ def delays(case: CaseContent) -> dict[str, float]:
 
 
 def refuse_late(case: CaseContent) -> None:
-    """Refuse late channels of a live source.
-
-    Raises `CaseError`: a channel states how late it is.
-    """
+    """Refuse late channels of a live source."""
     for name in delays(case):
         raise case.error(f"channels.{name}.late", LATE)
 
@@ -180,12 +183,8 @@ def _read(path: Path, columns: Mapping[str, Column], clock: Clock, spec: DataSpe
         from livepde.streams.table import read_parquet
 
         return read_parquet(path, columns, clock, **rows)
-    written: dict[str, Any] = {
-        "separator": spec.separator,
-        "encoding": spec.encoding,
-        "skip": spec.skip,
-    }
-    return read_csv(path, columns, clock, **rows, **written)
+    rows |= {"separator": spec.separator, "encoding": spec.encoding, "skip": spec.skip}
+    return read_csv(path, columns, clock, **rows)
 
 
 def _of_files(
@@ -194,7 +193,12 @@ def _of_files(
     """Return several files as tables; each channel comes from one of them."""
     specs = [case.spec.data.of(file) for file in files]
     paths = [_found(case, str(spec.file)) for spec in specs]
-    headers = list(map(partial(_header, case), specs, paths))
+    headers = []
+    for spec, path in zip(specs, paths, strict=True):
+        if path.suffix in (".parquet", *JSON_LINES):
+            text = f"{path} is not a CSV file; only CSV files can be joined."
+            raise case.error("data.file", text)
+        headers.append(header_of(path, spec.separator, spec.encoding, spec.skip))
     owners = {name: _owner(case, name, one, paths, headers) for name, one in columns.items()}
     tables = []
     for k, (spec, path) in enumerate(zip(specs, paths, strict=True)):
@@ -208,19 +212,6 @@ def _of_files(
             raise case.error("data.file", f"no channel has a column of {path}; leave it out.")
         tables.append(_read(path, own, clock_of(case, spec), spec))
     return tables
-
-
-def _merged(
-    case: CaseContent, tables: Sequence[DataTable], columns: Mapping[str, Column]
-) -> DataTable:
-    """Return tables as one, joined by time."""
-    from livepde.streams.join import join_tables
-
-    second = clock_of(case).second
-    sensors = case.roles(*SENSORS)
-    needed = [name for name, column in columns.items() if column.needed]
-    between = {name: column.between for name, column in columns.items()}
-    return join_tables(tables, second, sensors, needed, case.where("data.file"), between)
 
 
 def _owner(
@@ -242,18 +233,10 @@ def _owner(
     raise case.error(f"channels.{column.noise_of or name}", text)
 
 
-def _header(case: CaseContent, spec: DataSpec, path: Path) -> list[str]:
-    """Return the names of the columns of one of several files."""
-    if path.suffix in (".parquet", *JSON_LINES):
-        raise case.error("data.file", f"{path} is not a CSV file; only CSV files can be joined.")
-    return header_of(path, spec.separator, spec.encoding, spec.skip)
-
-
 def without_wild_start(case: CaseContent, table: DataTable) -> DataTable:
     """Return a record without wild first values, from which no initial state must be made.
 
-    They count as missing. Rows at the start in which an input lacks its value for that are left
-    out.
+    Rows at the start in which an input lacks its value for that are left out.
     """
     wild = wild_first_rows(table.t, table.values, _comparable(case, table.names))
     if not wild.any():
@@ -304,10 +287,7 @@ def _comparable(case: CaseContent, names: Sequence[str]) -> list[list[int]]:
 
 
 def _from_first_inputs(case: CaseContent, table: DataTable) -> DataTable:
-    """Return a record from the first row on where all inputs have had a value.
-
-    Raises `CaseError` if one never has.
-    """
+    """Return a record from the first row on where all inputs have had a value."""
     known, begin, remarks = np.isfinite(table.values), 0, dict(table.remarks)
     for k, name in enumerate(table.names):
         channel = case.spec.channels.get(name)
@@ -315,11 +295,9 @@ def _from_first_inputs(case: CaseContent, table: DataTable) -> DataTable:
         if not (channel and channel.drives) or channel.between == "next" or channel.gaps == "skip":
             continue
         if not known[:, k].any():
-            raise case.error(
-                f"channels.{name}",
-                "its column has no value, and the model needs it: choose another column, or a "
-                "shorter time with `data.start` and `data.stop`.",
-            )
+            text = "its column has no value, and the model needs it: choose another column, or a "
+            text += "shorter time with `data.start` and `data.stop`."
+            raise case.error(f"channels.{name}", text)
         if first := int(known[:, k].argmax()):
             remarks[BEGIN, name] = first
             begin = max(begin, first)
@@ -364,13 +342,10 @@ def _from_reader(
             raise case.error("data.reader", text) from None
     match found:
         case (times, Mapping() as values):
-            pass
-        case _:
-            text = f"{spec.reader} returned {type(found).__name__}; expected times and a mapping "
-            raise case.error("data.reader", text + "from column to values.")
-    return tabulated(
-        times, values, columns, clock, every=spec.every, missing=spec.missing, where=where
-    )
+            rows: dict[str, Any] = {"every": spec.every, "missing": spec.missing, "where": where}
+            return tabulated(times, values, columns, clock, **rows)
+    text = f"{spec.reader} returned {type(found).__name__}; expected times and a mapping "
+    raise case.error("data.reader", text + "from column to values.")
 
 
 def data_file(case: CaseContent) -> Path:
@@ -428,20 +403,12 @@ def assimilation_start(case: CaseContent, clock: Clock, origin: datetime | None)
 def source_of(
     case: CaseContent, data: Data, position: str, passwords: Mapping[str, str] | None = None
 ) -> RowSource:
-    """Return the source of the rows of a case, from a position on."""
-    match data:
-        case None:
-            return _own_source(case, position, passwords or {})
-        case str():
-            return _file_source(case, Path(data), position)
-        case Iterable():
-            return Lines(data)
-    return data
-
-
-def _own_source(case: CaseContent, position: str, passwords: Mapping[str, str]) -> RowSource:
-    """Return the source that the case names: a broker, a server or a file."""
-    spec = case.spec.data
+    """Return the source of the rows of a case, from a position on: its own if there are no data."""
+    spec, passwords = case.spec.data, passwords or {}
+    if isinstance(data, str):
+        return _file_source(case, Path(data), position)
+    if data is not None:
+        return Lines(data) if isinstance(data, Iterable) else data
     if spec.mqtt is not None:
         topics = {**dict.fromkeys(spec.mqtt.rows), **spec.mqtt.columns}
         return MqttSource(_broker(case, spec.mqtt, "data.mqtt", passwords), topics, spec.times[0])
@@ -524,48 +491,36 @@ def _server(
 def passwords_of(case: CaseContent, own: bool, allowed: Iterable[str]) -> dict[str, str]:
     """Return the passwords of a case by the key of their connection, before any is opened.
 
-    `own`: whether the case's own source is used.
-    `allowed`: environment variables that may be sent, besides those whose names begin with
-    LIVEPDE_.
+    `own`: whether the case's own source is used. `allowed`: environment variables that may be sent,
+    besides those whose names begin with LIVEPDE_.
     """
-    spec, allowed = case.spec, set(allowed)
+    spec, allowed, found = case.spec, set(allowed), {}
     sources = {"data.mqtt": spec.data.mqtt, "data.opcua": spec.data.opcua} if own else {}
     sinks = {"output.mqtt": spec.output.mqtt, "output.opcua": spec.output.opcua}
-    connections = {**sources, **sinks}
-    named = {key: one.password_env for key, one in connections.items() if one is not None}
-    return {key: _password(case, name, key, allowed) for key, name in named.items() if name}
-
-
-def _password(case: CaseContent, variable: str, key: str, allowed: Collection[str]) -> str:
-    # A case of somebody else must not send any secret of this machine to a server that it names.
-    own = variable.startswith(PASSWORDS) and variable != TOKEN
-    if not (own or variable in allowed):
-        raise case.error(
-            f"{key}.password_env",
-            f"the environment variable {variable} would be sent to a server that the case names; "
-            f"if you trust it, add --allow-env {variable}, or let the name begin with {PASSWORDS}.",
-        )
-    if variable not in os.environ:
-        raise case.error(
-            f"{key}.password_env", f"the environment variable {variable} is not set; set it."
-        )
-    return os.environ[variable]
+    for key, one in {**sources, **sinks}.items():
+        if one is None or one.password_env is None:
+            continue
+        name, where = one.password_env, f"{key}.password_env"
+        # A case of somebody else must not send any secret of this machine to a server it names.
+        if name not in allowed and (name == TOKEN or not name.startswith(PASSWORDS)):
+            text = f"the environment variable {name} would be sent to a server that the case names;"
+            text += f" if you trust it, add --allow-env {name}, or let the name begin with "
+            raise case.error(where, f"{text}{PASSWORDS}.")
+        if name not in os.environ:
+            raise case.error(where, f"the environment variable {name} is not set; set it.")
+        found[key] = os.environ[name]
+    return found
 
 
 def limits_of(case: CaseContent) -> tuple[Backlog, Retention, float | None]:
-    """Return limits of backlog and retention, and the seconds until a source is silent.
-
-    None: that follows from its usual interval.
-    """
-    spec = case.spec
+    """Return limits of backlog and retention, and the stated seconds until a source is silent."""
+    intake, output = case.spec.intake, case.spec.output
     # Without this key all estimates are kept.
-    unit, never = case.equation.time_unit, math.inf
-    span = case.positive(spec.output.retain, unit, "output.retain", never)
+    span = case.positive(output.retain, case.equation.time_unit, "output.retain", math.inf)
     silence = None
-    if spec.intake.silence is not None:
-        silence = case.positive(spec.intake.silence, "s", "intake.silence")
-    backlog = Backlog(spec.intake.overflow, spec.intake.queue)
-    return backlog, Retention(span, spec.output.thin), silence
+    if intake.silence is not None:
+        silence = case.positive(intake.silence, "s", "intake.silence")
+    return Backlog(intake.overflow, intake.queue), Retention(span, output.thin), silence
 
 
 def policy_of(case: CaseContent) -> Policy:
@@ -578,10 +533,8 @@ def policy_of(case: CaseContent) -> Policy:
     habits = {}
     for name, channel in case.spec.channels.items():
         wait = duration(channel.wait or 0.0, f"channels.{name}.wait")
-        interpolated = channel.gaps == "interpolate"
-        habits[name] = Habit(
-            wait, channel.repeated, interpolated, channel.screened, channel.between
-        )
+        filled = channel.gaps == "interpolate"
+        habits[name] = Habit(wait, channel.repeated, filled, channel.screened, channel.between)
     # Without a unit of time 30 days cannot be converted: then any pause is accepted.
     leap = case.convert(LEAP, unit, "intake.leap") if unit else math.inf
     leap = case.positive(spec.leap, unit, "intake.leap", leap)

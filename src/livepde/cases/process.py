@@ -51,16 +51,13 @@ def model_of(case: CaseContent) -> Model:
 def _check_inputs(
     case: CaseContent, model: Model, given: set[str], constants: Iterable[str]
 ) -> None:
-    """Refuse inputs that the model reads and the case lacks, and constants that it does not read.
-
-    Only the built model knows which optional inputs it reads with these unknowns.
-    """
+    """Refuse inputs that the model reads and the case lacks, and constants that nothing reads."""
+    # Only the built model knows which optional inputs it reads with these unknowns.
     for name in model.inputs:
         if name not in given:
             known = case.equation.inputs.get(name)
-            raise _without_input(
-                case, name, f"the {known.text}" if known else "the equation reads it"
-            )
+            what = f"the {known.text}" if known else "the equation reads it"
+            raise _without_input(case, name, what)
     # A constant that nothing reads is refused, since it may be the one a user believes to act.
     for name in constants:
         if name not in model.inputs:
@@ -77,9 +74,10 @@ def _dirichlet(case: CaseContent) -> dict[str, Any]:
     # "boundary" is all of it, also of a mesh without named boundaries.
     known = [*(case.mesh.boundaries or {}), "boundary"]
     values: dict[str, Any] = {}
-    for name, value in held(case).items():
-        case.require(name, known, "boundary", f"no boundary '{name}'")
-        values[name] = value
+    for name, given in case.spec.boundary.items():
+        if given.value is not None:
+            values[name] = case.convert(given.value, case.equation.state.unit, f"boundary.{name}")
+            case.require(name, known, "boundary", f"no boundary '{name}'")
     for name, channel in case.roles("boundary").items():
         if channel.offset is not None:  # an exchange, see `_near`
             continue
@@ -152,12 +150,12 @@ def _prior(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> fem.Pri
     low, high = -np.inf, np.inf
     if spec.bounds is not None:
         low, high = (value(bound, "bounds") for bound in spec.bounds)
+        bounds = f"[{low:g}, {high:g}] {unit}".rstrip()
         if not low < high:
-            text = f"got [{low:g}, {high:g}] {unit}".rstrip()
-            raise case.error(f"{key}.bounds", f"{text}; needs the lower one first.")
+            raise case.error(f"{key}.bounds", f"got {bounds}; needs the lower one first.")
         if not low <= prior <= high:
-            text = f"the prior {prior:g} is outside the bounds [{low:g}, {high:g}] {unit}"
-            raise case.error(key, f"{text.rstrip()}; widen them, or check the unit of the prior.")
+            text = f"the prior {prior:g} is outside the bounds {bounds}; widen them, or check the "
+            raise case.error(key, f"{text}unit of the prior.")
     if spec.transform is None:
         return fem.Normal(prior, std, (low, high))
     return _transformed(case, spec.transform, prior, std, (low, high), key)
@@ -216,11 +214,8 @@ def _field(case: CaseContent, spec: UnknownSpec, name: str, given: Mapping[str, 
 
 
 def _regions(case: CaseContent, regions: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """Return subdomains of the mesh by name, and predicates of layers and boxes.
-
-    Every point has to lie in exactly one.
-    """
-    mesh = case.mesh
+    """Return subdomains of the mesh by name, and predicates of layers and boxes."""
+    mesh, unit = case.mesh, case.equation.length_unit
     # Midpoints of cells decide, since a vertex on an interface would belong to two regions.
     middle = mesh.p[:, mesh.t].mean(axis=1)
     count = np.zeros(middle.shape[1])
@@ -234,34 +229,25 @@ def _regions(case: CaseContent, regions: Mapping[str, Any], key: str) -> dict[st
         found[name] = inside(case, given, len(mesh.p), where)
         here = found[name](middle)
         if not here.any():
-            raise _without_cells(case, given, where)
+            sides = sides_of(case, given, len(mesh.p), where)
+            spans = " x ".join(f"[{low:g}, {high:g}]" for low, high in sides)
+            limits = zip(mesh.p.min(axis=1), mesh.p.max(axis=1), strict=True)
+            ends = " x ".join(f"{low:g} to {high:g}" for low, high in limits)
+            text = f"{spans} {unit} contains no cell of the mesh, which spans {ends} {unit}."
+            raise case.error(where, text)
         count += here
     wrong = np.flatnonzero(count != 1)
     if len(wrong):
         x, times = middle[:, wrong[0]], int(count[wrong[0]])
         what = "layers" if len(x) == 1 else "regions"
-        point = f"{', '.join(f'{c:.4g}' for c in x)} {case.equation.length_unit}"
+        point = f"{', '.join(f'{c:.4g}' for c in x)} {unit}"
         text = f"{point} lies in {times} {what}; every point has to lie in exactly one."
         raise case.error(key, text)
     return found
 
 
-def _without_cells(case: CaseContent, given: Any, key: str) -> CaseError:
-    """Return the error about a layer or box without a cell of the mesh."""
-    unit, mesh = case.equation.length_unit, case.mesh
-    sides = sides_of(case, given, len(mesh.p), key)
-    spans = " x ".join(f"[{low:g}, {high:g}]" for low, high in sides)
-    limits = zip(mesh.p.min(axis=1), mesh.p.max(axis=1), strict=True)
-    ends = " x ".join(f"{low:g} to {high:g}" for low, high in limits)
-    text = f"{spans} {unit} contains no cell of the mesh, which spans {ends} {unit}."
-    return case.error(key, text)
-
-
 def wall_attributes(case: CaseContent, model: Model) -> dict[str, Any]:
-    """Return the attributes of a dataset by which the resistance of a wall is reported.
-
-    A wall is an interval with conductivities that are numbers; of other cases there are none.
-    """
+    """Return the attributes of a dataset by which the resistance of a wall, if any, is reported."""
     name, given = case.equation.conductivity, case.spec.output.surface_resistances
     unit = case.equation.unknowns[name].unit if name else ""
     layers: dict[str, float] = {}
@@ -285,17 +271,14 @@ def drive_notes(case: CaseContent, model: Model) -> list[str]:
     """Return a note if only the initial state drives the process.
 
     Without values on boundaries and without inputs, a state that is the same everywhere neither
-    changes nor depends on the unknowns if A'(q), B and F vanish there. Then only the decay of
-    differences in the initial state depends on the unknowns. Left out are periodic states, which
-    carry waves, and equations of the user's own, which need not be defined for any state.
+    changes nor depends on the unknowns if A'(q), B and F vanish there. Left out are periodic
+    states, which carry waves, and own equations, which need not be defined for any state.
     """
     if ":" in case.spec.equation:
         return []
     fields = [block.field for block in model.state_space.fields.values()]
     held = any(field.boundary_values or field.periodic for field in fields)
-    if held or model.channels or model.form_initial is not None:
-        return []
-    if not _rests(model):
+    if held or model.channels or model.form_initial is not None or not _rests(model):
         return []
     return [
         "No boundary value, flux, exchange, source or input drives the process. Only the decay of "
@@ -329,15 +312,6 @@ def process_notes(case: CaseContent) -> list[str]:
         remedy = "Add the ends to `mesh.nodes`" if spec.nodes else "Increase `mesh.cells`"
         names, end = ", ".join(crossed), "end" if len(crossed) > 1 else "ends"
         found.append(f"{names[0].upper()}{names[1:]} {end} inside a cell. {remedy}.")
-    return found
-
-
-def held(case: CaseContent) -> dict[str, Any]:
-    """Return boundary -> fixed value of the state."""
-    found, unit = {}, case.equation.state.unit
-    for name, given in case.spec.boundary.items():
-        if given.value is not None:
-            found[name] = case.convert(given.value, unit, f"boundary.{name}")
     return found
 
 
@@ -425,8 +399,8 @@ def _with_offsets(case: CaseContent) -> CaseContent:
 def _near(names: _ConditionNames, name: str) -> list[Flux | Exchange]:
     """Return the conditions of a boundary that is held at a channel less its unknown offset.
 
-    A boundary value knows no unknowns: D u_n = h (channel - offset - u) with a coefficient so large
-    that u differs from the value by 1e-4 of what it changes over a cell.
+    They are D u_n = h (channel - offset - u), with an h so large that u differs from the value by
+    1e-4 of its change over a cell.
     """
     case, label = names.case, _offset_label(name)
     state, (first, variable) = case.equation.state.unit, next(iter(case.equation.unknowns.items()))
@@ -449,14 +423,10 @@ def _check_drive(case: CaseContent, storage: str) -> None:
     The equation and all its unknowns can be multiplied by a number then.
     """
     spec = case.spec
-    amounts = [
-        *(item.flux for item in spec.boundary.values()),
-        *(item.transfer for item in spec.boundary.values()),
-        *(item.value for item in spec.sources.values()),
-    ]
-    if any(amount not in (None, 0.0) and amount not in spec.unknowns for amount in amounts):
-        return
-    if any(item.is_flux for item in case.roles("sensor").values()):
+    amounts = [amount for item in spec.boundary.values() for amount in (item.flux, item.transfer)]
+    amounts += [item.value for item in spec.sources.values()]
+    known = any(amount not in (None, 0.0) and amount not in spec.unknowns for amount in amounts)
+    if known or any(item.is_flux for item in case.roles("sensor").values()):
         return
     text = (
         f"temperatures alone do not determine '{storage}'; it requires a known flux, exchange or "
@@ -494,12 +464,12 @@ class _ConditionNames:
         """Return a number in the model's unit, a channel, or the name of an unknown."""
         spec = self.case.spec
         if isinstance(value, str) and value in spec.unknowns:
-            self._named(self.unknowns, self.case.equation.unknowns, value, unit, key)
+            self._named("unknowns", value, unit, key)
             return value
         if isinstance(value, str) and value in spec.channels:
             if spec.channels[value].role != "input":
                 raise self.case.error(key, f"the channel '{value}' has to be of role 'input'.")
-            self._named(self.inputs, self.case.equation.inputs, value, unit, key)
+            self._named("inputs", value, unit, key)
             return fem.Channel(value)
         # Text without a digit is no quantity: a name was meant.
         if isinstance(value, str) and not any(letter.isdigit() for letter in value):
@@ -508,17 +478,11 @@ class _ConditionNames:
             raise self.case.error(key, text)
         return self.case.convert(value, unit, key)
 
-    def _named(
-        self,
-        found: dict[str, Variable],
-        taken: Mapping[str, Variable],
-        name: str,
-        unit: str,
-        key: str,
-    ) -> None:
+    def _named(self, what: str, name: str, unit: str, key: str) -> None:
+        """Note an unknown or an input that a condition names."""
+        found, taken = getattr(self, what), getattr(self.case.equation, what)
         # Several conditions may share a name, if it has the same unit in all of them.
-        before, own = found.get(name) or taken.get(name), name in taken
-        clash = own and found is self.unknowns
+        before, clash = found.get(name) or taken.get(name), what == "unknowns" and name in taken
         if before is not None and (clash or before.unit != unit):
             text = f"'{name}' is the {before.text} [{before.unit}] already; take another name."
             raise self.case.error(key, text)
