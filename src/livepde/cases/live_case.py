@@ -202,10 +202,7 @@ class LiveCase:
     def _begun(
         self, stopping: threading.Event, irregular: dict[tuple[str, str], Remark]
     ) -> tuple[Prepared, Sequence[Ready]] | None:
-        """Return the case with its first sample, and the samples from it on; None if stopped.
-
-        Remarks on irregular rows received meanwhile are added to `irregular`.
-        """
+        """Return the case with its first sample and the samples from it on; None if stopped."""
         LOG.info("waiting for the first sample")
         why = logged = "no sample arrived"
         heard = time.monotonic()
@@ -254,11 +251,10 @@ class LiveCase:
             return []
         remarks = []
         for k, name in wild_start(self.case, [(one.t, one.values) for one in found]):
-            message = (
-                f"{name} = {found[k].values[name]:g} is an outlier: it is far from all later values"
-            )
-            remarks.append(Remark(START, name, message))
-            found[k] = replace(found[k], values=found[k].values | {name: math.nan})
+            values = found[k].values
+            text = f"{name} = {values[name]:g} is an outlier: it is far from all later values"
+            remarks.append(Remark(START, name, text))
+            found[k] = replace(found[k], values=values | {name: math.nan})
         return remarks
 
     def _listened(self, heard: float) -> float:
@@ -293,11 +289,11 @@ class LiveCase:
         if spec.every > 1 and not (file or reader):
             text = f"got {spec.every}; a live source uses all rows: leave it out."
             raise case.error("data.every", text)
-        whole = isinstance(file, tuple) or str(file).endswith(".parquet") or reader is not None
+        if isinstance(file, tuple) or str(file).endswith(".parquet") or reader is not None:
+            return True
         # These options are of files: lines that are sent have neither titles nor a second column.
         above = not spec.follow and (spec.skip > 0 or len(spec.times) > 1)
-        listed = spec.every > 1 or above
-        return whole or (bool(file) and listed)
+        return bool(file) and (spec.every > 1 or above)
 
     def _new_intake(self) -> tuple[Intake, str]:
         """Return an intake of rows that follow those of the journal, and the source's position."""
@@ -307,12 +303,9 @@ class LiveCase:
         if journal is not None:
             begun = journal.layout.attrs.get("origin")
             position = journal.position
-            options |= {
-                "origin": since_1970(datetime.fromisoformat(begun)) if begun is not None else 0.0,
-                "dates": begun is not None,
-                "last": journal.last,
-                "recent": [(one.t, one.values) for one in journal.recent(RECENT)],
-            }
+            options["origin"] = 0.0 if begun is None else since_1970(datetime.fromisoformat(begun))
+            options |= {"dates": begun is not None, "last": journal.last}
+            options["recent"] = [(one.t, one.values) for one in journal.recent(RECENT)]
         intake = Intake(case.columns, case.clock, self._policy, **options)
         intake.past = journal
         return intake, position

@@ -26,27 +26,16 @@ from livepde.streams import DataTable
 WAITING = 2**23  # numbers that wait to be written
 ALONE = "no other one has their settings and sample times"
 # Members may differ in how a channel is read, and in descriptions of a run.
-READ = {
-    "column",
-    "columns",
-    "noise_column",
-    "unit",
-    "factor",
-    "late",
-    "valid",
-    "missing",
-    "spikes",
-    "wait",
-    "repeated",
-}
+READ = {"column", "columns", "noise_column", "unit", "factor", "late", "valid"}
+READ |= {"missing", "spikes", "wait", "repeated"}
 TOLD = {"title", "initial", "data", "intake", "reference", "expect", "variants"}
 
 
 def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str, str]]:
     """Return blocks of members that can be stepped together, and the reasons why others cannot.
 
-    A block has members whose cases differ only in data, initial state and descriptions, and whose
-    samples have the same times, if `Fleet` can step their model and law together.
+    Their cases differ only in data, initial state and descriptions; their samples have the same
+    times.
     """
     groups, apart = _alike(members)
     found = []
@@ -92,10 +81,8 @@ def _refuses(one: Prepared) -> str:
     except LivepdeError:
         return "they cannot begin with their first sample"
     values = dict(one.first.z) if isinstance(one.first.z, Mapping) else {}
-    missing = [
-        name for name in one.case.model.channels if not np.isfinite(values.get(name, np.nan))
-    ]
-    return "an input has no value in their first sample" if missing else ""
+    known = (np.isfinite(values.get(name, np.nan)) for name in one.case.model.channels)
+    return "" if all(known) else "an input has no value in their first sample"
 
 
 class MemberBlock:
@@ -105,8 +92,8 @@ class MemberBlock:
         self.members = dict(members)
         self._each = list(self.members.values())
         self._tables = [one.stream for one in self._each if isinstance(one.stream, DataTable)]
-        one = self._each[0]
-        case = one.case
+        one, case = self._each[0], self._each[0].case
+        uncertain = [member.uncertain(case.law) for member in self._each]
         self.fleet = Fleet(
             case.model,
             case.observation,
@@ -119,9 +106,9 @@ class MemberBlock:
             dt_max=case.dt_max,
             assimilate_from=one.assimilate_from,
             between=between_of(case),
-            input_noise=one.uncertain(case.law).get("input_noise"),
-            u0_from=[member.uncertain(case.law).get("u0_from", {}) for member in self._each],
-            u0_errors=[member.uncertain(case.law).get("u0_errors", ()) for member in self._each],
+            input_noise=uncertain[0].get("input_noise"),
+            u0_from=[own.get("u0_from", {}) for own in uncertain],
+            u0_errors=[own.get("u0_errors", ()) for own in uncertain],
         )
         self.status = "finished"
         self.error: DataError | None = None
@@ -131,10 +118,9 @@ class MemberBlock:
         self._taken = self._written = 0  # samples
 
     def run(self, paths: Sequence[Path]) -> None:
-        """Take all samples; estimates so far are kept also if the run ends early.
+        """Step through all samples, and write new journals at `paths` at intervals.
 
-        The new journals at `paths`, one for each member, are written at intervals; `ended` writes
-        the rest.
+        `ended` writes the rest, also if the run ends early.
         """
         self._paths = list(paths)
         table, stopping = self._tables[0], threading.Event()
@@ -163,18 +149,16 @@ class MemberBlock:
         self._taken += 1
         for k in np.flatnonzero(~estimate.ok).tolist():
             status = estimate.statuses[k]
-            event = Event(float(self.fleet.t[k]), status.code, "", str(status))
-            self._events[k].append(event)
+            self._events[k].append(Event(float(self.fleet.t[k]), status.code, "", str(status)))
 
     def _journal(self, k: int, identifier: Identifier) -> Journal:
         """Return the journal of a member: all of them at once would be too many open files."""
         path, one = self._paths[k], self._each[k]
         if self._written:
             return Journal.open(path, write=True)
-        layout = layout_of(
-            identifier.model, identifier.observed, identifier.validation, one.case.ignored
-        )
-        journal = Journal.create(path, identifier.channels, one.described(layout))
+        who = identifier
+        layout = layout_of(who.model, who.observed, who.validation, one.case.ignored)
+        journal = Journal.create(path, who.channels, one.described(layout))
         for (kind, channel), number in self._tables[k].remarks.items():
             journal.count(kind, channel, number)
         return journal

@@ -21,8 +21,7 @@ from livepde.laws.sensitivity_state import SensitivityWork
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Combined, Observation, Points
-from livepde.result import Estimate
-from livepde.samples import Sample
+from livepde.samples import Sample, by_name
 from livepde.verdict import FLAT, REFINE, Shifts, discretised
 
 MOST_SAMPLES = 500
@@ -55,11 +54,7 @@ class Identified:
 
 @dataclass(frozen=True)
 class Preview:
-    """Information on the unknowns in the first samples of a case.
-
-    The sentences name unknowns that are traded off, the number of identified modes of each field,
-    shifts of unknowns by the discretisation, and sensor errors that would go undetected.
-    """
+    """Information on the unknowns in the first samples of a case."""
 
     unknowns: tuple[Identified, ...] = ()  # one item for each number, two for each field
     samples: int = 0  # with a measurement
@@ -68,10 +63,7 @@ class Preview:
 
 
 class StatedNoise(SensitivityLaw):
-    """The sensitivity law with the covariance of its filter, as if model and noise were right.
-
-    The covariance is not inflated by innovations, and the filter stays linear about the prior.
-    """
+    """The sensitivity law as if model and noise were right, linear about the prior."""
 
     relinearises = False
 
@@ -97,16 +89,12 @@ def linearised(law: AnyLaw) -> SensitivityLaw | None:
 def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
     """Return the identifiability by the first samples, linearised at the prior.
 
-    The covariance of a filter with a fixed linearisation does not depend on measured values, only
-    on their times and on inputs. So the law is linearised at the prior, never moves its reference,
-    and its estimates are discarded. The remaining standard deviations are a best case: noise as
-    stated, and a model without error. The preview of a law without covariance is empty.
+    The covariance then does not depend on measured values, only on their times and on inputs. It is
+    a best case: noise as stated, a model without error. A law without covariance has no preview.
     """
     linear = linearised(prepared.case.law)
-    if linear is None:
-        return Preview()
-    if linear.noise is None and prepared.identifier.observed.noise is None:
-        return Preview()  # the law estimates it from the samples
+    if linear is None or (linear.noise is None and prepared.identifier.observed.noise is None):
+        return Preview()  # in the second case the law estimates the noise from the samples
     # Samples may come from a stream, so they are iterated once, for both previews.
     begun, all_of = tee(samples)
     found = _told(prepared, replace(linear, shadows=Shadows()), begun)
@@ -120,9 +108,14 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
 
 def _told(prepared: Prepared, linear: SensitivityLaw, samples: Iterable[Sample]) -> Preview:
     """Return the posterior after the first of some samples, linearised at the prior."""
-    identifier = prepared.identifier_with(linear)
-    count, estimate = _assimilated(identifier, samples, prepared.assimilate_from)
-    model = prepared.case.model
+    identifier, model = prepared.identifier_with(linear), prepared.case.model
+    count, estimate = 0, None
+    for sample in samples:
+        estimate = identifier.step(sample.t, sample.z, sample.inputs)
+        if sample.t >= prepared.assimilate_from:
+            count += bool(np.isfinite(estimate.innovation).any())
+        if count >= MOST_SAMPLES:
+            break
     belief = identifier._latent_belief()
     prior, posterior = belief.prior_factor, belief.q_factor
     if not count or estimate is None or prior is None or posterior is None:
@@ -141,20 +134,6 @@ def _told(prepared: Prepared, linear: SensitivityLaw, samples: Iterable[Sample])
         *estimate.verdict.unseen,
     )
     return Preview(told, count, sentences)
-
-
-def _assimilated(
-    identifier: Identifier, samples: Iterable[Sample], start: float
-) -> tuple[int, Estimate | None]:
-    """Step through the first samples; return the number of measurements and the last estimate."""
-    count, estimate = 0, None
-    for sample in samples:
-        estimate = identifier.step(sample.t, sample.z, sample.inputs)
-        if sample.t >= start:
-            count += bool(np.isfinite(estimate.innovation).any())
-        if count >= MOST_SAMPLES:
-            break
-    return count, estimate
 
 
 def _shifted(shifts: Shifts[float], std: Mapping[str, float]) -> list[str]:
@@ -199,13 +178,10 @@ def _compare(prepared: Prepared, before: Belief, after: Belief) -> list[Identifi
 
 @dataclass(frozen=True, eq=False)
 class Advice:
-    """The best of all candidate positions for one more sensor.
-
-    `now` and `then` have the remaining share of the prior standard deviation of each unknown with
-    the present sensors, and with the new one; of a field the root of that of its mean variance.
-    """
+    """The best of all candidate positions for one more sensor."""
 
     position: Array  # coordinates, shape (d,)
+    # Remaining share of the prior standard deviation of each unknown without it, and with it.
     now: Mapping[str, float]
     then: Mapping[str, float]
     candidates: int  # number of compared positions
@@ -215,27 +191,29 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
     """Return where one more point sensor would reduce the posterior most.
 
     The criterion is the posterior variance over the prior variance, averaged over the unknowns (of
-    a field its mean over the domain; a sum would depend on the number of modes and on the choice of
-    units). The candidates are the vertices of the mesh, at most 400; the new sensor has the
-    median noise of the others, and measures whenever one of them does.
+    a field its mean over the domain). The candidates are vertices of the mesh. The new sensor has
+    the median noise of the others, and measures whenever one of them does.
 
     Linearised at the prior, the information of sensors adds up: with Y the sensitivity of a reading
     to the reduced coordinates a ~ N(0, I), over its noise, the posterior covariance of a is
     (I + sum of Y^T Y)^-1. So one run that assimilates nothing gives the sums of all candidates.
-
-    If unknowns move, the information of old samples fades and does not add up. Then the candidates
-    are ranked by the variance reduction of one more reading at each sample of the preview, from the
-    joint covariance of state and unknowns; each of the best few gets a preview of its own, and the
-    one with the smallest final variance is the advice.
     """
     case, law = prepared.case, linearised(prepared.case.law)
     if law is None:
-        raise ConfigurationError(
-            "advice on sensors needs a law with a covariance: kind = 'sensitivity'."
-        )
+        text = "advice on sensors needs a law with a covariance: kind = 'sensitivity'."
+        raise ConfigurationError(text)
     if law.drift or case.model.latent.random:  # an unknown moves
         return _advise_moving(prepared, law, list(samples))
-    here, each, factor = _information(prepared, law, samples)
+    # Information on a, prior included, and the information of each candidate.
+    here, each = np.zeros((0, 0)), np.zeros((0, 0, 0))
+    factor: Array | None = None
+    for Y, new, q_factor in islice(_sensitivities(prepared, law, samples), MOST_SAMPLES):
+        if factor is None:
+            k = Y.shape[1]
+            here, each = np.eye(k), np.zeros((len(new), k, k))
+        here += Y.T @ Y
+        each += new[:, :, None] * new[:, None, :]
+        factor = q_factor
     if factor is None:
         raise ConfigurationError(NOTHING)
     weights = _weights(case.model, factor)
@@ -249,25 +227,6 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
     )
     _, positions, _ = _candidates(prepared)
     return Advice(positions[:, best], now, then, len(after))
-
-
-def _information(
-    prepared: Prepared, law: SensitivityLaw, samples: Iterable[Sample]
-) -> tuple[Array, Array, Array | None]:
-    """Return the information on a, prior included, that of each candidate, and the factor of q.
-
-    Shapes (k, k), (candidates, k, k) and (m, k); without a measurement the factor is None.
-    """
-    here, each = np.zeros((0, 0)), np.zeros((0, 0, 0))
-    factor: Array | None = None
-    for Y, new, q_factor in islice(_sensitivities(prepared, law, samples), MOST_SAMPLES):
-        if not here.size:
-            k = Y.shape[1]
-            here, each = np.eye(k), np.zeros((len(new), k, k))
-        here += Y.T @ Y
-        each += new[:, :, None] * new[:, None, :]
-        factor = q_factor
-    return here, each, factor
 
 
 def _sensitivities(
@@ -284,7 +243,8 @@ def _sensitivities(
     known: dict[str, float] = {}
     for sample in samples:
         estimate = identifier.step(sample.t, sample.z, sample.inputs)
-        known |= _inputs(identifier, sample)
+        given = by_name(sample.z, ()) | dict(sample.inputs or {})
+        known |= {n: v for n in identifier.inputs if np.isfinite(v := given.get(n, np.nan))}
         belief, seen = estimate.belief, np.isfinite(estimate.innovation)
         if sample.t < prepared.assimilate_from or not seen.any():
             continue
@@ -322,14 +282,19 @@ def _noise(identifier: Identifier, law: SensitivityLaw) -> Array:
 
 
 def _advise_moving(prepared: Prepared, law: SensitivityLaw, samples: Sequence[Sample]) -> Advice:
-    """Return the advice where unknowns move: see `advise`."""
+    """Return the advice where unknowns move, so that the information of old samples fades.
+
+    The candidates are ranked by the variance reduction of one more reading at each sample of the
+    preview. Each of the best few gets its own preview.
+    """
     values, positions, part = _candidates(prepared)
     model, told = prepared.case.model, np.zeros(positions.shape[1])
     identifier = prepared.identifier
     noise = float(np.median(_noise(identifier, law)))
     weights: dict[str, Array] = {}
     for belief in _previewed(prepared, law, samples, prepared.case.observation):
-        weights = weights or _weights(model, _physical(model, belief.prior_factor))
+        if not weights and (prior := belief.prior_factor) is not None:
+            weights = _weights(model, model.latent.tangent(model.latent.prior, prior))
         C = _reduced(model, belief)
         if belief.u_factor is None:
             continue
@@ -344,10 +309,8 @@ def _advise_moving(prepared: Prepared, law: SensitivityLaw, samples: Sequence[Sa
     tried = []
     for best in np.argsort(-told)[:SHORT_LIST]:
         at: Any = positions[:, best].tolist()
-        point = Points(
-            {NEW: at if len(at) > 1 else at[0]}, noise=noise, of=prepared.case.observation.of
-        )
-        sensors = Combined([prepared.case.observation, point])
+        own, x = prepared.case.observation, at if len(at) > 1 else at[0]
+        sensors = Combined([own, Points({NEW: x}, noise=noise, of=own.of)])
         for belief in _previewed(prepared, law, samples, sensors):
             C = _reduced(model, belief)
         then = _left(weights, C)
@@ -376,11 +339,6 @@ def _previewed(
             break
 
 
-def _physical(model: Model, factor: Array | None) -> Array | None:
-    """Return a latent factor in physical coefficients, linearised at the prior."""
-    return None if factor is None else model.latent.tangent(model.latent.prior, factor)
-
-
 def _reduced(model: Model, belief: Belief) -> Array:
     """Return the square root of the posterior covariance in reduced coordinates, (k, r)."""
     if belief.prior_factor is None or belief.q_factor is None:
@@ -394,17 +352,9 @@ def _left(weights: Mapping[str, Array], C: Array) -> dict[str, float]:
     return {name: float(np.sqrt(np.sum(W * (C @ C.T)))) for name, W in weights.items()}
 
 
-def _inputs(identifier: Identifier, sample: Sample) -> dict[str, float]:
-    """Return the inputs that a sample has."""
-    given = {**(sample.z if isinstance(sample.z, Mapping) else {}), **(sample.inputs or {})}
-    return {name: v for name in identifier.inputs if np.isfinite(v := given.get(name, np.nan))}
-
-
-def _weights(model: Model, factor: Array | None) -> dict[str, Array]:
+def _weights(model: Model, factor: Array) -> dict[str, Array]:
     """Return unknown -> W with trace(W P) its mean variance over that of the prior, P = I."""
     space = model.parameter_space
-    if factor is None:
-        return {}
     found = {label: np.outer(factor[k], factor[k]) for label, k in space.labels.items()}
     # The mass matrix integrates the variance of a field over the domain. Division by the trace
     # makes the share of the prior, P = I, equal to one.

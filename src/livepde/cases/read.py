@@ -108,7 +108,11 @@ def _nearest(folder: Path, name: str) -> str:
 
 def read_toml(text: str, where: str) -> dict[str, Any]:
     """Return the document of a case file; raises `CaseError`."""
-    _check_text(text, where)
+    # A document that would take long to read is refused before it is read.
+    if DOTTED.search(NAME.sub("a", text)):
+        raise CaseError(f"{where}: a key has more than {DEPTH} parts; a case needs few.")
+    if DIGITS.search(text):
+        raise CaseError(f"{where}: a number has 400 digits or more; write it shorter, as 2.5e9.")
     try:
         document = tomllib.loads(text)
     except (RecursionError, ValueError) as error:  # or a number or a date that Python cannot hold
@@ -129,14 +133,13 @@ def _line(text: str, reason: str) -> str:
 
 def read_spec(raw: Mapping[str, Any], where: str) -> CaseSpec:
     """Return the checked content of a case's document; raises `CaseError`."""
-    if blanks := blanks_in(raw):
-        raise CaseError(
-            "\n".join(
-                f"{where}: {key} = {toml_value(value)}: replace '?' by a "
-                f"{'unit' if key.endswith('unit') else 'value'}."
-                for key, value in blanks.items()
-            )
-        )
+    blanks = [
+        f"{where}: {key} = {toml_value(value)}: replace '?' by a "
+        f"{'unit' if key.endswith('unit') else 'value'}."
+        for key, value in blanks_in(raw).items()
+    ]
+    if blanks:
+        raise CaseError("\n".join(blanks))
     return spec_of(raw, where)
 
 
@@ -212,12 +215,10 @@ def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
         message = CLASS.sub("", str(context["error"]), count=1).removesuffix(".")
         shown = "" if isinstance(got, dict) else f"got {_short(got)}; "
         return f"{key}: {shown}{message}."
-    expected = EXPECTED.get(kind)
+    message = str(found["msg"]).removeprefix("Input should be ").removeprefix("Value should be ")
+    expected = EXPECTED.get(kind, message)
     if kind == "greater_than":
         expected = f"a number greater than {context['gt']}"
-    if expected is None:
-        message = str(found["msg"])
-        expected = message.removeprefix("Input should be ").removeprefix("Value should be ")
     return f"{key}: got {_short(got)}; expected {expected}."
 
 
@@ -233,10 +234,7 @@ def _short(value: Any) -> str:
 
 
 def _path(loc: tuple[int | str, ...], raw: Any, missing: bool) -> list[str]:
-    """Return the keys of an error as the file has them, without pydantic's own tags.
-
-    The last one of a key that is missing stands in no file.
-    """
+    """Return the keys of an error as the file has them, without pydantic's own tags."""
     path: list[str] = []
     here = raw
     for k, part in enumerate(loc):
@@ -311,11 +309,9 @@ def parse(assignments: Iterable[str]) -> dict[str, Any]:
 def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Return a case's document with other values.
 
-    `settings`: key as the file would have it, 'law.noise' or 'unknowns.k.regions."0-1"' -> value. A
-    table sets the keys in it and leaves the others; None takes the key away. A table for an unknown
-    or a channel that the case has not adds it.
-    Raises `CaseError`: a key that is none, or an unknown, a channel or a key to take away that the
-    case has not.
+    `settings`: key as in the file, 'law.noise' or 'unknowns.k.regions."0-1"' -> value. A table sets
+    the keys in it and leaves the others; None removes the key. A table for a new unknown or channel
+    adds it.
     """
     changed = copy.deepcopy(dict(document))
     for key, given in settings.items():
@@ -357,9 +353,8 @@ def key_path(key: str, where: str) -> tuple[str, ...]:
     try:
         here: Any = tomllib.loads(f"{key} = 0")
     except tomllib.TOMLDecodeError:
-        raise CaseError(
-            f"{where}: '{key}' is not a key; expected a key such as 'law.noise'."
-        ) from None
+        text = f"{where}: '{key}' is not a key; expected a key such as 'law.noise'."
+        raise CaseError(text) from None
     path = []
     while isinstance(here, dict):
         ((name, here),) = here.items()
@@ -400,14 +395,6 @@ def toml_value(value: Any) -> str:
     return shown
 
 
-def _check_text(text: str, where: str) -> None:
-    """Refuse a document that would take long to read, before it is read."""
-    if DOTTED.search(NAME.sub("a", text)):
-        raise CaseError(f"{where}: a key has more than {DEPTH} parts; a case needs few.")
-    if DIGITS.search(text):
-        raise CaseError(f"{where}: a number has 400 digits or more; write it shorter, as 2.5e9.")
-
-
 def _check_document(document: Mapping[str, Any], where: str) -> None:
     """Refuse numbers and depths that no case needs."""
     for key, value, depth in _values(document, where):
@@ -436,10 +423,8 @@ def _values(value: Any, where: str) -> Iterator[tuple[str, Any, int]]:
             yield key, value, depth
         elif isinstance(value, Mapping):
             if len(value) > NAMES:
-                what = key or "the case"
-                raise CaseError(
-                    f"{where}: {what} has {len(value)} names; expected at most {NAMES}."
-                )
+                text = f"{key or 'the case'} has {len(value)} names; expected at most {NAMES}."
+                raise CaseError(f"{where}: {text}")
             stack += [(f"{key}.{n}" if key else n, v, depth + 1) for n, v in value.items()]
         else:
             stack += [(key, item, depth + 1) for item in value]

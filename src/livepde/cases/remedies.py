@@ -12,6 +12,7 @@ import numpy as np
 
 from livepde.cases.read import settings_in, toml_key, toml_value
 from livepde.laws import SensitivityLaw
+from livepde.linalg import Array
 from livepde.verdict import Cause, Finding, Severity, Verdict, channel_setting
 from livepde.verdict.sentences import ESTIMATED, FINDINGS, LIKELY, amount_of, estimating
 
@@ -31,10 +32,7 @@ NO_SETTING = "This case has no setting to estimate it."
 
 
 def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
-    """Return a verdict whose causes have the settings of the case that estimate or correct them.
-
-    If there is no setting, the remedy states it.
-    """
+    """Return a verdict whose causes have the settings of the case that estimate or correct them."""
 
     def named(cause: Cause) -> Cause:
         settings = freed(prepared, cause)
@@ -52,10 +50,9 @@ def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
 
 
 def after_gaps(verdict: Verdict, inputs: Iterable[Finding]) -> Verdict:
-    """Return a verdict in which gaps of inputs are to be mended before refused readings.
+    """Return a verdict in which gaps of inputs are to be fixed before refused readings.
 
-    Readings are missed where an input is a guess: they are not what to correct. `inputs`: findings
-    on the inputs; those with a remedy are long gaps.
+    `inputs`: findings on the inputs; those with a remedy are long gaps.
     """
     gaps = next((one.remedy for one in inputs if one.remedy), "")
     if not gaps:
@@ -141,9 +138,8 @@ def _of_sensor(case: Case, cause: Cause) -> tuple[str, ...]:
         return ()
     if key == "at_std" and not channel.is_point:
         return ()
-    others = (getattr(item, key) for item in channels.values())
+    others, size = (getattr(item, key) for item in channels.values()), cause.size
     stated = next((value for value in others if value is not None), None)
-    size = cause.size
     if key == "at_std" and not math.isfinite(size):
         size = PLACE * float(np.ptp(case.mesh.p, axis=1).max())
     if stated is None and not math.isfinite(size):
@@ -188,10 +184,16 @@ def first_miss(prepared: Prepared) -> float:
     case = prepared.case
     if case.equation.components or not isinstance(prepared.u0, float):
         return 0.0
-    given = prepared.first.z if isinstance(prepared.first.z, Mapping) else {}
-    seen = np.array([float(np.ravel(given[name])[0]) for name in case.sensors if name in given])
-    seen = seen[np.isfinite(seen)]
+    seen = _first_readings(prepared)
     return float(np.sqrt(np.mean((seen - prepared.u0) ** 2))) if len(seen) else 0.0
+
+
+def _first_readings(prepared: Prepared) -> Array:
+    """Return the readings of the assimilated sensors in the first sample."""
+    given = prepared.first.z if isinstance(prepared.first.z, Mapping) else {}
+    names = [name for name in prepared.case.sensors if name in given]
+    seen: Array = np.array([float(np.ravel(given[name])[0]) for name in names])
+    return np.compress(np.isfinite(seen), seen)
 
 
 def _capacity(case: Case) -> float:
@@ -226,12 +228,10 @@ def _loss(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     size = float(f"{cause.size * _capacity(case):.2g}")
     settings = [adding(case, "loss", size, prior=size, transform="log")]
     if "ambient" not in {*case.spec.channels, *case.spec.inputs}:
-        given = prepared.first.z if isinstance(prepared.first.z, Mapping) else {}
-        seen = [float(np.ravel(given[name])[0]) for name in case.sensors if name in given]
-        known = [value for value in seen if math.isfinite(value)]
-        if not known:
+        seen = _first_readings(prepared)
+        if not len(seen):
             return ()
-        settings.append(f"inputs.ambient={sum(known) / len(known):.6g}")
+        settings.append(f"inputs.ambient={seen.mean():.6g}")
     return tuple(settings)
 
 

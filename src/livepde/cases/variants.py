@@ -84,31 +84,22 @@ class LastEstimate:
 
 @dataclass(frozen=True)
 class VariantRun:
-    """How the run of a variant ended.
-
-    `log_evidence`: `Result.log_evidence` of all readings that it assimilates, as a density in the
-    unit of the data: variants with another unit of a sensor are comparable.
-    `readings`: sensor that it assimilates -> number of the readings that are assimilated.
-    `same_readings`: log evidence of the case itself with these readings, NaN if it has not all of
-    them; None if they are those of the case, since no late channel leaves some out.
-    `misfits`: sensor -> its misfit over noise, as `ModelErrors` has it. Without a fit that of its
-    errors one step ahead, second half of the samples.
-    `errors`, `validation`: assimilated and validation sensor -> root mean square of its errors one
-    step ahead, second half of the samples.
-    `unknowns`: how many numbers were unknown; of a field the number of modes.
-    """
+    """How the run of a variant ended."""
 
     variant: Variant
     error: str = ""  # why it failed; empty if it did not
     verdict: Mapping[str, Any] = field(default_factory=dict)  # of `Verdict.to_dict`
-    log_evidence: float = math.nan
-    readings: Mapping[str, int] = field(default_factory=dict)
+    log_evidence: float = math.nan  # a density in the unit of the data, whatever unit it states
+    readings: Mapping[str, int] = field(default_factory=dict)  # sensor -> number assimilated
+    # Log evidence of the case with these readings: None if they are those of the case, NaN if the
+    # case has not all of them.
     same_readings: float | None = None
-    misfits: Mapping[str, float] = field(default_factory=dict)
-    errors: Mapping[str, float] = field(default_factory=dict)
+    misfits: Mapping[str, float] = field(default_factory=dict)  # sensor -> misfit over noise
+    # Sensor -> root mean square error one step ahead, second half of the samples.
+    errors: Mapping[str, float] = field(default_factory=dict)  # assimilated
     validation: Mapping[str, float] = field(default_factory=dict)
     estimates: Mapping[str, LastEstimate] = field(default_factory=dict)
-    unknowns: int = 0
+    unknowns: int = 0  # numbers, and modes of fields
 
     @property
     def level(self) -> str:
@@ -153,30 +144,27 @@ class VariantRun:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the run as JSON can hold it."""
-        numbers = {
-            name: {
-                **{key: _number(getattr(one, key)) for key in ("value", "std", "low", "high")},
-                "unit": one.unit,
-            }
-            for name, one in self.estimates.items()
-        }
         return {
             "name": self.variant.name,
             "settings": list(self.variant.settings),
             "error": self.error,
             "level": self.level,
-            "log_evidence": _number(self.log_evidence),
+            "log_evidence": _known(self.log_evidence),
             "readings": dict(self.readings),
-            "misfit": _number(self.misfit),
-            "validation_error": _number(self.validation_error),
+            "misfit": _known(self.misfit),
+            "validation_error": _known(self.validation_error),
             "unknowns": self.unknowns,
-            "estimates": numbers,
+            "estimates": {
+                name: {key: _known(value) for key, value in vars(one).items()}
+                for name, one in self.estimates.items()
+            },
             "verdict": dict(self.verdict),
         }
 
 
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _known(value: Any) -> Any:
+    """Return a value, None for a number that is not finite."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _pooled(values: Iterable[float]) -> float:
@@ -210,8 +198,7 @@ def run_variant(
         every = parse(settings), parse(variant.settings)
         prepared = load(path, allow_code=allow_code, settings=every).prepare(data)
         # Errors of single columns are looked for in the case itself, to be proposed.
-        run = _run(prepared, prepared.stream, columns=not variant.settings)
-        found = _ended(variant, prepared, run.to_xarray())
+        found = _run(variant, prepared, prepared.stream, columns=not variant.settings)
         stated = load(path, allow_code=allow_code, settings=every[:1])
         if delays(stated) == delays(prepared.case):
             return found
@@ -222,7 +209,9 @@ def run_variant(
         return VariantRun(variant, error=f"{type(error).__name__}: {reason}")
 
 
-def _run(prepared: Prepared, samples: Iterable[Sample], *, columns: bool) -> Result:
+def _run(
+    variant: Variant, prepared: Prepared, samples: Iterable[Sample], *, columns: bool
+) -> VariantRun:
     """Run a case; `columns`: whether its verdict looks for errors of single columns."""
     who = prepared.identifier
     result = Result(who.model, who.observed, who.validation, EVERY, layout=prepared.layout)
@@ -230,14 +219,13 @@ def _run(prepared: Prepared, samples: Iterable[Sample], *, columns: bool) -> Res
         result.add(who.step(sample.t, sample.z, sample.inputs))
     if result.last is not None:
         result._settle(who._settled(result.last, columns=columns))
-    return result
+    return _ended(variant, prepared, result.to_xarray())
 
 
 def _evidence_of_same(stated: Prepared, late: Prepared, found: VariantRun) -> float | None:
     """Return the log evidence of the case as stated with the readings that a variant has used.
 
-    A late channel loses its first readings, or those of others before it begins. None if the
-    variant uses all; NaN if the case has not all readings of the variant.
+    A late channel loses its first readings, or the readings of others before it begins.
     """
     known, table = late.stream, stated.stream
     if not (isinstance(known, DataTable) and isinstance(table, DataTable)):
@@ -260,8 +248,7 @@ def _evidence_of_same(stated: Prepared, late: Prepared, found: VariantRun) -> fl
         values[(table.t < low) | (table.t > high), table.names.index(name)] = np.nan
     if np.array_equal(values, table.values, equal_nan=True):
         return None
-    run = _run(stated, replace(table, values=values), columns=False)
-    own = _ended(Variant(AS_STATED), stated, run.to_xarray())
+    own = _run(Variant(AS_STATED), stated, replace(table, values=values), columns=False)
     return own.log_evidence if dict(own.readings) == dict(found.readings) else math.nan
 
 
@@ -286,26 +273,19 @@ def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun
     seen = np.isfinite(data["innovation"].transpose("time", "sensor").values[used]).sum(axis=0)
     readings = dict(zip(map(str, data["sensor"].values), seen.tolist(), strict=True))
     evidence = float(data.attrs.get("log_evidence", math.nan))
+    # A density in the unit of the data, not of the model: the case may state another unit.
+    columns = columns_of(prepared.case)
+    volumes = (n * math.log(abs(columns[k].factor)) for k, n in readings.items() if k in columns)
     return VariantRun(
         variant,
         verdict=found.to_dict(),
-        log_evidence=evidence + _log_volume(prepared, readings),
+        log_evidence=evidence + sum(volumes),
         readings=readings,
         misfits=_misfits(data) if errors is None else dict(errors.sensors),
         errors={n: rmse(one.later) for n, one in channels.items() if one.role == "assimilated"},
         validation={n: rmse(one.later) for n, one in channels.items() if one.role == "validation"},
         estimates=estimates,
         unknowns=len(labels) + sum(modes),
-    )
-
-
-def _log_volume(prepared: Prepared, readings: Mapping[str, int]) -> float:
-    """Return what turns a log density in the units of the model into one in those of the data."""
-    columns = columns_of(prepared.case)
-    return sum(
-        count * math.log(abs(columns[name].factor))
-        for name, count in readings.items()
-        if name in columns
     )
 
 
@@ -324,9 +304,8 @@ def _misfits(data: xr.Dataset) -> dict[str, float]:
 def recommended(base: VariantRun, others: Sequence[VariantRun]) -> VariantRun:
     """Return the variant with the best evidence that predicts the validation sensors no worse.
 
-    Of several whose evidence is no strong one against each other it is the one with the fewest
-    unknowns; the case itself if none has strong evidence against it. One that is not to be trusted
-    is of no use where another one with strong evidence is.
+    Among variants of similar evidence it is the one with the fewest unknowns, and a usable one goes
+    first. It is the case itself if none has strong evidence against it.
     """
     fair = [one for one in others if not _worse(one, base)]
     useful = [one for one in fair if one.level in USABLE and one.gained(base) > GAINED]
@@ -339,10 +318,7 @@ def recommended(base: VariantRun, others: Sequence[VariantRun]) -> VariantRun:
 
 
 def _worse(one: VariantRun, base: VariantRun) -> bool:
-    """Return whether a run predicts one of the validation sensors worse than another run does.
-
-    Each sensor counts: they may have different units, and one may not hide behind another.
-    """
+    """Return whether a run predicts one of the validation sensors worse than another run does."""
     return any(_worse_at(one, name, error) for name, error in base.validation.items())
 
 
@@ -354,25 +330,17 @@ def _worse_at(one: VariantRun, name: str, error: float) -> bool:
 
 def conclusions(base: VariantRun, others: Sequence[VariantRun]) -> list[str]:
     """Return sentences on the recommendation, and on what other variants disagree about."""
-    best = recommended(base, others)
+    best, remarks = recommended(base, others), _remarks(base, others)
+    text = _recommendation(base, best)
     if math.isnan(base.log_evidence):
         text = (
             "Variants are not ranked: this case has no log evidence (its law has no covariance). "
             "The case is kept unchanged."
         )
-        return [text, *_failures(others), *_disagreements(best, [base, *others])]
-    return [
-        _recommendation(base, best),
-        *_failures(others),
-        *_remarks(base, others),
-        *_disagreements(best, [base, *others]),
-    ]
-
-
-def _failures(others: Sequence[VariantRun]) -> Iterator[str]:
-    """Iterate over a sentence on the variants that failed."""
-    if failed := [f"'{one.variant.name}'" for one in others if one.error]:
-        yield f"Not compared, because they failed: {', '.join(failed)}."
+        remarks = iter(())
+    failed = [f"'{one.variant.name}'" for one in others if one.error]
+    why = [f"Not compared, because they failed: {', '.join(failed)}."] if failed else []
+    return [text, *why, *remarks, *_disagreements(best, [base, *others])]
 
 
 def _recommendation(base: VariantRun, best: VariantRun) -> str:
