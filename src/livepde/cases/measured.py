@@ -99,11 +99,8 @@ def measured(
 ) -> Measured:
     """Read a CSV file of which nothing is known.
 
-    `time_unit`: the unit of time of the equation.
-    `time_format`: of dates; empty: found from the cells.
-    `skip`: lines before the header; None: found from the lines.
-    Raises `DataError`: there is no such file, or it is no table of times and measurements; one
-    sentence.
+    `time_unit`: the unit of time of the equation. `time_format`: of dates; empty: found from the
+    cells. `skip`: lines before the header; None: found from the lines.
     """
     if table.suffix in (*JSON_LINES, ".parquet"):
         raise SampleError(f"{table}: expected a CSV file with a header.")
@@ -113,7 +110,7 @@ def measured(
     found = ""
     if kinds[time[0]] == "date":
         found = _format(table, written, time, time_format)
-    numbers = [name for name in _of_kind(kinds, "number") if name not in time]
+    numbers = [name for name, kind in kinds.items() if kind == "number" and name not in time]
     counted = tuple(name for name in numbers if _counts_rows(name, written))
     columns = {n: Column((n,), decimal=written.decimal) for n in numbers if n not in counted}
     if not columns:
@@ -151,9 +148,8 @@ def _kinds(table: Path, written: Written, form: str) -> dict[str, str]:
     form = form or next(iter(written.time_formats), "")
     of_cell = partial(_kind, decimal=written.decimal, form=form)
     if VALUES.issuperset(map(of_cell, filter(None, header))):
-        raise SampleError(
-            f"{table}: has no header. Add a first line with the names of its columns."
-        )
+        text = "has no header. Add a first line with the names of its columns."
+        raise SampleError(f"{table}: {text}")
     if len(header) < 2:
         raise SampleError(
             f"{table}: has one column, '{header[0]}'; expected times and measurements, with a "
@@ -179,13 +175,12 @@ def _kind(cell: str, decimal: str, form: str) -> str:
     return "hour" if HOUR.fullmatch(cell.strip()) else "text"
 
 
-def _of_kind(kinds: Mapping[str, str], kind: str) -> list[str]:
-    return [name for name, found in kinds.items() if found == kind]
-
-
 def _times(table: Path, written: Written, kinds: Mapping[str, str]) -> tuple[str, ...]:
     """Return the column of times: dates, or numbers that increase; or days and times of day."""
-    dates, hours, numbers = (_of_kind(kinds, kind) for kind in ("date", "hour", "number"))
+    dates, hours, numbers = (
+        [name for name, found in kinds.items() if found == kind]
+        for kind in ("date", "hour", "number")
+    )
     complete = [name for name in dates if ":" in "".join(_cells(name, written))]
     if dates and hours and not complete:
         return dates[0], hours[0]
@@ -206,7 +201,11 @@ def _times(table: Path, written: Written, kinds: Mapping[str, str]) -> tuple[str
 def _most_like_times(numbers: Sequence[str], written: Written) -> list[str]:
     """Return columns of numbers that may be times, those with the surest signs first."""
     timed = [name for name in numbers if unit_in(name, "s", IN_BRACKETS, AT_THE_END)]
-    rising = [name for name in numbers if _rises(name, written)]
+    rising = []
+    for name in numbers:
+        pairs = pairwise(_values(name, written))
+        if all(a is not None and b is not None and a < b for a, b in pairs):
+            rising.append(name)
     both = [name for name in timed if name in rising]
     # Row numbers increase, too: they are times only if nothing else is.
     others = [name for name in rising if not _counts_rows(name, written)]
@@ -215,9 +214,9 @@ def _most_like_times(numbers: Sequence[str], written: Written) -> list[str]:
 
 def _format(table: Path, written: Written, time: tuple[str, ...], given: str) -> str:
     """Return the format of dates; refuses cells whose order of day and month is not unique."""
-    cells = [" ".join(parts) for parts in zip(*(_cells(n, written) for n in time), strict=False)]
     if given:
         return given
+    cells = [" ".join(parts) for parts in zip(*(_cells(n, written) for n in time), strict=False)]
     formats = date_formats(cells)
     if len(formats) == 1:
         return formats[0]
@@ -246,11 +245,6 @@ def _cells(name: str, written: Written) -> list[str]:
 def _values(name: str, written: Written) -> list[float | None]:
     k = written.header.index(name)
     return [number_of(row[k], written.decimal) for row in written.rows if k < len(row)]
-
-
-def _rises(name: str, written: Written) -> bool:
-    values = _values(name, written)
-    return all(a is not None and b is not None and a < b for a, b in pairwise(values))
 
 
 def _counts_rows(name: str, written: Written) -> bool:

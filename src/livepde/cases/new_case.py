@@ -53,10 +53,7 @@ def schema_text() -> str:
 
 
 def documented(text: str) -> tuple[str, dict[str, str]]:
-    """Return the summary of a docstring, and parameter -> its meaning.
-
-    Options of a law are documented where they are declared, and only there.
-    """
+    """Return the summary of a docstring, and parameter -> its meaning."""
     summary = text.partition("\n\n")[0].replace("\n", " ")
     listed = re.search(r"^Parameters\n-+\n(.*?)(?:\n\n|\Z)", text, flags=re.DOTALL | re.MULTILINE)
     items = re.findall(r"^(\w+)\n((?: +.*\n?)+)", listed[1] if listed else "", flags=re.MULTILINE)
@@ -118,7 +115,7 @@ def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
         *_inline("data", _data(table, folder), told),
         *_contents(table),
         *_unknowns(equation, given),
-        *_inputs(found),
+        *_constants(found),
         *_inline("law", {"noise": noise}, "standard deviation of a single reading"),
         *_steps(table, equation),
         "",
@@ -241,14 +238,10 @@ def _steps(table: Measured, equation: Equation) -> Iterator[str]:
 
 
 def _alternative(equation: Equation, inputs: set[str]) -> str:
-    """Return the initial choice among alternative unknowns of an equation.
-
-    The first whose inputs the table has, or else the last, which needs the least.
-    """
-    for name, belongs in equation.alternatives.items():
-        if inputs & set(belongs):
-            return name
-    return next(reversed(list(equation.alternatives)), "")
+    """Return the initial choice among alternative unknowns of an equation."""
+    fits = [name for name, belongs in equation.alternatives.items() if inputs & set(belongs)]
+    # If the table has no input of any, it is the last one, which needs the least.
+    return fits[0] if fits else next(reversed(list(equation.alternatives)), "")
 
 
 def _unknowns(equation: Equation, inputs: set[str]) -> Iterator[str]:
@@ -260,21 +253,17 @@ def _unknowns(equation: Equation, inputs: set[str]) -> Iterator[str]:
         if name == chosen or not variable.optional:
             others = [other for other in equation.alternatives if other != name]
             more = f"; or {', '.join(others)}, or both" if name == chosen else ""
-            yield from _unknown(name, variable, more)
+            prior = _open(variable.unit)
+            given: dict[str, Any] = {"prior": prior, "std": prior}
+            if variable.transform == "logit":
+                given["bounds"] = [0, 1]
+            if variable.transform:
+                given["transform"] = variable.transform
+            yield from _inline(f"unknowns.{name}", given, variable.text + more)
 
 
-def _unknown(name: str, variable: Variable, more: str) -> Iterator[str]:
-    prior = _open(variable.unit)
-    given: dict[str, Any] = {"prior": prior, "std": prior}
-    if variable.transform == "logit":
-        given["bounds"] = [0, 1]
-    if variable.transform:
-        given["transform"] = variable.transform
-    yield from _inline(f"unknowns.{name}", given, variable.text + more)
-
-
-def _inputs(found: list[FoundChannel]) -> Iterator[str]:
-    """Yield the lines of the inputs without a column: constants, unless one is named."""
+def _constants(found: list[FoundChannel]) -> Iterator[str]:
+    """Yield the lines of the inputs without a column."""
     for item in found:
         if not item.columns:
             more = f'or [channels] {item.name} = {{ role = "input", column = ... }}'
@@ -314,18 +303,13 @@ def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
             label = key if key and keys.count(key) == 1 else name
             found.append(_sensor(equation, label, name, values))
     there = {item.name for item in found if not item.is_sensor}
-    return [*_in_families(equation, found), *_lacking(equation, inputs, there)]
-
-
-def _lacking(
-    equation: Equation, inputs: Mapping[str, Variable], there: set[str]
-) -> Iterator[FoundChannel]:
-    """Yield those of the inputs without a column that the case needs."""
     chosen = equation.alternatives.get(_alternative(equation, there), ())
-    for name, variable in inputs.items():
-        if not variable.optional or name in chosen:
-            given = {"role": "input", "value": _open(variable.unit)}
-            yield FoundChannel(name, given, (), variable.text)
+    lacking = [
+        FoundChannel(name, {"role": "input", "value": _open(variable.unit)}, (), variable.text)
+        for name, variable in inputs.items()
+        if not variable.optional or name in chosen
+    ]
+    return [*_in_families(equation, found), *lacking]
 
 
 def _input_of(column: str, inputs: Mapping[str, Variable]) -> str:
@@ -379,7 +363,7 @@ def _in_families(equation: Equation, found: list[FoundChannel]) -> list[FoundCha
     """Return the channels with numbered sensors whose places are open, u_0 to u_37, as one."""
 
     def stem_of(item: FoundChannel) -> tuple[str, bool]:
-        """Return the column of a numbered sensor without its number; else the name, and False."""
+        # The column of a numbered sensor without its number; else the name, and False.
         numbered = NUMBERED.fullmatch(item.columns[0])
         open_ = item.is_sensor and BLANK in str(item.given["at"]) and "unit" not in item.given
         return (numbered[1], True) if numbered and open_ else (item.name, False)
@@ -418,15 +402,11 @@ def _range(values: Array) -> str:
 
 
 def write_template(
-    folder: Path, table: Measured | Path | None = None, equation: Equation = EQUATIONS["heat"]
+    folder: Path, table: Path | None = None, equation: Equation = EQUATIONS["heat"]
 ) -> tuple[Path, Path]:
     """Write a commented case into a folder, and return the paths of case and data.
 
     The case is for a table of measurements, or else for made-up data that are written beside it.
-
-    Raises `RunError`: a file that would be written is there already, or the folder is none or
-    cannot be written.
-    Raises `DataError`: the table cannot be used as it is.
     """
     if table is None:
         check_free(folder, ["rod.csv", "case.toml"])  # before the simulation, which takes a while
@@ -434,9 +414,9 @@ def write_template(
         write_files(folder, {"rod.csv": _measurements(), "case.toml": text})
         return folder / "case.toml", folder / "rod.csv"
     check_free(folder, ["case.toml"])
-    found = table if isinstance(table, Measured) else measured(table, equation.time_unit)
+    found = measured(table, equation.time_unit)
     write_files(folder, files_for(found, folder, equation))
-    return folder / "case.toml", found.path
+    return folder / "case.toml", table
 
 
 def files_for(table: Measured, folder: Path, equation: Equation) -> dict[str, str]:

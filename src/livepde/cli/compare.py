@@ -21,6 +21,7 @@ from livepde.atomic_write import write_bytes
 from livepde.cases.read import filled, parse, read_text
 from livepde.cases.variants import (
     AS_STATED,
+    MOST,
     LastEstimate,
     Variant,
     VariantRun,
@@ -69,7 +70,7 @@ def compare(
     ] = None,
     most: Annotated[
         int, typer.Option(min=1, help="Largest number of variants, if the program chooses them.")
-    ] = 12,
+    ] = MOST,
     jobs: Annotated[
         int, option("Number of processes. Default: one for each processor.", min=1)
     ] = os.cpu_count() or 1,
@@ -99,8 +100,11 @@ def compare(
     Of a run: livepde compare runs/mycase --write mycase/better.toml
     """
     given = [variant_of(text) for text in variants or ()]
-    named = case
-    case, settings, data = _of_run(named, settings or [], data)
+    named, settings = case, settings or []
+    if named.is_dir():
+        opened = runs.open(named)
+        case, settings = opened.case_file(), [*opened.settings, *settings]
+        data = data or opened.data_file
     loaded = load_case(case, allow_code, settings)
     if loaded.goes_on(data) or data == "-":
         raise ConfigurationError(
@@ -124,7 +128,11 @@ def compare(
     if write is not None and best is base:
         notes.append(f"{write} is not written: the case itself is recommended.")
     elif write is not None:
-        notes.append(_written(write, case, settings, best.variant.settings))
+        text = read_text(case)
+        for each in (settings, best.variant.settings):
+            text = filled(text, parse(each), str(case))
+        write_bytes(write, text.encode())
+        notes.append(f"Wrote {write}: livepde run {write}")
     if figure is not None and base.estimates:
         _draw([base, *found], best, figure)
         notes.append(f"Wrote {figure}.")
@@ -140,16 +148,6 @@ def compare(
         recommended=best.variant.name,
         variants=[one.to_dict() for one in (base, *found)],
     )
-
-
-def _of_run(
-    case: Path, settings: Sequence[str], data: str | None
-) -> tuple[Path, list[str], str | None]:
-    """Return case file, settings and data: those of a run if its directory is named."""
-    if not case.is_dir():
-        return case, list(settings), data
-    opened = runs.open(case)
-    return opened.case_file(), [*opened.settings, *settings], data or opened.data_file
 
 
 def _all(
@@ -206,16 +204,9 @@ def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> 
                 *cells,
             )
         )
-    columns = (
-        "variant",
-        "verdict",
-        "log evidence",
-        "misfit / noise",
-        "validation RMSE",
-        "unknowns",
-    )
+    columns = ("variant", "verdict", "log evidence", "misfit / noise", "validation RMSE")
     title = "Variants (* recommended; log evidence relative to the case)"
-    tables = [Table(title, (*columns, "overlaps", *labels), rows)]
+    tables = [Table(title, (*columns, "unknowns", "overlaps", *labels), rows)]
     more = [
         (one.variant.name, label, _interval(known), known.unit)
         for one in ended
@@ -281,12 +272,3 @@ def _check_figure(target: Path) -> None:
         raise ConfigurationError(f"--figure {target}: name a file that ends in .png, .pdf or .svg.")
     if not target.parent.is_dir():
         raise ConfigurationError(f"--figure {target}: there is no directory {target.parent}.")
-
-
-def _written(target: Path, case: Path, *settings: Sequence[str]) -> str:
-    """Write a case with settings, one part after the other, and return a sentence on it."""
-    text = read_text(case)
-    for each in settings:
-        text = filled(text, parse(each), str(case))
-    write_bytes(target, text.encode())
-    return f"Wrote {target}: livepde run {target}"

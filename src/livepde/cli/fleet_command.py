@@ -120,22 +120,12 @@ def fleet(
     for row in () if resume else rows:
         runs.refuse_taken(folder / row.name)
     run = FleetRunner(case, folder, allow_code, tuple(settings or ()), resume, separately)
-    _report(folder, *_each(run, rows, jobs, backend), as_json=as_json)
-
-
-def _report(
-    folder: Path,
-    ended: Sequence[MemberOutcome],
-    told: Sequence[str],
-    summary: pd.DataFrame,
-    as_json: bool,
-) -> None:
-    """Print the outcomes of all members; a member that failed ends the command with an error."""
+    ended, told, summary = _each(run, rows, jobs, backend)
     wrong = [item for item in ended if item.status == "failed" or item.failed]
     notes = [*_how(ended), *told, *_complaints(ended)]
     lines = [f"[bold]Run directories: {escape(str(folder))}[/]"]
-    rows = [tuple(row) for row in summary.itertuples(index=False)]
-    tables = [Table(f"{len(rows)} runs", list(map(str, summary.columns)), rows)]
+    cells = [tuple(row) for row in summary.itertuples(index=False)]
+    tables = [Table(f"{len(cells)} runs", list(map(str, summary.columns)), cells)]
     present(tables, [], notes, as_json=as_json, lines=lines, run=str(folder), failed=len(wrong))
     if any(item.status == "interrupted" for item in ended):
         raise typer.Exit(INTERRUPTED)
@@ -343,30 +333,21 @@ class FleetRunner:
 
     def _alone(self, member: Member, prepared: Prepared) -> MemberOutcome:
         """Run one member, if it has not finished."""
-        case, name = prepared.case, member.name
+        name, table = member.name, prepared.stream
         target = self._target(name)
         try:
-            through = self._through(member, prepared)
-            if through is not None:
-                return through
+            if self.resume and (target / runs.RECORD).exists() and isinstance(table, DataTable):
+                run = runs.open(target)
+                if run.status == "finished" and run.record.get("samples") == len(table):
+                    return _outcome_of(name, run, run.dataset, run.checks)
             with ExitStack() as stack:
-                write = partial(self._writer, member, case)
+                write = partial(self._writer, member, prepared.case)
                 writer, (_, driven) = run_batch(prepared, target, write, stack, quiet=True)
                 one = (prepared, prepared.identifier, driven, writer)
                 dataset, _, checks, _ = concluded(*one, draw=False)
         except LivepdeError as error:
             return MemberOutcome(name, "failed", error=str(error))
         return _outcome_of(name, driven, dataset, checks)
-
-    def _through(self, member: Member, prepared: Prepared) -> MemberOutcome | None:
-        """Return how a run ended that has taken all of its samples before; None if it has not."""
-        target, table = self._target(member.name), prepared.stream
-        if not (self.resume and (target / runs.RECORD).exists() and isinstance(table, DataTable)):
-            return None
-        run = runs.open(target)
-        if run.status != "finished" or run.record.get("samples") != len(table):
-            return None
-        return _outcome_of(member.name, run, run.dataset, run.checks)
 
 
 def _interrupted(ended: Mapping[str, MemberOutcome]) -> bool:
@@ -452,11 +433,8 @@ def in_parts(
 ) -> Iterator[Found]:
     """Run rows in parts of bounded size, and iterate over their results, in any order.
 
-    A part whose worker died is run again; `run` has to resume from its run directories. Dask uses
-    all workers of its cluster. `told` receives a sentence for each loss of a worker.
-
-    Raises `ConfigurationError`: joblib or the backend is not installed.
-    Raises `RunError`: workers died `ATTEMPTS` times in a row without a finished part in between.
+    A part whose worker died is run again; `run` has to resume from its run directories. `told`
+    receives a sentence for each loss of a worker.
     """
     try:
         from joblib import Parallel, delayed, effective_n_jobs
@@ -484,17 +462,13 @@ def in_parts(
                     lost = 0
                     yield found
             except Exception as error:
-                # A dead worker: killed, or out of memory.
-                if (
-                    not isinstance(error, BrokenExecutor)
-                    and type(error).__name__ not in DEAD_WORKER
-                ):
+                name = type(error).__name__
+                if not isinstance(error, BrokenExecutor) and name not in DEAD_WORKER:
                     raise
                 lost += 1
                 members = sum(map(len, parts.values()))
-                what = (
-                    f"A worker process died (killed or out of memory), {members} members unfinished"
-                )
+                what = "A worker process died (killed or out of memory)"
+                what += f", {members} members unfinished"
                 if lost == ATTEMPTS:
                     raise RunError(f"{what}, {lost} times in a row without progress.") from error
                 told.append(f"{what}. They were resumed from their run directories.")

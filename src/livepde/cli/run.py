@@ -150,7 +150,18 @@ def run(
     if driven.error is not None:
         raise driven.error
     if not estimates:  # which are all that standard output is for then
-        _report(loaded.title, folder, driven, found, as_json)
+        where = escape(str(folder))
+        printing.present(
+            found.tables,
+            found.checks,
+            found.notes,
+            as_json=as_json,
+            title=f"[bold]{escape(loaded.title)}[/]  {len(driven.result)} samples",
+            lines=[f"[bold]Run directory: {where}[/]", f"To view it: livepde watch {where}"],
+            dataset=found.dataset,
+            run=str(folder),
+            status=driven.status,
+        )
     if driven.status == "interrupted" and not live:  # a live run usually ends by a signal
         raise typer.Exit(printing.INTERRUPTED)
     if as_json and not all(item.ok for item in found.checks):
@@ -187,33 +198,12 @@ def _refuse(how: LiveOptions, live: bool, as_json: bool) -> None:
         )
 
 
-def _report(title: str, folder: Path, driven: Driven, found: Conclusion, as_json: bool) -> None:
-    """Print the results of a run, and where they are."""
-    where = escape(str(folder))
-    printing.present(
-        found.tables,
-        found.checks,
-        found.notes,
-        as_json=as_json,
-        title=f"[bold]{escape(title)}[/]  {len(driven.result)} samples",
-        lines=[f"[bold]Run directory: {where}[/]", f"To view it: livepde watch {where}"],
-        dataset=found.dataset,
-        run=str(folder),
-        status=driven.status,
-    )
-
-
 def writer_of(
     loaded: Case, folder: Path, settings: Sequence[str], resume: bool, command: Sequence[str]
 ) -> RunWriter:
     """Return the writer of the run directory, a new or a resumed one."""
-    about: dict[str, Any] = {
-        "version": __version__,
-        "command": command,
-        "case": loaded.text,
-        "settings": settings,
-        "original": loaded.original,
-    }
+    about: dict[str, Any] = {"version": __version__, "command": command, "settings": settings}
+    about |= {"case": loaded.text, "original": loaded.original}
     if resume and (folder / RECORD).exists():
         return RunWriter.reopen(folder, **about)
     return RunWriter.create(folder, title=loaded.title, **about)
@@ -369,8 +359,8 @@ def run_live(
 ) -> tuple[RunWriter, tuple[Prepared, Driven]]:
     """Run a case in its run directory until its source ends or a signal comes.
 
-    `write`: makes the run directory; called when the source is connected.
-    `stack`: closes all opened resources, among them the journal, from which the result reads.
+    `write` creates the run directory, when the source is connected. `stack` closes what is opened,
+    among it the journal, from which the result reads.
     """
     wiring = stack.enter_context(
         LiveCase(case, how.data, path=folder / JOURNAL, pace=how.pace, allow_env=how.allow_env)
