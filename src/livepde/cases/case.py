@@ -387,7 +387,7 @@ class Case(CaseContent):
 
     def read(self, source: str | Iterable[str] | None = None) -> Prepared:
         """Return the case with its data, as `prepare` does, before an identifier is built."""
-        raw = read_data(self, self.columns, self.clock, source)
+        raw = read_data(self, source)
         table = raw if isinstance(raw, DataTable) else None
         data = raw if table is None else without_gaps(self, table)
         samples: Iterator[Sample] = iter(data)

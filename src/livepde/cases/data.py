@@ -15,6 +15,7 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
+from livepde.cases.case_channels import columns_of
 from livepde.cases.case_content import CaseContent, check_options, load_code, own_code
 from livepde.cases.schema import SENSORS, BrokerSpec, CaseSpec, DataSpec, FileSpec, NodesSpec
 from livepde.dates import since_1970
@@ -34,7 +35,7 @@ from livepde.streams.intake import Habit, Policy
 from livepde.streams.mqtt import Broker, MqttSink, MqttSource
 from livepde.streams.oddities import wild_first_rows
 from livepde.streams.sources import Follow, Lines, RowSource
-from livepde.streams.table import JSON_LINES, no_file
+from livepde.streams.table import JSON_LINES, no_file, read_parquet
 from livepde.units import conversion
 
 if TYPE_CHECKING:
@@ -91,26 +92,30 @@ def _instant(case: CaseContent, value: Any, key: str) -> Any:
     return value
 
 
-def read_data(
-    case: CaseContent,
-    columns: Mapping[str, Column],
-    clock: Clock,
-    source: str | Iterable[str] | None,
-) -> DataTable | JsonLines:
+def read_data(case: CaseContent, source: str | Iterable[str] | None) -> DataTable | JsonLines:
     """Return the data: of the case's file, another file, or lines of JSON as they come."""
-    found = _all_read(case, columns, clock, source)
-    if isinstance(found, JsonLines):
-        refuse_late(case)
-        return found
-    tables = _on_time(case, columns, found)
+    spec, columns, clock = case.spec.data, columns_of(case), clock_of(case)
+    if source is None and isinstance(spec.file, tuple):
+        tables = _of_files(case, spec.file, columns)
+    else:
+        check_hours(case, clock, spec.file if source is None else source)
+        if not isinstance(source, str | None):
+            refuse_late(case)
+            return JsonLines(source, columns, clock, every=spec.every, missing=spec.missing)
+        if source is None and case.reader is not None:
+            tables = [_from_reader(case, case.reader, columns, clock)]
+        else:
+            path = data_file(case) if source is None else Path(source)
+            tables = [_read(path, columns, clock, spec)]
+    tables = _on_time(case, columns, tables)
     if len(tables) == 1:
         return tables[0]
     from livepde.streams.join import join_tables
 
-    second, sensors = clock_of(case).second, case.roles(*SENSORS)
     needed = [name for name, column in columns.items() if column.needed]
     between = {name: column.between for name, column in columns.items()}
-    return join_tables(tables, second, sensors, needed, case.where("data.file"), between)
+    where = case.where("data.file")
+    return join_tables(tables, clock.second, case.roles(*SENSORS), needed, where, between)
 
 
 def _on_time(
@@ -148,24 +153,6 @@ def refuse_late(case: CaseContent) -> None:
         raise case.error(f"channels.{name}.late", LATE)
 
 
-def _all_read(
-    case: CaseContent,
-    columns: Mapping[str, Column],
-    clock: Clock,
-    source: str | Iterable[str] | None,
-) -> list[DataTable] | JsonLines:
-    """Return the tables of all files, before they are joined."""
-    spec = case.spec.data
-    if source is None and isinstance(spec.file, tuple):
-        return _of_files(case, spec.file, columns)
-    check_hours(case, clock, spec.file if source is None else source)
-    if not isinstance(source, str | None):
-        return JsonLines(source, columns, clock, every=spec.every, missing=spec.missing)
-    if source is None and case.reader is not None:
-        return [_from_reader(case, case.reader, columns, clock)]
-    return [_read(data_file(case) if source is None else Path(source), columns, clock, spec)]
-
-
 def check_hours(case: CaseContent, clock: Clock, source: Any) -> None:
     """Refuse times in two columns of a source that is not a CSV file."""
     ending = Path(source).suffix if isinstance(source, str) else ""
@@ -180,8 +167,6 @@ def _read(path: Path, columns: Mapping[str, Column], clock: Clock, spec: DataSpe
     if path.suffix in JSON_LINES:
         return read_json_lines(path, columns, clock, **rows)
     if path.suffix == ".parquet":
-        from livepde.streams.table import read_parquet
-
         return read_parquet(path, columns, clock, **rows)
     rows |= {"separator": spec.separator, "encoding": spec.encoding, "skip": spec.skip}
     return read_csv(path, columns, clock, **rows)
@@ -192,16 +177,16 @@ def _of_files(
 ) -> list[DataTable]:
     """Return several files as tables; each channel comes from one of them."""
     specs = [case.spec.data.of(file) for file in files]
-    paths = [_found(case, str(spec.file)) for spec in specs]
-    headers = []
-    for spec, path in zip(specs, paths, strict=True):
+    found = []
+    for spec in specs:
+        path = _found(case, str(spec.file))
         if path.suffix in (".parquet", *JSON_LINES):
             text = f"{path} is not a CSV file; only CSV files can be joined."
             raise case.error("data.file", text)
-        headers.append(header_of(path, spec.separator, spec.encoding, spec.skip))
-    owners = {name: _owner(case, name, one, paths, headers) for name, one in columns.items()}
+        found.append((path, header_of(path, spec.separator, spec.encoding, spec.skip)))
+    owners = {name: _owner(case, name, one, found) for name, one in columns.items()}
     tables = []
-    for k, (spec, path) in enumerate(zip(specs, paths, strict=True)):
+    for k, (spec, (path, _)) in enumerate(zip(specs, found, strict=True)):
         # Which rows are needed is decided once they are joined.
         own = {
             name: replace(column, decimal=spec.decimal, needed=False)
@@ -215,20 +200,17 @@ def _of_files(
 
 
 def _owner(
-    case: CaseContent,
-    name: str,
-    column: Column,
-    paths: Sequence[Path],
-    headers: Sequence[list[str]],
+    case: CaseContent, name: str, column: Column, files: Sequence[tuple[Path, list[str]]]
 ) -> int:
-    """Return the number of the one file that has a column."""
-    places = [k for k, header in enumerate(headers) if set(column.names) <= set(header)]
+    """Return the number of the one file, of path and header, that has a column."""
+    places = [k for k, (_, header) in enumerate(files) if set(column.names) <= set(header)]
     if len(places) == 1:
         return places[0]
     what = " and ".join(map(repr, column.names))
-    text = f"no file has the column {what}; the files are {', '.join(map(str, paths))}."
+    listed = ", ".join(str(path) for path, _ in files)
+    text = f"no file has the column {what}; the files are {listed}."
     if places:
-        both = " and ".join(str(paths[k]) for k in places)
+        both = " and ".join(str(files[k][0]) for k in places)
         text = f"{both} have a column {what} each; rename one."
     raise case.error(f"channels.{column.noise_of or name}", text)
 

@@ -272,7 +272,7 @@ class LiveCase:
     def _fed(self, data: Data) -> Feed:
         case, named = self.case, data if isinstance(data, str) else None
         if self._reads_all(data, named):
-            table = read_data(case, case.columns, case.clock, named)
+            table = read_data(case, named)
             self._origin = table.origin
             last = -math.inf if self._journal is None else self._journal.last
             return SampleFeed(table, after=last)
