@@ -37,31 +37,15 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str
     Their cases differ only in data, initial state and descriptions; their samples have the same
     times.
     """
-    groups, apart = _alike(members)
-    found = []
-    for group in groups:
-        why = {name: reason for name, one in group.items() if (reason := _refuses(one))}
-        apart |= why
-        rest = {name: one for name, one in group.items() if name not in why}
-        if len(rest) < 2:
-            apart |= dict.fromkeys(rest, ALONE)
-            continue
-        block = MemberBlock(rest)
-        if block.fleet.together:
-            found.append(block)
-        else:
-            apart |= dict.fromkeys(rest, block.fleet.note)
-    return found, apart
-
-
-def _alike(members: Mapping[str, Prepared]) -> tuple[list[dict[str, Prepared]], dict[str, str]]:
-    """Return groups of members with the same settings and times, and those without a table."""
     groups: dict[tuple[str, float, bytes], dict[str, Prepared]] = {}
     settings: dict[Case, str] = {}
     apart: dict[str, str] = {}
     for name, one in members.items():
         if not isinstance(one.stream, DataTable):
             apart[name] = "their samples come one at a time"
+            continue
+        if why := _refuses(one):
+            apart[name] = why
             continue
         # Members often share one case, whose text takes longer to write than a look-up.
         if one.case not in settings:
@@ -71,7 +55,14 @@ def _alike(members: Mapping[str, Prepared]) -> tuple[list[dict[str, Prepared]], 
             )
         key = settings[one.case], one.assimilate_from, one.stream.t.tobytes()
         groups.setdefault(key, {})[name] = one
-    return list(groups.values()), apart
+    found = []
+    for group in groups.values():
+        block = MemberBlock(group) if len(group) > 1 else None
+        if block is not None and block.fleet.together:
+            found.append(block)
+        else:
+            apart |= dict.fromkeys(group, ALONE if block is None else block.fleet.note)
+    return found, apart
 
 
 def _refuses(one: Prepared) -> str:

@@ -402,17 +402,7 @@ def _disagreements(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[s
 def proposed(prepared: Prepared, base: VariantRun, most: int = MOST) -> list[Variant]:
     """Return variants of a case, the likely causes of the verdict of its run first, each once."""
     found: dict[frozenset[str], Variant] = {}
-    start = [Variant(NAMES["initial"], freed(prepared, Cause("initial", "", "")))]
-    likely = [
-        Variant(
-            NAMES.get(cause.kind, cause.kind + " of {}").format(cause.subject),
-            settings_in(cause.setting),
-        )
-        for cause in base.causes
-    ]
-    # A start that the first readings miss looks like many other errors.
-    missed = first_miss(prepared) > _usual_error(base)
-    for variant in (*(start if missed else []), *likely, *_usual(prepared, base)):
+    for variant in _candidates(prepared, base):
         if variant.settings:
             # The same keys with another prior are no other variant.
             keys = frozenset(setting.partition("=")[0] for setting in variant.settings)
@@ -420,9 +410,15 @@ def proposed(prepared: Prepared, base: VariantRun, most: int = MOST) -> list[Var
     return list(found.values())[:most]
 
 
-def _usual(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
-    """Iterate over what is often missing or too much in a case."""
+def _candidates(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
+    """Iterate over likely causes, then over what is often missing or too much in a case."""
     case = prepared.case
+    # A start that the first readings miss looks like many other errors.
+    if first_miss(prepared) > _usual_error(base):
+        yield Variant(NAMES["initial"], freed(prepared, Cause("initial", "", "")))
+    for cause in base.causes:
+        name = NAMES.get(cause.kind, cause.kind + " of {}").format(cause.subject)
+        yield Variant(name, settings_in(cause.setting))
     if case.spec.law.kind != "sensitivity":
         return
     yield from _process(prepared, base)
@@ -462,15 +458,12 @@ def _process(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
 
 def _sensors(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     """Iterate over errors that all sensors may have."""
-    error = _usual_error(base)
     length = float(np.ptp(prepared.case.mesh.p, axis=1).max())
-    sizes = {"offset": error, "position": PLACE * length}
-    words = {"offset": "offsets of all sensors", "position": "positions of all sensors"}
-    for kind, size in sizes.items():
+    for kind, size in (("offset", _usual_error(base)), ("position", PLACE * length)):
         causes = [Cause(kind, name, "", size=size) for name in prepared.case.sensors]
         settings = [setting for cause in causes for setting in freed(prepared, cause)]
         if settings and len(causes) > 1:
-            yield Variant(words[kind], tuple(settings))
+            yield Variant(f"{kind}s of all sensors", tuple(settings))
 
 
 def _fewer(case: Case) -> Iterator[Variant]:
@@ -495,15 +488,13 @@ def _fewer(case: Case) -> Iterator[Variant]:
 
 def _layers(case: Case) -> Iterator[Variant]:
     """Iterate over unknowns with two layers, with their border at the middle of the sensors."""
-    if len(case.mesh.p) != 1:
+    nodes = np.sort(case.mesh.p[0])[1:-1]
+    if len(case.mesh.p) != 1 or not len(nodes):
         return
     low, high = float(case.mesh.p.min()), float(case.mesh.p.max())
     places = getattr(case.observation, "positions", None)
-    inner = np.asarray(places, dtype=float).ravel() if places is not None else np.empty(0)
+    inner = np.asarray(() if places is None else places, dtype=float).ravel()
     middle = float(np.median(inner)) if len(inner) else 0.5 * (low + high)
-    nodes = np.sort(case.mesh.p[0])[1:-1]
-    if not len(nodes):
-        return
     border = float(nodes[np.abs(nodes - middle).argmin()])
     for name, unknown in case.spec.unknowns.items():
         own = next(iter(case.equation.unknowns), "") == name

@@ -14,7 +14,7 @@ from rich.markup import escape
 from livepde.cases import Case, Prepared
 from livepde.cases.data import policy_of, source_text
 from livepde.cases.preview import MOST_SAMPLES, advise, preview
-from livepde.cli.options import CaseArgument, CodeOption, SetOption, load_case, option
+from livepde.cli.options import CaseArgument, CodeOption, DataOption, SetOption, load_case
 from livepde.cli.printing import CHECK_FAILED, extent, print_table, terminal
 from livepde.runs import Table, sampling_findings
 from livepde.stepping import ForwardStage
@@ -27,9 +27,7 @@ MOST_CHANNELS = 40  # rows of the table of channels
 
 def check(
     case: CaseArgument,
-    data: Annotated[
-        str | None, option("Use this data instead of the case's (.csv, .jsonl, .parquet).")
-    ] = None,
+    data: DataOption = None,
     allow_code: CodeOption = False,
     settings: SetOption = None,
     advised: Annotated[

@@ -33,6 +33,7 @@ from livepde.cases.variants import (
 )
 from livepde.cli.options import (
     CodeOption,
+    DataOption,
     JsonOption,
     SetOption,
     argument,
@@ -65,9 +66,7 @@ def compare(
         ),
     ] = None,
     settings: SetOption = None,
-    data: Annotated[
-        str | None, option("Use this data instead of the case's (.csv, .jsonl, .parquet).")
-    ] = None,
+    data: DataOption = None,
     most: Annotated[
         int, typer.Option(min=1, help="Largest number of variants, if the program chooses them.")
     ] = MOST,

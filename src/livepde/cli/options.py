@@ -56,6 +56,9 @@ SetOption = Annotated[
 ]
 RunArgument = Annotated[Path, argument("A run directory.", metavar="RUN")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite existing files.")]
+DataOption = Annotated[
+    str | None, option("Use this data instead of the case's (.csv, .jsonl, .parquet).")
+]
 CaseArgument = Annotated[Path, argument("The case file (TOML).")]
 
 
