@@ -283,7 +283,7 @@ def cases(
     )
     if gallery is not None:
         page = benchmark.gallery(runs, gallery)
-        terminal(err=True).print(f"Gallery: {page}", soft_wrap=True)
+        terminal(err=True).print(f"Gallery: {page}")
     return outcome
 
 

@@ -59,7 +59,7 @@ def main(program: typer.Typer | None = None) -> int:
         with threadpool_limits(1):
             (program or app)(standalone_mode=True)
     except LivepdeError as error:
-        terminal(err=True).print(f"[bold red]Error:[/] {escape(str(error))}", soft_wrap=True)
+        terminal(err=True).print(f"[bold red]Error:[/] {escape(str(error))}")
         return BAD_INPUT
     except BrokenPipeError:  # the reader of a pipe has seen enough
         sys.stderr.close()

@@ -73,7 +73,7 @@ def init(
         for option in (name for name, value in given.items() if value):
             raise ConfigurationError(f"{option} requires --data FILE.csv.")
         case, table = new_case.write_template(folder)
-        console.print(f"Wrote {case} and {table}. Next:", soft_wrap=True)
+        console.print(f"Wrote {case} and {table}. Next:")
     else:
         if equation is not None and ":" in equation:
             raise ConfigurationError(
@@ -93,7 +93,7 @@ def init(
         files["case.toml"] = filled(files["case.toml"], parse(settings or []), f"{case}")
         new_case.write_files(folder, files)
         _show_written(console, case, data, files)
-    console.print(f"  livepde check {case}\n  livepde run {case}", soft_wrap=True)
+    console.print(f"  livepde check {case}\n  livepde run {case}")
 
 
 def _show_written(
@@ -104,9 +104,9 @@ def _show_written(
     places = [f"{key} = {toml_value(value)}" for key, value in blanks.items()]
     places += [f"positions in {case.parent / name}" for name in files if name != "case.toml"]
     told = f"replace each '?' ({len(places)})" if places else "nothing is left open. Next"
-    console.print(f"Wrote {case} for {' and '.join(map(str, data))}: {told}:", soft_wrap=True)
+    console.print(f"Wrote {case} for {' and '.join(map(str, data))}: {told}:")
     for place in places:
-        console.print(escape(f"  {place}"), soft_wrap=True)
+        console.print(escape(f"  {place}"))
     if places:
         console.print("Next:")
 
@@ -119,7 +119,7 @@ def _show_read(console: Console, read: Measured, equation: Equation) -> None:
         rows += [(name, "text", "", "", "", "", "") for name in table.texts]
     headings = ("column", "role", "channel", "unit", "least", "largest", "missing")
     for table in read.tables:
-        console.print(f"{escape(f'{table.path}: {table.span}')}.", soft_wrap=True)
+        console.print(f"{escape(f'{table.path}: {table.span}')}.")
     print_table(console, Table(f"Times in {' and '.join(read.time)}", headings, rows))
 
 
@@ -152,11 +152,11 @@ def equations(
     console = terminal()
     if name == "list":
         for item in EQUATIONS.values():
-            console.print(f"[bold]{item.name}[/]  {escape(item.summary)}", soft_wrap=True)
+            console.print(f"[bold]{item.name}[/]  {escape(item.summary)}")
         return
     found = named(name, EQUATIONS, "equation")
-    console.print(f"[bold]{found.name}[/]  {escape(found.summary)}", soft_wrap=True)
-    console.print(escape(found.formula), soft_wrap=True)
+    console.print(f"[bold]{found.name}[/]  {escape(found.summary)}")
+    console.print(escape(found.formula))
     columns = ("table", "key", "meaning", "unit", "default")
     print_table(console, Table("Keys of a case", columns, _entries(found)))
     console.print(f"Length in {found.length_unit or '1'}, time in {found.time_unit or '1'}.")
@@ -193,4 +193,4 @@ def schema() -> None:
     Example:  livepde schema > livepde.schema.json
     """
     text = new_case.schema_text().rstrip()
-    terminal().print(text, markup=False, highlight=False, soft_wrap=True)
+    terminal().print(text, markup=False)

@@ -43,7 +43,7 @@ def check(
     _show_model(console, loaded)
     if loaded.live and data is None:
         _show_wiring(console, loaded)
-        console.print(f"[bold green]ok[/]  livepde run {escape(str(case))}", soft_wrap=True)
+        console.print(f"[bold green]ok[/]  livepde run {escape(str(case))}")
         return
     prepared = loaded.prepare(data)
     samples: DataTable = prepared.raw  # type: ignore[assignment]
@@ -60,10 +60,10 @@ def check(
     if advised:
         _show_advice(console, prepared)
     for note in notes:
-        console.print(f"[yellow]Note:[/] {escape(note)}", soft_wrap=True)
+        console.print(f"[yellow]Note:[/] {escape(note)}")
     if failed:
         raise typer.Exit(CHECK_FAILED)
-    console.print(f"[bold green]ok[/]  livepde run {escape(str(case))}", soft_wrap=True)
+    console.print(f"[bold green]ok[/]  livepde run {escape(str(case))}")
 
 
 def _refused(prepared: Prepared) -> list[str]:
@@ -171,8 +171,7 @@ def _show_advice(console: Console, prepared: Prepared) -> None:
     print_table(console, Table(title, columns, rows))
     console.print(
         f"Best of {found.candidates} vertices by the mean share of the prior variance, with the "
-        "noise of the other sensors.",
-        soft_wrap=True,
+        "noise of the other sensors."
     )
 
 
@@ -201,19 +200,20 @@ def _show_wiring(console: Console, case: Case) -> None:
     rows = [row[:shown] for row in rows]
     print_table(console, Table(f"Channels from {source_text(case)}", columns[:shown], rows))
     console.print(
-        "To see what the sensors can identify, add --data FILE: a recording with these columns.",
-        soft_wrap=True,
+        "To see what the sensors can identify, add --data FILE: a recording with these columns."
     )
 
 
 def _show_model(console: Console, case: Case) -> None:
     model = case.model
-    console.print(f"[bold]{escape(case.title)}[/]\n{escape(case.equation.formula)}")
+    title, formula = escape(case.title), escape(case.equation.formula)
+    console.print(f"[bold]{title}[/]\n{formula}", soft_wrap=False)
     engine = ForwardStage(model).engine
     console.print(
         f"State: {model.X.dim} coefficients; parameter: {model.Q.dim}; "
         f"law: {type(case.law).__name__}; scheme: {type(case.scheme).__name__}; "
-        f"engine: {engine.solver.name} ({engine.reason})."
+        f"engine: {engine.solver.name} ({engine.reason}).",
+        soft_wrap=False,
     )
 
 
@@ -224,7 +224,7 @@ def _show_data(console: Console, case: Case, prepared: Prepared, samples: DataTa
     text = f"Data: {len(samples)} samples{begin}, t = {samples.t[0]:g} to {samples.t[-1]:g} {unit}"
     if len(steps):
         text += f"; step {np.median(steps):g} {unit}, longest {steps.max():g} {unit}"
-    console.print(text + ".", soft_wrap=True)
+    console.print(text + ".")
     rows: list[tuple[Any, ...]] = []
     for name, values in list(zip(samples.names, samples.values.T, strict=True))[:MOST_CHANNELS]:
         least, largest, missing = extent(values)
@@ -264,5 +264,5 @@ def _show_checks(console: Console, prepared: Prepared) -> bool:
         if item.ok:
             console.print(f"{item.name}: [green]ok[/] ({len(item.lines)} properties)")
         else:
-            console.print(escape(str(item)), soft_wrap=True)
+            console.print(escape(str(item)))
     return not all(item.ok for item in reports)

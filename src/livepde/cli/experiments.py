@@ -59,8 +59,7 @@ def demo(out: OutOption = None) -> None:
     console.print(
         "\n[bold]Which reaction q(x) explains what is seen?[/]\n\n"
         "  u_t - (D u_x)_x + q u = f  on (0, 1), u is seen on (0.3, 0.87), one sample at a time.\n"
-        "  The state u and the parameter q are estimated together while the samples come.\n",
-        soft_wrap=True,
+        "  The state u and the parameter q are estimated together while the samples come.\n"
     )
     folder = out or free_path(Path("runs") / "demo")
     experiment = EXPERIMENTS["seed"]
@@ -71,8 +70,8 @@ def demo(out: OutOption = None) -> None:
     outcome = experiment.run(None, progress=True)
     show(console, outcome.tables, outcome.checks, outcome.notes)
     for name in _finish(writer, outcome, console):
-        console.print(f"Figure: {folder / name}.png", soft_wrap=True)
-    console.print(f"[bold]Run directory: {escape(str(folder))}[/]", soft_wrap=True)
+        console.print(f"Figure: {folder / name}.png")
+    console.print(f"[bold]Run directory: {escape(str(folder))}[/]")
 
 
 def run_experiment(
@@ -128,7 +127,7 @@ def reproduce(
 
     if name == "list":
         for item in EXPERIMENTS.values():
-            terminal().print(f"[bold]{item.name}[/]  {escape(item.summary)}")
+            terminal().print(f"[bold]{item.name}[/]  {escape(item.summary)}", soft_wrap=False)
         return
     experiment = named(name, EXPERIMENTS, "experiment")
     command = ["livepde", "reproduce", name, *(["--truth", truth] if truth else [])]
@@ -164,4 +163,4 @@ def citation(
         text = BIBTEX.format(year=year, year_line=year_line, version=__version__)
     elif form is CitationForm.apa:
         text = APA.format(year=year or "n.d.", version=__version__)
-    terminal().print(text.rstrip(), markup=False, highlight=False, soft_wrap=True)
+    terminal().print(text.rstrip(), markup=False)

@@ -144,7 +144,7 @@ def export(
             write_report(opened, target, force=force)
         else:
             write(opened, target, at=moment, force=force)
-        terminal().print(escape(f"Written: {target}"), soft_wrap=True)
+        terminal().print(escape(f"Written: {target}"))
 
 
 def _moment(text: str, data: Dataset) -> float:
@@ -255,7 +255,7 @@ def watch(
                 server.close()
 
             Thread(target=end_with_input, daemon=True).start()
-        terminal().print(f"Open {escape(server.shown)}  (Ctrl-C ends it)", soft_wrap=True)
+        terminal().print(f"Open {escape(server.shown)}  (Ctrl-C ends it)")
         server.wait()
     except KeyboardInterrupt:
         server.close()

@@ -27,8 +27,8 @@ FIGURES_MISSING = "No figures: they require Matplotlib, pip install 'livepde[plo
 
 
 def terminal(*, err: bool = False) -> Console:
-    """Return where to print: standard output, or standard error."""
-    return Console(stderr=err, highlight=False)
+    """Return where to print: standard output, or standard error. Lines are not wrapped."""
+    return Console(stderr=err, highlight=False, soft_wrap=True)
 
 
 def named(name: str, known: Mapping[str, Any], what: str) -> Any:
@@ -84,10 +84,10 @@ def present(
     console = terminal()
     if not as_json:
         if title:
-            console.print(title, soft_wrap=True)
+            console.print(title)
         show(console, shown, checks, notes)
         for line in lines:
-            console.print(line, soft_wrap=True)
+            console.print(line)
         return
     content: dict[str, Any] = {"livepde": __version__, **facts}
     content["checks"] = [item.to_dict() for item in checks]
@@ -110,9 +110,9 @@ def show(
         mark = "[green]ok[/]" if item.ok else "[bold red]failed[/]"
         grid.add_row(mark, escape(item.name), _cell(item.value), item.sense, item.bound_text)
     if grid.row_count:
-        console.print(grid)
+        console.print(grid, soft_wrap=False)
     for note in notes:
-        console.print(f"[yellow]Note:[/] {escape(note)}", soft_wrap=True)
+        console.print(f"[yellow]Note:[/] {escape(note)}")
 
 
 def extent(values: Any) -> tuple[str, str, int]:
@@ -129,7 +129,7 @@ def print_table(console: Console, table: Table) -> None:
     printed as wide as they are.
     """
     if not table.rows:
-        console.print(f"[bold]{escape(table.title)}[/]", soft_wrap=True)
+        console.print(f"[bold]{escape(table.title)}[/]")
         return
     grid = RichTable(
         title=escape(table.title), title_justify="left", box=SIMPLE_HEAD, title_style="bold"
@@ -148,7 +148,7 @@ def print_table(console: Console, table: Table) -> None:
         )
     for row in table.rows:
         grid.add_row(*(escape(_cell(value)) for value in row))
-    console.print(grid, width=max(console.width, needed), crop=False)
+    console.print(grid, width=max(console.width, needed), crop=False, soft_wrap=False)
 
 
 def _numeric(value: Any) -> bool:
