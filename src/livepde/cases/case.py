@@ -18,7 +18,7 @@ from livepde import laws
 from livepde.cases import case_channels
 from livepde.cases.case_content import CaseContent, resolve
 from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of, without_gaps
-from livepde.cases.process import conditioned, drive_notes, model_of, process_notes, wall_attributes
+from livepde.cases.process import conditioned, model_of, process_notes, wall_attributes
 from livepde.cases.read import apply, did_you_mean, read_spec, read_text, read_toml
 from livepde.cases.schema import SENSORS, GradientSpec, SensitivitySpec
 from livepde.diagnostics.check_report import Bound, Sense
@@ -343,11 +343,7 @@ class Case(CaseContent):
     @property
     def notes(self) -> list[str]:
         """Notes on allowed settings that may be mistakes."""
-        found = [
-            *drive_notes(self, self.model),
-            *process_notes(self),
-            *case_channels.sensor_notes(self),
-        ]
+        found = [*process_notes(self, self.model), *case_channels.sensor_notes(self)]
         if isinstance(self.law, laws.GradientLaw) and isinstance(self.observation, Points):
             found.append(
                 "The gradient law is made for observed subdomains and averages; a few noisy point "

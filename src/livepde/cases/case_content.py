@@ -310,11 +310,10 @@ def _option_value(case: CaseContent, option: Option, value: Any, key: str) -> An
 
 
 def resolve(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Equation:
-    """Return the equation of a case.
+    """Return the equation of a case: a predefined one, or the user's own, 'file.py:name'.
 
-    A name with a colon is code of the user, 'module:name' or 'file.py:name' (relative to the case
-    file). It is an `Equation`, or a function (mesh, unknowns, dirichlet, **options) -> `Model`;
-    then all numbers of the case are taken as they are.
+    The latter is an `Equation`, or a function that returns a `Model`; then all numbers of the case
+    are used as they are.
     """
     name = spec.equation
     if ":" not in name:
@@ -391,8 +390,6 @@ def load_code(name: str, folder: Path, where: str, expected: str, allowed: bool)
     """Import the object that a case names: 'module:name', or 'file.py:name' in its folder.
 
     `where` and `expected` are for messages: file and key, and the signature of the function.
-
-    Raises `CaseError`: not allowed, not found, or it fails while it is loaded.
     """
     source, colon, attribute = name.rpartition(":")
     if not colon:

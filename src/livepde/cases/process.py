@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -267,43 +267,17 @@ def wall_attributes(case: CaseContent, model: Model) -> dict[str, Any]:
     return {LAYERS: json.dumps(layers), SURFACES: sum(surfaces)}
 
 
-def drive_notes(case: CaseContent, model: Model) -> list[str]:
-    """Return a note if only the initial state drives the process.
-
-    Without values on boundaries and without inputs, a state that is the same everywhere neither
-    changes nor depends on the unknowns if A'(q), B and F vanish there. Left out are periodic
-    states, which carry waves, and own equations, which need not be defined for any state.
-    """
-    if ":" in case.spec.equation:
-        return []
-    fields = [block.field for block in model.state_space.fields.values()]
-    held = any(field.boundary_values or field.periodic for field in fields)
-    if held or model.channels or model.form_initial is not None or not _rests(model):
-        return []
-    return [
-        "No boundary value, flux, exchange, source or input drives the process. Only the decay of "
-        "its initial state depends on the unknowns. Add a channel with role = 'boundary', or a "
-        "value or a flux in [boundary]."
-    ]
-
-
-def _rests(model: Model) -> bool:
-    """Return whether A'(q), B and F vanish at a constant state."""
-    # Terms at a constant state are compared with those at an uneven one, which give their size:
-    # rounding leaves no exact zeros.
-    level = model.state_space.interpolate(1.0)
-    uneven = level * (1.0 + np.arange(len(level)) % 3)
-    flat, steep = (abs(model.A(u).matrix).max(axis=0).toarray() for u in (level, uneven))
-    known = np.abs(model.B(level)).max() > 1e-9 * np.abs(model.B(uneven)).max()
-    return not (known or model.F().any() or (flat > 1e-9 * steep).any())
-
-
-def process_notes(case: CaseContent) -> list[str]:
-    """Return notes on allowed settings that may be mistakes."""
-    found, spec = [], case.spec.mesh
-    graded = case.equation.spacing == "geometric"
+def process_notes(case: CaseContent, model: Model) -> Iterator[str]:
+    """Yield notes on allowed settings that may be mistakes."""
+    if _undriven(case, model):
+        yield (
+            "No boundary value, flux, exchange, source or input drives the process. Only the decay "
+            "of its initial state depends on the unknowns. Add a channel with role = 'boundary', "
+            "or a value or a flux in [boundary]."
+        )
+    spec, graded = case.spec.mesh, case.equation.spacing == "geometric"
     if graded and spec.start is not None and spec.spacing == "uniform":
-        found.append(
+        yield (
             "The mesh is uniform, so its cells are too large at the left end, where "
             f"'{case.equation.name}' changes most. Set `mesh.spacing = 'geometric'`."
         )
@@ -311,8 +285,28 @@ def process_notes(case: CaseContent) -> list[str]:
     if line and (crossed := off_nodes(case, case.mesh.p[0])):
         remedy = "Add the ends to `mesh.nodes`" if spec.nodes else "Increase `mesh.cells`"
         names, end = ", ".join(crossed), "end" if len(crossed) > 1 else "ends"
-        found.append(f"{names[0].upper()}{names[1:]} {end} inside a cell. {remedy}.")
-    return found
+        yield f"{names[0].upper()}{names[1:]} {end} inside a cell. {remedy}."
+
+
+def _undriven(case: CaseContent, model: Model) -> bool:
+    """Return whether only the initial state drives the process.
+
+    Without values on boundaries and without inputs, a state that is the same everywhere neither
+    changes nor depends on the unknowns if A'(q), B and F vanish there. Left out are periodic
+    states, which carry waves, and own equations, which need not be defined for any state.
+    """
+    fields = [block.field for block in model.state_space.fields.values()]
+    held = any(field.boundary_values or field.periodic for field in fields)
+    own = ":" in case.spec.equation
+    if own or held or model.channels or model.form_initial is not None:
+        return False
+    # Terms at a constant state are compared with those at an uneven one, which give their size:
+    # rounding leaves no exact zeros.
+    level = model.state_space.interpolate(1.0)
+    uneven = level * (1.0 + np.arange(len(level)) % 3)
+    flat, steep = (abs(model.A(u).matrix).max(axis=0).toarray() for u in (level, uneven))
+    known = np.abs(model.B(level)).max() > 1e-9 * np.abs(model.B(uneven)).max()
+    return not (known or model.F().any() or (flat > 1e-9 * steep).any())
 
 
 def conditioned(case: CaseContent) -> CaseContent:

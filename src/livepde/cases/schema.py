@@ -198,10 +198,6 @@ class DataSpec(Spec):
         sources = [n for n in ("file", "reader", "mqtt", "opcua") if getattr(self, n) is not None]
         if len(sources) > 1:
             raise ValueError(f"{sources[0]} and {sources[1]} are two sources: keep one")
-        return self
-
-    @model_validator(mode="after")
-    def _source_that_goes_on(self) -> DataSpec:
         if self.follow and not isinstance(self.file, str):
             raise ValueError("follow requires a single file that grows")
         if self.live and not self.follow and (self.skip or not isinstance(self.time, str)):

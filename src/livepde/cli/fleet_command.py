@@ -229,10 +229,12 @@ class FleetRunner:
         """Run members as `livepde run` would, as blocks where they can."""
         members = {row.name: row for row in rows}
         ready, ended = self._prepared(rows)
-        together, apart = self._plan(ready)
+        begun = {name: GOES_ON for name in ready if (self._target(name) / JOURNAL).exists()}
+        new = {name: one for name, one in ready.items() if name not in begun}
+        together, apart = ([], dict.fromkeys(new, ASKED)) if self.separately else blocks(new)
         for block in together:
             ended |= self._together(block, members) if not _interrupted(ended) else {}
-        for name, why in apart.items():
+        for name, why in (apart | begun).items():
             if not _interrupted(ended):
                 ended[name] = replace(self._alone(members[name], ready[name]), apart=why)
         return _in_order(rows, ended)
@@ -261,20 +263,10 @@ class FleetRunner:
                 ended[row.name] = MemberOutcome(row.name, "failed", error=str(error))
         return ready, ended
 
-    def _plan(self, ready: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str, str]]:
-        """Return the blocks to step together, and why each other member runs on its own."""
-        begun = {name for name in ready if (self._target(name) / JOURNAL).exists()}
-        new = {name: one for name, one in ready.items() if name not in begun}
-        found, apart = ([], dict.fromkeys(new, ASKED)) if self.separately else blocks(new)
-        return found, apart | dict.fromkeys(begun, GOES_ON)
-
     def left(
         self, rows: Sequence[Member], ended: Mapping[str, MemberOutcome], status: str, why: str
     ) -> dict[str, MemberOutcome]:
-        """Return how the other runs ended, which no process follows any more.
-
-        Runs that are still marked as running get this status and reason.
-        """
+        """Return how the other runs ended; those still marked as running get this status."""
         found = {}
         for name in (row.name for row in rows if row.name not in ended):
             target = self._target(name)

@@ -78,8 +78,8 @@ def present(
 ) -> None:
     """Print results as text, or as one JSON object.
 
-    The text has a title before the results and lines after them, with markup. The object has
-    measures and verdict of the run in `dataset`, and further facts.
+    Title and lines, with markup, are for the text; measures and verdict of the dataset and the
+    facts for the object.
     """
     console = terminal()
     if not as_json:
@@ -123,11 +123,7 @@ def extent(values: Any) -> tuple[str, str, int]:
 
 
 def print_table(console: Console, table: Table) -> None:
-    """Print a table: numbers are never cut; where the terminal is too narrow, words are folded.
-
-    A table without rows is its title. A table whose numbers alone are wider than the terminal is
-    printed as wide as they are.
-    """
+    """Print a table; in a narrow terminal words are folded, and numbers are never cut."""
     if not table.rows:
         console.print(f"[bold]{escape(table.title)}[/]")
         return
