@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, get_args
 
@@ -12,7 +13,7 @@ import typer
 
 from livepde.cli.experiments import run_experiment
 from livepde.cli.options import JsonOption
-from livepde.cli.printing import named, report_outcome
+from livepde.cli.printing import named
 from livepde.runs import Outcome
 
 Measurement: TypeAlias = Callable[..., Outcome]
@@ -124,8 +125,8 @@ class Program:
                 given |= {key: shared[key] for key in shared if key in parameters}
                 words = self._words(context, hidden)
                 title = (inspect.getdoc(function) or "").split("\n")[0].rstrip(".")
-                outcome = run_experiment(lambda: function(**given), shared["out"], words, title)
-                report_outcome(outcome, words, shared["as_json"])
+                measured = partial(function, **given)
+                run_experiment(measured, shared["out"], words, title, shared["as_json"])
 
             shared = {
                 "quick": (Annotated[bool, typer.Option("--quick", help=quick)], False),

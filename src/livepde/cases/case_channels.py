@@ -77,10 +77,8 @@ def observation_of(case: CaseContent, *roles: str) -> observation.Observation | 
         "unit": units.pop() if len(units) == 1 else "",
         "reconstruction": _reconstruction(case) if assimilated else observation.Pseudoinverse(),
     }
-    own = any(item.offset or item.gain or item.correlated for item in channels.values())
-    if own and assimilated:
-        whole = _whole(case, kinds, {})
-        return _calibrated(case, whole, names, **outer)
+    if assimilated and any(one.offset or one.gain or one.correlated for one in channels.values()):
+        return _calibrated(case, _whole(case, kinds, {}), names, **outer)
     return _whole(case, kinds, outer)
 
 
@@ -121,15 +119,15 @@ def _followed(
 ) -> dict[str, tuple[str, ...]]:
     """Return the channels of the positions of sensors that move."""
     positions: dict[str, tuple[str, ...]] = {}
-    known = case.roles("position")
+    known, needed = case.roles("position"), len(case.mesh.p)
     for name, item in channels.items():
+        key = f"channels.{name}.follows"
         given = item.follows if isinstance(item.follows, tuple) else (str(item.follows),)
         for channel in given:
-            text = f"there is no channel '{channel}' of role position"
-            case.require(channel, known, f"channels.{name}.follows", text)
-        if len(given) != (needed := len(case.mesh.p)):
+            case.require(channel, known, key, f"there is no channel '{channel}' of role position")
+        if len(given) != needed:
             text = f"got {len(given)} channels; needs one for each of {needed} coordinates."
-            raise case.error(f"channels.{name}.follows", text)
+            raise case.error(key, text)
         positions[name] = given
     return positions
 
@@ -379,7 +377,7 @@ def _level(readings: Sequence[_Reading]) -> tuple[list[float], list[float]]:
 def _initial_readings(case: CaseContent, first: Sample) -> list[_Reading]:
     """Return the readings that the initial state is interpolated from."""
     ends = {"left": float(case.mesh.p.min()), "right": float(case.mesh.p.max())}
-    values = dict(first.z) if isinstance(first.z, Mapping) else {}
+    values = by_name(first.z, ())
     found = []
     for name, channel in case.roles("sensor", "boundary").items():
         if channel.role == "boundary" and channel.at in ends:

@@ -21,6 +21,7 @@ from livepde.identifier import Identifier
 from livepde.result import Result
 from livepde.runs import Driven, Journal, stopped_by_signals
 from livepde.runs.journal import Event
+from livepde.samples import by_name
 from livepde.streams import DataTable
 
 WAITING = 2**23  # numbers that wait to be written
@@ -71,7 +72,7 @@ def _refuses(one: Prepared) -> str:
         _ = one.u0
     except LivepdeError:
         return "they cannot begin with their first sample"
-    values = dict(one.first.z) if isinstance(one.first.z, Mapping) else {}
+    values = by_name(one.first.z, ())
     known = (np.isfinite(values.get(name, np.nan)) for name in one.case.model.channels)
     return "" if all(known) else "an input has no value in their first sample"
 

@@ -206,13 +206,8 @@ def _written(table: Measured, folder: Path) -> dict[str, Any]:
     found["time"] = table.time[0] if len(table.time) == 1 else list(table.time)
     if table.samples.origin is None and table.time_unit:
         found["time_unit"] = table.time_unit
-    return {
-        **found,
-        "time_format": table.time_format,
-        "separator": written.separator,
-        "decimal": written.decimal,
-        "encoding": written.encoding,
-    }
+    found |= {"time_format": table.time_format, "separator": written.separator}
+    return found | {"decimal": written.decimal, "encoding": written.encoding}
 
 
 def _contents(table: Measured) -> Iterator[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ import numpy as np
 from livepde.cases.read import settings_in, toml_key, toml_value
 from livepde.laws import SensitivityLaw
 from livepde.linalg import Array
+from livepde.samples import by_name
 from livepde.verdict import Cause, Finding, Severity, Verdict, channel_setting
 from livepde.verdict.sentences import ESTIMATED, FINDINGS, LIKELY, amount_of, estimating
 
@@ -190,9 +191,8 @@ def first_miss(prepared: Prepared) -> float:
 
 def _first_readings(prepared: Prepared) -> Array:
     """Return the readings of the assimilated sensors in the first sample."""
-    given = prepared.first.z if isinstance(prepared.first.z, Mapping) else {}
-    names = [name for name in prepared.case.sensors if name in given]
-    seen: Array = np.array([float(np.ravel(given[name])[0]) for name in names])
+    given, names = by_name(prepared.first.z, ()), prepared.case.sensors
+    seen: Array = np.array([float(given[name]) for name in names if name in given])
     return np.compress(np.isfinite(seen), seen)
 
 

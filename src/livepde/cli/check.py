@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from livepde.cases.preview import MOST_SAMPLES, advise, preview
 from livepde.cli.options import CaseArgument, CodeOption, DataOption, SetOption, load_case
 from livepde.cli.printing import CHECK_FAILED, extent, print_table, terminal
 from livepde.runs import Table, sampling_findings
+from livepde.samples import by_name
 from livepde.stepping import ForwardStage
 from livepde.streams import DataTable
 from livepde.streams.oddities import sentinels, switches
@@ -254,7 +255,7 @@ def _show_checks(console: Console, prepared: Prepared) -> bool:
     from livepde.diagnostics import check_model, check_observation
 
     case, first = prepared.case, prepared.first
-    values = first.z if isinstance(first.z, Mapping) else {}
+    values = by_name(first.z, ())
     inputs = {name: values[name] for name in case.model.channels if values[name] == values[name]}
     report = check_model(case.model, u=prepared.u0, t=first.t, inputs=inputs)
     observed, size = prepared.identifier.observed, prepared.typical(inputs)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Sequence
 from enum import StrEnum
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +16,7 @@ from rich.markup import escape
 
 from livepde import __version__
 from livepde.cli.options import JsonOption, OutOption, names_in, option
-from livepde.cli.printing import can_draw, named, report_outcome, show, terminal
+from livepde.cli.printing import CHECK_FAILED, can_draw, named, present, show, terminal
 from livepde.runs import Outcome, RunWriter, free_path
 
 # The facts are those of CITATION.cff, as a test checks; the year is that of the release.
@@ -75,16 +76,22 @@ def demo(out: OutOption = None) -> None:
 
 
 def run_experiment(
-    run: Callable[[], Outcome], out: Path | None, command: Sequence[str], title: str
-) -> Outcome:
-    """Run an experiment, keep its outcome in a new run directory if one is named, and return it."""
+    run: Callable[[], Outcome], out: Path | None, command: Sequence[str], title: str, as_json: bool
+) -> None:
+    """Run an experiment, keep its outcome in a new run directory if one is named, and print it.
+
+    With `as_json` a failed check ends the command with exit code 1.
+    """
     writer = None
     if out is not None:
         writer = RunWriter.create(out, version=__version__, command=list(command), title=title)
     outcome = run()
     if writer is not None:
         _finish(writer, outcome, terminal(err=True))
-    return outcome
+    shown = outcome.tables, outcome.checks, outcome.notes
+    present(*shown, as_json=as_json, command=" ".join(command))
+    if as_json and not outcome.ok:
+        raise typer.Exit(CHECK_FAILED)
 
 
 def _finish(writer: RunWriter, outcome: Outcome, console: Console) -> Iterable[str]:
@@ -131,10 +138,8 @@ def reproduce(
         return
     experiment = named(name, EXPERIMENTS, "experiment")
     command = ["livepde", "reproduce", name, *(["--truth", truth] if truth else [])]
-    outcome = run_experiment(
-        lambda: experiment.run(truth, progress=not as_json), out, command, experiment.summary
-    )
-    report_outcome(outcome, command, as_json)
+    run = partial(experiment.run, truth, progress=not as_json)
+    run_experiment(run, out, command, experiment.summary, as_json)
 
 
 class CitationForm(StrEnum):

@@ -5,11 +5,10 @@ from __future__ import annotations
 import importlib.util
 import json
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
@@ -18,7 +17,7 @@ from rich.table import Table as RichTable
 from livepde import __version__, plots, runs
 from livepde.cases.read import did_you_mean
 from livepde.errors import ConfigurationError
-from livepde.runs import Check, Journal, Outcome, Table
+from livepde.runs import Check, Journal, Table
 from livepde.runs.directory import plain
 
 MOST_CURVES = 100_000  # samples of a run whose readings are drawn
@@ -55,14 +54,6 @@ def figures_of(dataset: Any, title: str, journal: Journal | None) -> dict[str, A
     few = journal is not None and names and len(journal) <= MOST_CURVES
     measured = journal.readings(names) if few and journal is not None else None
     return {"overview": lambda: plots.overview(dataset, title=title, measured=measured)}
-
-
-def report_outcome(outcome: Outcome, command: Sequence[str], as_json: bool) -> None:
-    """Print an outcome; with `as_json` a failed check ends the command with exit code 1."""
-    shown = outcome.tables, outcome.checks, outcome.notes
-    present(*shown, as_json=as_json, command=" ".join(command))
-    if as_json and not outcome.ok:
-        raise typer.Exit(CHECK_FAILED)
 
 
 def present(
