@@ -270,6 +270,19 @@ def test_every_cause_has_a_setting_that_makes_it_an_unknown(tmp_path, equation):
         assert label in again.case.model.parameter_space.labels
 
 
+def test_the_size_of_a_source_does_not_depend_on_the_unit_of_the_prior(tmp_path):
+    path, cause = short_rod(tmp_path), Cause("source", "", "", size=1e-3)
+    common = ["equation=conduction", "unknowns.alpha=", "unknowns.k={ prior = 100, std = 50 }"]
+    common += ["channels.T_right=", "boundary.right.flux='1 W/m^2'"]
+    given = ("unit = 'MJ/(m^3 K)', prior = 3.6, std = 1", "prior = 3.6e6, std = 1e6")
+    priors = [f"unknowns.C={{ {text} }}" for text in given]
+    found = {
+        freed(cases.load(path, settings=parse([*common, prior])).prepare(), cause)
+        for prior in priors
+    }
+    assert len(found) == 1
+
+
 def test_a_cause_that_no_setting_frees_says_so(tmp_path):
     prepared = cases.load(short_rod(tmp_path)).prepare()
     lag = Cause("lag", "T_10", "it is late", remedy="Check the clock.")

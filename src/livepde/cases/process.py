@@ -129,6 +129,15 @@ def _options_of(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> di
     return options
 
 
+def prior_of(case: CaseContent, name: str) -> float:
+    """Return the value of an unknown before the data, in the model's unit."""
+    spec, unit = case.spec.unknowns[name], case.equation.unknowns[name].unit
+    if isinstance(spec.prior, str):
+        return case.convert(spec.prior, unit, f"unknowns.{name}.prior")
+    rule = conversion(spec.unit or unit, unit, case.where(f"unknowns.{name}.unit"))
+    return rule.factor * spec.prior + rule.offset
+
+
 def _prior(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> fem.Prior:
     """Return the prior in the model's unit."""
     rule = conversion(spec.unit or unit, unit, case.where(f"{key}.unit"))
@@ -397,14 +406,9 @@ def _near(names: _ConditionNames, name: str) -> list[Flux | Exchange]:
     1e-4 of its change over a cell.
     """
     case, label = names.case, _offset_label(name)
-    state, (first, variable) = case.equation.state.unit, next(iter(case.equation.unknowns.items()))
+    state = case.equation.state.unit
     names.unknowns[label] = Variable("K" if state == "degC" else state, f"offset of {name}")
-    given = case.spec.unknowns[first]
-    value = given.prior
-    if not isinstance(value, str):
-        rule = conversion(given.unit or variable.unit, variable.unit, case.where(first))
-        value = rule.factor * value + rule.offset
-    D = case.convert(value, variable.unit, f"unknowns.{first}.prior")
+    D = prior_of(case, next(iter(case.equation.unknowns)))
     dimension, cells = len(case.mesh.p), case.mesh.t.shape[1]
     cell = float(np.ptp(case.mesh.p, axis=1).max()) / cells ** (1.0 / dimension)
     h = HELD * D / cell

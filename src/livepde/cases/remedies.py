@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from livepde.cases.process import prior_of
 from livepde.cases.read import settings_in, toml_key, toml_value
 from livepde.laws import SensitivityLaw
 from livepde.linalg import Array
@@ -201,10 +202,7 @@ def _capacity(case: Case) -> float:
     name = case.equation.storage
     if not name:
         return 1.0
-    if name in case.spec.unknowns:
-        unknown = case.spec.unknowns[name]
-        return case.convert(unknown.prior, case.equation.unknowns[name].unit, f"unknowns.{name}")
-    return float(case.options[name])
+    return prior_of(case, name) if name in case.spec.unknowns else float(case.options[name])
 
 
 def _free(case: Case, name: str) -> bool:
