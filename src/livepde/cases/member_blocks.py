@@ -110,10 +110,7 @@ class MemberBlock:
         self._taken = self._written = 0  # samples
 
     def run(self, paths: Sequence[Path]) -> None:
-        """Step through all samples, and write new journals at `paths` at intervals.
-
-        `ended` writes the rest, also if the run ends early.
-        """
+        """Step through all samples; journals are written at intervals, their ends by `ended`."""
         self._paths = list(paths)
         table, stopping = self._tables[0], threading.Event()
         with stopped_by_signals(stopping, lambda: True):

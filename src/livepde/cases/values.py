@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from datetime import date, datetime
 from typing import Annotated, Any, TypeAlias
 
@@ -22,10 +23,7 @@ def _quantity(value: Any) -> Any:
 
 
 class Also:
-    """Short forms that a validator accepts as well, for the JSON schema.
-
-    `schemas`: their JSON schemas.
-    """
+    """JSON schemas of short forms that a validator accepts as well."""
 
     def __init__(self, *schemas: dict[str, Any]) -> None:
         self.schemas = schemas
@@ -83,11 +81,9 @@ def _limits(value: Any) -> Any:
             return "in", (float(low), float(high))
     if isinstance(value, str):
         match = re.fullmatch(r"\s*(<=|>=)\s*([-+0-9.eE]+)\s*", value)
-        if match:
-            try:
+        with suppress(ValueError):
+            if match:
                 return match[1], float(match[2])
-            except ValueError:
-                pass
     raise ValueError('expected [low, high], "<= number" or ">= number"')
 
 
@@ -101,12 +97,10 @@ def _encoding(value: str) -> str:
 
 def _time_format(value: str) -> str:
     moment = datetime(2001, 2, 3, 4)
-    try:
+    with suppress(ValueError, re.error):  # the latter of a part that stands twice
         # A complete format returns the date that was written with it.
         if datetime.strptime(moment.strftime(value), value).date() == moment.date():
             return value
-    except (ValueError, re.error):  # the latter of a part that stands twice
-        pass
     raise ValueError("expected year, month, day and time, as '%d.%m.%Y %H:%M'")
 
 

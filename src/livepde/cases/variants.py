@@ -66,14 +66,11 @@ class Variant:
 
 @dataclass(frozen=True)
 class LastEstimate:
-    """Last estimate of an unknown: value, standard deviation, ends of the 95 % interval, unit.
-
-    The interval allows for errors of the model where the verdict knows it.
-    """
+    """Last estimate of an unknown."""
 
     value: float
     std: float
-    low: float
+    low: float  # ends of the 95 % interval, which allows for errors of the model if they are known
     high: float
     unit: str = ""
 
@@ -190,10 +187,7 @@ def run_variant(
     data: str | None = None,
     allow_code: bool = False,
 ) -> VariantRun:
-    """Run a variant of a case with further settings, in memory.
-
-    A variant that cannot be run ends with its reason.
-    """
+    """Run a variant of a case with further settings, in memory; a failure is its reason."""
     try:
         every = parse(settings), parse(variant.settings)
         prepared = load(path, allow_code=allow_code, settings=every).prepare(data)
@@ -223,10 +217,7 @@ def _run(
 
 
 def _evidence_of_same(stated: Prepared, late: Prepared, found: VariantRun) -> float | None:
-    """Return the log evidence of the case as stated with the readings that a variant has used.
-
-    A late channel loses its first readings, or the readings of others before it begins.
-    """
+    """Return the log evidence of the case as stated with the readings that a variant has used."""
     known, table = late.stream, stated.stream
     if not (isinstance(known, DataTable) and isinstance(table, DataTable)):
         return math.nan

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
@@ -150,10 +151,8 @@ def export(
 def _moment(text: str, data: Dataset) -> float:
     """Return a time of the command line in the run's unit."""
     unit = str(data["time"].attrs.get("units", ""))
-    try:
+    with suppress(ValueError):
         return float(text)
-    except ValueError:
-        pass
     try:
         date = datetime.fromisoformat(text)
     except ValueError:

@@ -175,10 +175,7 @@ def _member(content: Mapping[Hashable, str], path: Path) -> Member:
 def _each(
     run: FleetRunner, rows: Sequence[Member], jobs: int, backend: Backend | None
 ) -> tuple[list[MemberOutcome], list[str], pd.DataFrame]:
-    """Run all members; return their outcomes, notes on lost workers, and the summary.
-
-    The summary is written also if an error or Ctrl-C ends the command.
-    """
+    """Run all members; return their outcomes, notes on lost workers, and the written summary."""
     ended: dict[str, MemberOutcome] = {}
     told: list[str] = []
 
