@@ -124,7 +124,7 @@ def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     return _stated(case, cause)
 
 
-def adding(case: Case, name: str, std: float, **keys: float | str) -> str:
+def _adding(name: str, std: float, **keys: float | str) -> str:
     """Return the setting that adds an unknown about zero, in the unit of the model."""
     known = {"prior": 0.0, "std": float(f"{std:.2g}"), **keys}
     return f"unknowns.{toml_key(name)}={toml_value(known)}"
@@ -215,7 +215,7 @@ def _source(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     case = prepared.case
     if not (_free(case, "source") and cause.size):
         return ()
-    return (adding(case, "source", WIDE * abs(cause.size) * _capacity(case)),)
+    return (_adding("source", WIDE * abs(cause.size) * _capacity(case)),)
 
 
 def _loss(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
@@ -224,7 +224,7 @@ def _loss(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     if not (_free(case, "loss") and cause.size > 0.0):
         return ()
     size = float(f"{cause.size * _capacity(case):.2g}")
-    settings = [adding(case, "loss", size, prior=size, transform="log")]
+    settings = [_adding("loss", size, prior=size, transform="log")]
     if "ambient" not in {*case.spec.channels, *case.spec.inputs}:
         seen = _first_readings(prepared)
         if not len(seen):
@@ -254,4 +254,4 @@ def _flux(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
         return ()
     # What a source of this size brings into the whole interval.
     size = WIDE * abs(cause.size) * _capacity(case) * float(np.ptp(case.mesh.p[0]))
-    return adding(case, label, size), f"boundary.{toml_key(name)}.flux={toml_value(label)}"
+    return _adding(label, size), f"boundary.{toml_key(name)}.flux={toml_value(label)}"
