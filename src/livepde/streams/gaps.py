@@ -185,12 +185,12 @@ def bridged(t: float, past: Series, later: Series) -> float:
     return float(scipy.interpolate.PchipInterpolator(times, values)(t))
 
 
-def is_spike(past: Series, now: tuple[float, float], later: Series, beyond: float) -> bool:
-    """Return whether a value is a spike; False with fewer than two known values after it."""
-    if len(later) < CENTRE or not math.isfinite(beyond):
-        return False
-    t, x = np.array([*past, now, *later]).T
-    return bool(find_spikes(t, x, beyond)[len(past)])
+def _spikes_after(past: Series, later: Series, beyond: float) -> list[bool]:
+    """Return which of the later values are spikes; of the last two of them nothing is known."""
+    if len(later) <= CENTRE or not math.isfinite(beyond):
+        return [False] * len(later)
+    t, x = np.array([*past, *later]).T
+    return find_spikes(t, x, beyond)[len(past) :].tolist()
 
 
 def filled_column(t: Array, x: Array, beyond: float = BEYOND) -> tuple[Array, Mask, Mask]:
@@ -217,31 +217,10 @@ def filled_column(t: Array, x: Array, beyond: float = BEYOND) -> tuple[Array, Ma
     return new, gaps, spikes
 
 
-def _from_next(x: Array) -> tuple[Array, Mask]:
-    """Return a channel whose missing values are the next known ones, and where they were missing.
-
-    Gaps after the last value stay.
-    """
-    known = np.flatnonzero(np.isfinite(x))
-    later = np.searchsorted(known, np.arange(len(x)))
-    found = np.where(later < len(known), x[known[np.minimum(later, len(known) - 1)]], math.nan)
-    return found, np.isnan(x) & np.isfinite(found)
-
-
-def _long(gaps: Mask) -> Mask:
-    """Return which rows are in gaps of more than `LONG` rows."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], gaps, [False]]).astype(int)))
-    found = np.zeros_like(gaps)
-    for first, last in edges.reshape(-1, 2).tolist():
-        found[first:last] = last - first > LONG
-    return found
-
-
 def fill_table(
     table: DataTable,
     interpolated: Iterable[str],
     screened: Iterable[str],
-    beyond: float = BEYOND,
     *,
     means: Iterable[str] = (),
 ) -> DataTable:
@@ -252,16 +231,19 @@ def fill_table(
     and remaining gaps as "missing". Readings of the channels `means` are means since the last one:
     a gap is part of the next mean.
     """
+    import pandas as pd  # slow to load, and rarely needed
+
     values, remarks = table.values.copy(), dict(table.remarks)
     fills, screens, of_means = set(interpolated), set(screened), set(means)
     for k, name in enumerate(table.names):
         if name not in fills | screens | of_means:
             continue
-        if name in of_means and np.isfinite(values[:, k]).any():
-            column, gaps = _from_next(values[:, k])
+        if name in of_means:
+            column = pd.Series(values[:, k]).bfill().to_numpy(copy=True)
+            gaps = np.isnan(values[:, k]) & ~np.isnan(column)
             spikes, fills = np.zeros_like(gaps), fills | {name}
         else:
-            limit = beyond if name in screens else math.inf
+            limit = BEYOND if name in screens else math.inf
             column, gaps, spikes = filled_column(table.t, values[:, k], limit)
         if name not in fills:
             column[gaps], gaps = math.nan, np.zeros_like(gaps)
@@ -270,7 +252,8 @@ def fill_table(
         after = len(column) - 1 - int(known[-1]) if len(known) else 0
         ended = after if after > LONG else 0
         left = np.isnan(column).sum() - ended
-        bridges = _long(gaps).sum()
+        numbered, _ = scipy.ndimage.label(gaps)
+        bridges = (np.bincount(numbered)[numbered[gaps]] > LONG).sum()
         counts = {"spike": spikes.sum(), "interpolated": gaps.sum() - bridges, "bridged": bridges}
         counts |= {"ended": ended, "missing": left}
         remarks |= {(kind, name): int(number) for kind, number in counts.items() if number}
@@ -360,8 +343,7 @@ class Filled(Iterable[Sample]):
 
     def _values(self, sample: Sample) -> dict[str, float]:
         """Return the values of the channels in a sample, NaN where missing."""
-        named = dict(sample.z) if isinstance(sample.z, Mapping) else {}
-        named |= dict(sample.inputs or {})
+        named = {**(sample.z if isinstance(sample.z, Mapping) else {}), **(sample.inputs or {})}
         return {name: number(named.get(name), f"input '{name}'") for name in self.stage.channels}
 
     def _later(self, waiting: deque[tuple[Sample, dict[str, float]]], name: str) -> Series:
@@ -426,21 +408,14 @@ def decided(
             return value, kinds
         return (later[0][1], ("interpolated",)) if later else (value, ("missing",))
     if math.isfinite(value):
-        if not is_spike(past, (t, value), later, beyond):
+        if not _spikes_after(past, [(t, value), *later], beyond)[0]:
             return value, ()
         kinds = ("spike",)
     # Later values are not judged yet, so one of them may be a spike itself.
-    found = bridged(t, past, _plausible(past, later, beyond))
+    spikes = _spikes_after(past, later, beyond)
+    plausible = [pair for pair, spike in zip(later, spikes, strict=True) if not spike]
+    found = bridged(t, past, plausible)
     return found, (*kinds, "interpolated" if math.isfinite(found) else "missing")
-
-
-def _plausible(past: Series, later: Series, beyond: float) -> Series:
-    """Return the values after a gap without those that are spikes."""
-    if not math.isfinite(beyond) or len(later) < CENTRE:
-        return later
-    t, x = np.array([*past, *later]).T
-    spikes = find_spikes(t, x, beyond)[len(past) :]
-    return [pair for pair, spike in zip(later, spikes.tolist(), strict=True) if not spike]
 
 
 def _with(sample: Sample, values: Mapping[str, float]) -> Sample:

@@ -92,6 +92,7 @@ FEWEST = 3  # times of rows that are far ahead, or first, before they are used
 MOST_AHEAD = 1000  # rows that wait so; more than these are used without a contradiction
 REMEMBERED = 1024  # accepted samples that are remembered though the journal has them
 PLAIN = Habit()
+NO_VALUE = "no value of any channel"
 NAN = math.nan
 Known: TypeAlias = tuple[float, Mapping[str, float]]  # time and values of an accepted sample
 
@@ -142,20 +143,15 @@ class Ready:
 
 @dataclass
 class IntakeOutcome:
-    """Outcome of a row: ready samples, remarks, and tokens of rows that no sample uses.
-
-    `row` is the token of the row, to which remarks refer by default.
-    """
+    """Outcome of a row: ready samples, remarks, and tokens of rows that no sample uses."""
 
     ready: list[Ready] = field(default_factory=list)
     remarks: list[Remark] = field(default_factory=list)
     spent: list[Any] = field(default_factory=list)
-    row: Any = None
 
-    def remark(self, kind: str, channel: str, message: str, row: Any = None) -> None:
-        """Add a remark, about the row that was taken or another one."""
-        about = self.row if row is None else row
-        self.remarks.append(Remark(kind, channel, message, row=about))
+    def remark(self, kind: str, channel: str, message: str, row: Any) -> None:
+        """Add a remark about the row with a token."""
+        self.remarks.append(Remark(kind, channel, message, row=row))
 
 
 class Past(Protocol):
@@ -176,7 +172,7 @@ class _Held:
     t: float
     values: dict[str, float]
     token: Any
-    remarks: tuple[Remark, ...]
+    remarks: list[Remark]
 
 
 @dataclass
@@ -246,10 +242,14 @@ class Intake:
     @property
     def interval(self) -> float:
         """Seconds between two samples as they usually come; infinite if that is not known."""
-        step = self._times.slowest
-        waits = (self.policy.longest(self.policy.habit(channel)) for channel in self.columns)
-        seconds = (step + max(waits, default=0.0)) / self.clock.second
+        seconds = (self._times.slowest + self._longest) / self.clock.second
         return math.inf if math.isnan(seconds) else seconds
+
+    @property
+    def _longest(self) -> float:
+        """Longest time for which a sample waits for a channel."""
+        waits = (self.policy.longest(self.policy.habit(channel)) for channel in self.columns)
+        return max(waits, default=0.0)
 
     @property
     def why(self) -> str:
@@ -284,7 +284,7 @@ class Intake:
 
         `received`: seconds of a clock of this machine; a row may be ahead by the time that passed.
         """
-        found = IntakeOutcome(row=token)
+        found = IntakeOutcome()
         held = self._read(row, token, found)
         if held is None or not self._judged(held, received, found):
             found.spent.append(token)
@@ -296,24 +296,21 @@ class Intake:
         try:
             times = self._time(row)
         except DataError as error:
-            found.remark("malformed", "", str(error))
+            found.remark("malformed", "", str(error), token)
             return None
-        about = IntakeOutcome(row=token)
+        values, remarks = self._values(row, token)
         if times is None:
-            found.remark("outside", "", "not between start and stop")
-            self._hold_first(self._values(row, about))
+            found.remark("outside", "", "not between start and stop", token)
+            self._hold_first(values)
             return None
-        values = self._values(row, about)
         if not values:
-            if not about.remarks:
-                about.remark("malformed", "", "no value of any channel")
-            found.remarks += about.remarks
+            found.remarks += remarks or [Remark("malformed", "", NO_VALUE, row=token)]
             return None
         t, again = times
         # An hour that clocks show twice: its second pass, unless these values came in the first.
         if again and self._passed(t, again, values) and not self._repeats(t, values):
             t += again
-        return _Held(t=t, values=values, token=token, remarks=tuple(about.remarks))
+        return _Held(t=t, values=values, token=token, remarks=remarks)
 
     def _passed(self, t: float, hour: float, values: Mapping[str, float]) -> bool:
         """Return whether rows of a time or later ones have come, of the same channels."""
@@ -327,7 +324,7 @@ class Intake:
         """Return whether a row is used or waits for others."""
         if self._repeats(held.t, held.values):
             text = f"t = {held.t:g} has been accepted with the same values before"
-            found.remark("repeated", "", text)
+            found.remark("repeated", "", text, held.token)
             return False
         if self._is_ahead(held, received):
             self._wait(held, received, found)
@@ -353,8 +350,7 @@ class Intake:
 
     def _wait(self, held: _Held, received: float, found: IntakeOutcome) -> None:
         """Let a row wait for others, and use all rows that wait if they agree."""
-        waits = (self.policy.longest(self.policy.habit(channel)) for channel in self.columns)
-        latest = held.t + self.policy.tolerance + max(waits, default=0.0)
+        latest = held.t + self.policy.tolerance + self._longest
         # A row of an earlier time refutes those that have come before it; of the first rows none
         # has privilege, and those that agree decide.
         if self._begun:
@@ -455,7 +451,6 @@ class Intake:
     def _placed(self, held: _Held, found: IntakeOutcome) -> bool:
         """Return whether a row became part of a sample."""
         t, values = held.t, held.values
-        about, found.row = found.row, held.token
         found.remarks += held.remarks
         moment = self._moment(t)
         if moment is None:
@@ -463,13 +458,12 @@ class Intake:
         else:
             if t < self._newest - self.policy.tolerance:
                 text = f"t = {t:g} came after {self._newest:g}"
-                found.remark("disordered", "", text)
+                found.remark("disordered", "", text, held.token)
             self._add(moment, values, held.token, found)
             if self._times.use(t, values):
                 text = f"times that went back continue at t = {t:g}: the clock was set back before"
-                found.remark("shifted", "", text)
+                found.remark("shifted", "", text, held.token)
         self._newest = max(self._newest, t)
-        found.row = about
         return moment is not None
 
     def _refuse_late(self, held: _Held, found: IntakeOutcome) -> None:
@@ -481,35 +475,36 @@ class Intake:
             value, before = held.values[name], known.get(name, NAN)
             if math.isnan(before):
                 text = f"t = {held.t:g} is not later than the last sample at {self._last:g}"
-                found.remark("late", name, text)
+                found.remark("late", name, text, held.token)
             elif value != before:
                 text = f"t = {held.t:g} was accepted with {before:g}, and came again with {value:g}"
-                found.remark("conflict", name, text)
+                found.remark("conflict", name, text, held.token)
         if self._times.refuse(held.t, held.values):
             text = (
                 f"times went back from t = {self._newest:g} to {held.t:g}: these rows count as late"
             )
-            found.remark("clock", "", text)
+            found.remark("clock", "", text, held.token)
 
-    def _values(self, row: Mapping[str, Any], found: IntakeOutcome) -> dict[str, float]:
-        """Return the valid values of a row, NaN for missing and invalid ones."""
+    def _values(self, row: Mapping[str, Any], token: Any) -> tuple[dict[str, float], list[Remark]]:
+        """Return the valid values of a row, NaN for missing and invalid ones, and remarks."""
         values: dict[str, float] = {}
+        found = IntakeOutcome()
         for channel, column in self.columns.items():
             if not all(name in row for name in column.names):
                 continue
             try:
                 value = channel_value(column, row, self.missing)
             except DataError as error:
-                found.remark("malformed", channel, str(error))
+                found.remark("malformed", channel, str(error), token)
                 continue
             low, high = column.valid
             if value < low or value > high:
                 text = f"{value:g} is not between {low:g} and {high:g}"
-                found.remark("invalid", channel, text)
+                found.remark("invalid", channel, text, token)
                 # Missing, not absent: the channel has come, and the sample must not wait for it.
                 value = math.nan
             values[channel] = value
-        return values
+        return values, found.remarks
 
     def _time(self, row: Mapping[str, Any]) -> tuple[float, float] | None:
         """Return the time of a row, and how much later the clocks show it again; None: outside.
@@ -549,7 +544,7 @@ class Intake:
             known = sample.values.get(channel, math.nan)
             if not (math.isnan(known) or math.isnan(value)) and value != known:
                 text = f"a second value for t = {moment:g}: {value:g} after {known:g}"
-                found.remark("conflict", channel, text)
+                found.remark("conflict", channel, text, token)
                 if self.policy.keeps(channel) == "first":
                     continue
             # An empty cell of a second row must not erase a value that has come.
@@ -582,9 +577,8 @@ class Intake:
             found.remark("missing", channel, text, sample.tokens[-1])
         needed = [channel for channel in lacking if self.columns[channel].needed]
         if needed:
-            found.remark(
-                "skipped", needed[0], f"the sample at t = {t:g} was skipped", sample.tokens[-1]
-            )
+            text = f"the sample at t = {t:g} was skipped"
+            found.remark("skipped", needed[0], text, sample.tokens[-1])
             sample.values = self._held(sample.values)
             self._hold_first(sample.values)
             if not (self._recent and sample.values):
