@@ -361,7 +361,7 @@ def _cells(
 
 def _check_names(path: Path, header: list[str], needed: list[str]) -> None:
     """Refuse a header without a needed column, or with two of its name."""
-    table.check_columns(str(path), needed, header, told=table.is_data(path))
+    table.check_columns(str(path), needed, header, told=path.suffix.lower() in table.SHOWN)
     for name in needed:
         if header.count(name) > 1:
             raise SampleError(f"{path}: two columns are called '{name}'; rename one.")
