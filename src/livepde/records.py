@@ -35,6 +35,13 @@ SMOOTHED = "_smoothed"  # suffix of a variable estimated from all samples of a r
 DATE = "date"  # column of an exported table, beside the variables of the dataset
 # The numbers among the unknowns on axes of their own, in `Result.to_xarray`.
 ESTIMATES, PARAMETER, STATISTIC = "estimates", "parameter", "statistic"
+OWN_NAMES = frozenset(
+    {DATE, ESTIMATES, PARAMETER, f"{PARAMETER}_unit", STATISTIC}
+    | {"time", "snapshot", "vertex", "cell", "corner", "unknown", "other", "correlation"}
+    | {"sensor", "sensor_unit", "innovation", "validation", "validation_unit", "validation_error"}
+    | {"status", "steps"}
+)
+"""Names that every dataset of a run has, without those of its mesh."""
 # Variables beside an unknown or a component of the state: suffix of their names -> meaning.
 STATE_ENDS = {"_std": "the standard deviation"}
 INTERVAL_ENDS = {"_low": "the lower end of the interval", "_high": "the upper end of the interval"}
@@ -380,12 +387,7 @@ class Layout:
         """
         import xarray as xr
 
-        return xr.Dataset(*self._contents(RecordArrays.of(records), last))
-
-    def _contents(
-        self, rows: RecordArrays, last: Snapshot | None
-    ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-        """Return variables, coordinates and attributes of the dataset."""
+        rows = RecordArrays.of(records)
         times, kept = rows.t, [*rows.snapshots()]
         if last is not None:
             kept.append((-1, last))
@@ -412,7 +414,7 @@ class Layout:
             "scalars": "\n".join(self.scalars),
             "state": " ".join(self.state),
         }
-        return data, coords, about
+        return xr.Dataset(data, coords, about)
 
     def _coordinates(self, times: Array, snapshots: Array) -> dict[str, Any]:
         """Return the coordinates of the dataset: times of samples and of fields, and places."""
@@ -445,49 +447,14 @@ class Layout:
             return {}
         return {f"{dimension}_unit": (dimension, [self.sensor_units[name] for name in names])}
 
-    @classmethod
-    def own_names(cls, axes: Iterable[str], cells: Iterable[str]) -> set[str]:
+    @staticmethod
+    def own_names(axes: Iterable[str], cells: Iterable[str]) -> set[str]:
         """Return the names of dimensions, coordinates and variables that every dataset has.
 
         `axes`, `cells`: coordinates and kinds of cells of the mesh.
         """
-        pair = ["1", "2"]  # two unknown numbers, so that they have a correlation
-        grid, none = {axis: [0.0] for axis in axes}, {kind: [[0]] for kind in cells}
-        at = {name: [0.0] * len(grid) for name in ("z", "w")}
-        units = {"z": "K", "w": "m"}
-        blank = cls(
-            "",
-            "",
-            grid,
-            none,
-            ["z"],
-            ["w"],
-            {},
-            {},
-            pair,
-            [],
-            [],
-            places=at,
-            sensor_units=units,
-        )
-        rows, snapshot = RecordArrays(), Snapshot({}, {}, np.eye(2))
-        rows.append(
-            Record(
-                t=0.0,
-                numbers=np.zeros(0),
-                innovation=np.zeros(1),
-                validation_error=np.zeros(1),
-                status=0,
-                steps=1,
-                notes={},
-                snapshot=snapshot,
-            )
-        )
-        data, coords, _ = blank._contents(rows, None)
-        found = {DATE, ESTIMATES, PARAMETER, f"{PARAMETER}_unit", STATISTIC}
-        for name, (dimensions, *_) in {**data, **coords}.items():
-            found |= {name, *([dimensions] if isinstance(dimensions, str) else dimensions)}
-        return found
+        places = {f"{of}{axis}" for axis in axes for of in ("", "sensor_", "validation_")}
+        return {*OWN_NAMES, *places, *cells}
 
     def _snapshots(self, kept: Sequence[Snapshot]) -> dict[str, Any]:
         data: dict[str, Any] = {}

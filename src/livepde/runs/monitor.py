@@ -66,15 +66,12 @@ class JsonLinesSink(Sink):
         try:
             print(line, file=self._stream, flush=True)
         except OSError:
-            self._abandon()
+            # To the null device from now on: flushing the buffer at exit would fail again.
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            with suppress(OSError):
+                os.dup2(nowhere, self._stream.fileno())
+            os.close(nowhere)
             raise
-
-    def _abandon(self) -> None:
-        """Redirect the stream to the null device: flushing its buffer at exit would fail again."""
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        with suppress(OSError):
-            os.dup2(nowhere, self._stream.fileno())
-        os.close(nowhere)
 
 
 class Metrics(Sink):
@@ -117,7 +114,6 @@ class Metrics(Sink):
         self._failed = Counter("livepde_failed_steps", "Steps that failed", registry=self.registry)
 
     def put(self, estimate: Estimate) -> None:
-        """Publish one estimate."""
         for label, (value, std) in estimate.parameters.items():
             self._estimate.labels(label).set(value)
             self._deviation.labels(label).set(std)
