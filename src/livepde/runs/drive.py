@@ -116,8 +116,7 @@ def drive(
     """
     from livepde.progress import watched
 
-    if journal is None:
-        journal = journal_of(identifier)
+    journal = journal_of(identifier) if journal is None else journal
     feed = SampleFeed(
         watched(stream, total) if progress else stream, identifier.observed.names, journal.last
     )
@@ -131,8 +130,8 @@ def drive(
 
 def journal_of(identifier: Identifier, path: Path | None = None) -> Journal:
     """Return a new journal for the samples and estimates of an identifier; no path: in memory."""
-    who = identifier
-    layout = layout_of(who.model, who.observed, who.validation, who.ignored)
+    model, observed = identifier.model, identifier.observed
+    layout = layout_of(model, observed, identifier.validation, identifier.ignored)
     return Journal.create(path, identifier.channels, layout)
 
 

@@ -567,8 +567,8 @@ class Journal:
             with sound(self.path):
                 if len(channels) not in (8 * len(self.channels), 16 * len(self.channels)):
                     raise ValueError(f"sample {number} has not the size of the others")
-                values = self._named(np.frombuffer(channels).tolist())
-                taken = Taken(id=number, t=float(t), values=values)
+                named = self._named(np.frombuffer(channels).tolist())
+                taken = Taken(id=number, t=float(t), values=named)
             yield taken
 
     def _named(self, row: Sequence[float]) -> dict[str, float]:

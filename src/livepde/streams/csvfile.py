@@ -95,8 +95,7 @@ def read_csv(
         No such file or column; text or infinity in a channel; times that do not increase. The
         message names file, row (the header is row 1) and column.
     """
-    path = Path(path)
-    decimals = table.decimal_marks(columns)
+    path, decimals = Path(path), table.decimal_marks(columns)
     needed = list(dict.fromkeys([*clock.names, *decimals]))
     try:
         _check_text(path)
@@ -267,16 +266,14 @@ def _separator(lines: Sequence[str]) -> str:
 
 def _titles(lines: Sequence[str], separator: str) -> int:
     """Return how many lines at the start have fewer cells than most, and are no header."""
-
-    def width(line: str) -> int:
-        row = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
-        return max((k for k, cell in enumerate(row, start=1) if cell.strip()), default=0)
-
-    widths = [width(line) for line in lines]
+    rows = [
+        next(csv.reader([line], delimiter=separator, skipinitialspace=True), []) for line in lines
+    ]
+    widths = list(map(_width, rows))
     # A title has fewer cells than most lines; of equally frequent widths the smaller one counts.
     usual = min(multimode(found for found in widths if found), default=0)
     start = next((k for k, found in enumerate(widths) if found >= usual), 0)
-    names = next(csv.reader(lines[start : start + 1], delimiter=separator), [])
+    names = rows[start] if rows else []
     titled = all(found <= 1 for found in widths[:start])
     if not titled or any(number_of(name.strip(), ",") is not None for name in names):
         return 0  # it is the header that is short
@@ -312,15 +309,17 @@ def _as_written(
     return " and ".join(filter(None, (", ".join(said[:-1]), said[-1])))
 
 
+def _width(cells: Sequence[str]) -> int:
+    """Return the number of cells up to the last one that is not empty."""
+    return max((k for k, cell in enumerate(cells, start=1) if cell.strip()), default=0)
+
+
 def too_wide(cells: list[str], header: list[str]) -> bool:
     """Return whether a row is longer than the header, and not only by empty fields.
 
     A separator at the end of each row, or of the header, is no field.
     """
-    if len(cells) <= len(header):
-        return False
-    named = max((k for k, name in enumerate(header, start=1) if name), default=0)
-    return any(cell.strip() for cell in cells[named:])
+    return len(cells) > len(header) and _width(cells) > _width(header)
 
 
 def _cells(

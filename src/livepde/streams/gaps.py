@@ -190,7 +190,7 @@ def _spikes_after(past: Series, later: Series, beyond: float) -> list[bool]:
     if len(later) <= CENTRE or not math.isfinite(beyond):
         return [False] * len(later)
     t, x = np.array([*past, *later]).T
-    return find_spikes(t, x, beyond)[len(past) :].tolist()
+    return list(map(bool, find_spikes(t, x, beyond)[len(past) :]))
 
 
 def filled_column(t: Array, x: Array, beyond: float = BEYOND) -> tuple[Array, Mask, Mask]:

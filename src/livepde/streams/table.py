@@ -321,7 +321,7 @@ def to_table(
 
         def repeats(one: int, other: int) -> bool:
             pairs = (numbers(name, np.array([one, other])) for name in decimal_marks(columns))
-            return all(np.array_equal(*pair, equal_nan=True) for pair in pairs)
+            return all(np.array_equal(pair[:1], pair[1:], equal_nan=True) for pair in pairs)
 
         times = with_second_passes(times, written, clock, repeats)
     rows = Thinned([column.between for column in columns.values()])
