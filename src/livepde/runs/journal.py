@@ -292,16 +292,13 @@ class Journal:
 
     def withdraw(self) -> None:
         """Withdraw the last sample, which the identifier could not use."""
-        self._forget(self._current)
+        for table in ("samples", "estimates", "fields", "checkpoints", "tries"):
+            self._execute(f"DELETE FROM {table} WHERE id = ?", self._current)
+        # The newest number is used again; before later samples a gap remains.
+        if self._current == self._newest:
+            self._newest -= 1
         self._write(self._db.commit)
         self._current = self._last
-
-    def _forget(self, number: int) -> None:
-        for table in ("samples", "estimates", "fields", "checkpoints", "tries"):
-            self._execute(f"DELETE FROM {table} WHERE id = ?", number)
-        # The newest number is used again; before later samples a gap remains.
-        if number == self._newest:
-            self._newest -= 1
 
     def mark(self) -> int:
         """Count and commit one more try of the last sample; return the number of tries."""

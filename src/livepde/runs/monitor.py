@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TextIO
 
 from livepde import __version__
@@ -127,17 +128,17 @@ class Metrics(Sink):
             self._failed.inc()
 
 
+@dataclass(frozen=True, eq=False)
 class _Health:
     """Collector of metrics from the health of a run at the time of each request."""
 
-    def __init__(self, health: Callable[[], Mapping[str, Any]]) -> None:
-        self._health = health
+    health: Callable[[], Mapping[str, Any]]
 
     def collect(self) -> Iterator[Metric]:
         """Return the metrics."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-        found = self._health()
+        found = self.health()
         for name, key, text in (
             ("ok", "ok", "1 while samples arrive, are accepted, and steps succeed"),
             ("silent", "silent", "1 while no data arrive from the source"),
@@ -165,7 +166,7 @@ class _Health:
         yield remarks
 
 
-class Monitor:
+class Monitor(Server):
     """Serves /livez, /readyz, /health and /metrics from its own threads.
 
     /livez answers 200 as long as the process does, /readyz and /health while the run goes well,
@@ -185,10 +186,7 @@ class Monitor:
         self._health = health
         metrics.registry.register(_Health(health))
         self._metrics = make_wsgi_app(metrics.registry)
-        self._server = Server(self._answer, address)
-        self.url = self._server.url
-        self.shown = self._server.shown
-        self.port = self._server.port
+        super().__init__(self._answer, address)
 
     def _answer(self, environ: WSGIEnvironment, start: StartResponse) -> Iterable[bytes]:
         path = environ.get("PATH_INFO", "/")
@@ -210,7 +208,3 @@ class Monitor:
             return [f"{waits or 'ok'}\n".encode()]
         start(code, [("Content-Type", "application/json")])
         return [json.dumps(found).encode()]
-
-    def close(self) -> None:
-        """Stop listening."""
-        self._server.close()

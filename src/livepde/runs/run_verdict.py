@@ -133,10 +133,10 @@ def sampling_findings(
     It is called if there is a pause. Without it a leap of the clock is called a pause.
     """
     t, found = data["time"].values, list[Finding]()
-    leaps, breaks = {}, pauses(t)
+    leaps, breaks = list[float](), pauses(t)
     if breaks and readings is not None:
         all_times, values = readings()
-        leaps = {leap.t: leap for leap in clock_leaps(all_times, values, pauses(all_times))}
+        leaps = clock_leaps(all_times, values, pauses(all_times))
     anchors = note(data, "residual") is None  # the gradient law has no covariance
     for k in breaks:
         usual = float(np.median(np.diff(t[:k])))

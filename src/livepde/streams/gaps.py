@@ -19,7 +19,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy  # scipy.interpolate and scipy.ndimage are slow to load, and rarely needed
@@ -47,17 +47,16 @@ GAUSS = 1.4826  # standard deviation over median absolute deviation of Gaussian 
 
 Series = Sequence[tuple[float, float]]
 """Times and known values of a channel, in order."""
+Waiting: TypeAlias = deque[tuple[Sample, dict[str, float]]]
+"""Samples that are not decided, with the values of the channels, NaN where missing."""
 
 
-class _Residuals(NamedTuple):
-    """Residuals of values to the cubic through two neighbours on each side."""
+def _residuals(t: Array, x: Array) -> tuple[Array, Array]:
+    """Return residuals of values to the cubic through two neighbours on each side, and weights.
 
-    size: Array  # shape (values - 4,), reduced where the neighbours are far away
-    weights: Array  # of the five values in each residual, shape (values - 4, 5)
-
-
-def _residuals(t: Array, x: Array) -> _Residuals:
-    """Return the residuals of at least five values."""
+    The residuals are reduced where the neighbours are far away, shape (values - 4,). The weights
+    are those of the five values in each, shape (values - 4, 5).
+    """
     window = np.lib.stride_tricks.sliding_window_view
     times, values = window(t, NEIGHBOURS), window(x, NEIGHBOURS)
     weights = np.ones(times.shape)
@@ -74,7 +73,7 @@ def _residuals(t: Array, x: Array) -> _Residuals:
     noise = np.sqrt((weights * weights).sum(axis=1))
     far = np.maximum(reach / np.median(reach), noise / np.median(noise))
     weights /= np.maximum(1.0, far)[:, None]
-    return _Residuals((weights * values).sum(axis=1), weights)
+    return (weights * values).sum(axis=1), weights
 
 
 def _curves(t: Array, x: Array) -> IntArray:
@@ -165,7 +164,8 @@ def _explains(t: Array, x: Array, suspect: int, largest: float) -> bool:
     about = np.delete(np.arange(first, min(suspect + ABOUT + 1, len(x))), suspect - first)
     if len(about) < NEIGHBOURS:
         return False
-    return bool((np.abs(_residuals(t[about], x[about]).size) <= largest).all())
+    size, _ = _residuals(t[about], x[about])
+    return bool((np.abs(size) <= largest).all())
 
 
 def bridged(t: float, past: Series, later: Series) -> float:
@@ -333,7 +333,7 @@ class Filled(Iterable[Sample]):
         recent: dict[str, deque[tuple[float, float]]] = {
             name: deque(maxlen=RECENT) for name in self.stage.channels
         }
-        waiting: deque[tuple[Sample, dict[str, float]]] = deque()
+        waiting: Waiting = deque()
         for sample in in_order(self.stream, "FillGaps"):
             waiting.append((sample, self._values(sample)))
             while waiting and self._decided(waiting):
@@ -346,12 +346,12 @@ class Filled(Iterable[Sample]):
         named = {**(sample.z if isinstance(sample.z, Mapping) else {}), **(sample.inputs or {})}
         return {name: number(named.get(name), f"input '{name}'") for name in self.stage.channels}
 
-    def _later(self, waiting: deque[tuple[Sample, dict[str, float]]], name: str) -> Series:
+    def _later(self, waiting: Waiting, name: str) -> Series:
         """Return the known values of a channel after the first sample that waits."""
         found = [(float(sample.t), values[name]) for sample, values in list(waiting)[1:]]
         return [pair for pair in found if math.isfinite(pair[1])]
 
-    def _decided(self, waiting: deque[tuple[Sample, dict[str, float]]]) -> bool:
+    def _decided(self, waiting: Waiting) -> bool:
         """Return whether the first waiting sample can be released."""
         stage, (first, values) = self.stage, waiting[0]
         expired = waiting[-1][0].t - first.t > stage.wait
@@ -366,9 +366,7 @@ class Filled(Iterable[Sample]):
         return True
 
     def _released(
-        self,
-        waiting: deque[tuple[Sample, dict[str, float]]],
-        recent: Mapping[str, deque[tuple[float, float]]],
+        self, waiting: Waiting, recent: Mapping[str, deque[tuple[float, float]]]
     ) -> Sample:
         """Return the first sample that waits, without gaps as far as possible."""
         sample, values = waiting[0]
