@@ -103,28 +103,16 @@ class Snapshot:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Record:
-    """The stored part of an estimate.
-
-    Attributes
-    ----------
-    t, steps, notes, innovation, validation_error
-        Attributes of the estimate.
-    numbers
-        Values of the variables `Layout.numbers`, shape (numbers,).
-    status
-        Index in `STATUS_CODES`.
-    snapshot
-        The fields; None where none are kept.
-    """
+    """The stored part of an estimate."""
 
     t: float
-    numbers: Array
+    numbers: Array  # values of the variables `Layout.numbers`, shape (numbers,)
     innovation: Array
     validation_error: Array
-    status: int
+    status: int  # index in `STATUS_CODES`
     steps: int
     notes: Mapping[str, float]
-    snapshot: Snapshot | None = None
+    snapshot: Snapshot | None = None  # the fields; None where none are kept
 
 
 class Records(Protocol):
@@ -342,25 +330,20 @@ def _array(values: array[float]) -> Array:
 class Layout:
     """Names, units and coordinates of the numbers of records, as plain values."""
 
-    # time_unit, sensor_unit: units of time and innovations; `sensor_unit` is empty if the sensors
-    # have several
     time_unit: str
-    sensor_unit: str
+    sensor_unit: str  # of innovations; empty if the sensors have several
     coordinates: Mapping[str, Sequence[float]]  # axis -> coordinates of the vertices
     # Kind of cell as meshio names it ("triangle", "tetra", ...) -> vertices of each; of an interval
     # none, its vertices are in order
     cells: Mapping[str, Sequence[Sequence[int]]]
-    # sensors, validation: names of the sensors; `validation` is None if there are none
     sensors: Sequence[str]
-    validation: Sequence[str] | None
+    validation: Sequence[str] | None  # names of these sensors; None if there are none
     # Variable over time -> its attributes, in the order of `Record.numbers`
     numbers: Mapping[str, Mapping[str, Any]]
     units: Mapping[str, str]  # unknown or component of the state -> unit
-    # scalars, fields, state: labels of scalar unknowns, names of unknown fields and of variables of
-    # the state
-    scalars: Sequence[str]
-    fields: Sequence[str]
-    state: Sequence[str]
+    scalars: Sequence[str]  # labels of scalar unknowns
+    fields: Sequence[str]  # names of unknown fields
+    state: Sequence[str]  # names of variables of the state
     length_unit: str = ""  # unit of coordinates
     # Sensor, of either kind, that is at one point -> its coordinates
     places: Mapping[str, Sequence[float]] = field(default_factory=dict)

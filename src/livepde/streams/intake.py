@@ -25,43 +25,30 @@ from livepde.streams.table import Column, channel_value, row_time, without_noise
 
 @dataclass(frozen=True)
 class Habit:
-    """Arrival of one channel: waiting time, repeated values, interpolation and spikes.
+    """Arrival of one channel: waiting time, repeated values, interpolation and spikes."""
 
-    `wait`: time for which a sample waits for this channel, if longer than `Policy.wait`.
-    `repeated`: which of two values for one moment is kept; default that of the policy.
-    `interpolated`: a sample without this channel takes a value interpolated from the next one, if
-    that comes while the sample waits; it waits no longer then.
-    `screened`: a spike is refused, if two later values have come while the sample waited.
-    `between`: how the channel behaves between two readings.
-    """
-
-    wait: float = 0.0
-    repeated: Literal["first", "last"] | None = None
+    wait: float = 0.0  # for which a sample waits for this channel, if longer than `Policy.wait`
+    repeated: Literal["first", "last"] | None = None  # as in the policy; None: as the policy says
+    # A sample without this channel takes a value interpolated from the next one, if that comes
+    # while the sample waits; it waits no longer then.
     interpolated: bool = False
-    screened: bool = False
-    between: Between = "line"
+    screened: bool = False  # a spike is refused, if two later values come while the sample waits
+    between: Between = "line"  # how the channel behaves between two readings
 
 
 @dataclass(frozen=True)
 class Policy:
-    """Policy for rows that are late, incomplete, repeated, or ahead of the others.
+    """Policy for rows that are late, incomplete, repeated, or ahead of the others."""
 
-    `wait`: time for which a row may come after a later one; one that comes later still is refused.
-    `tolerance`: rows whose times differ by at most so much are of one moment: that of the first.
-    `leap`: a row that is later than the newest one by more than this, or by more than ten usual
-    steps of its channels, waits until the rows after it agree with it; a row at the old times
-    refutes it.
-    `repeated`: which of two values of a channel for one moment is kept, while the sample waits.
-    `shift`: correction of a wrong clock, as the user states it: added to all times that come.
-    `channels`: channel -> its own options.
-    """
-
-    wait: float = 0.0
-    tolerance: float = 0.0
+    wait: float = 0.0  # for which a row may come after a later one, before it is refused
+    tolerance: float = 0.0  # rows whose times differ by at most this are of one moment, the first
+    # A row that is later than the newest one by more than this, or by more than ten usual steps of
+    # its channels, waits until the rows after it agree with it; a row at the old times refutes it.
     leap: float = math.inf
+    # Which of two values of a channel for one moment is kept, while the sample waits.
     repeated: Literal["first", "last"] = "first"
-    shift: float = 0.0
-    channels: Mapping[str, Habit] = field(default_factory=dict)
+    shift: float = 0.0  # correction of a wrong clock by the user: added to all times that come
+    channels: Mapping[str, Habit] = field(default_factory=dict)  # channel -> its own options
 
     def __post_init__(self) -> None:
         waits = {f"wait of '{name}'": habit.wait for name, habit in self.channels.items()}
@@ -108,17 +95,13 @@ class Remark:
     late rows follow one another, so that a clock went back. Used all the same: "shifted" (late rows
     lead on to it: the clock was set back), "disordered" (came after a later row), "missing" (a
     sample without this channel), "interpolated" (the same, with a value between known ones).
-    `channel`: channel of the value; '' for a whole row.
-    `message`: description; of several remarks that of the first.
-    `number`: number of occurrences.
-    `row`: token of its row; for a sample that of the last row.
     """
 
     kind: str
-    channel: str
-    message: str
-    number: int = 1
-    row: Any = None
+    channel: str  # of the value; '' for a whole row
+    message: str  # of several remarks that of the first
+    number: int = 1  # of occurrences
+    row: Any = None  # token of its row; for a sample that of the last row
 
 
 def gather(found: dict[tuple[str, str], Remark], remark: Remark) -> None:
@@ -130,15 +113,11 @@ def gather(found: dict[tuple[str, str], Remark], remark: Remark) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Ready:
-    """A sample that is complete.
-
-    `t`, `values`: time, and values of the channels that have come.
-    `tokens`: tokens of the source for the rows of the sample, to acknowledge them.
-    """
+    """A sample that is complete."""
 
     t: float
-    values: dict[str, float]
-    tokens: tuple[Any, ...]
+    values: dict[str, float]  # of the channels that have come
+    tokens: tuple[Any, ...]  # of the source for the rows of the sample, to acknowledge them
 
 
 @dataclass
