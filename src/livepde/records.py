@@ -12,7 +12,6 @@ from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
-from sys import getsizeof
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -202,12 +201,6 @@ class RecordArrays:
         return _array(values).reshape(len(self), -1 if values else 0)
 
     @property
-    def nbytes(self) -> int:
-        """Bytes of all arrays, reserved capacity included."""
-        single = (self._t, self._numbers, self._innovation, self._error, self._status, self._steps)
-        return self._snapshots.nbytes + sum(map(getsizeof, (*single, *self._notes.values())))
-
-    @property
     def t(self) -> Array:
         """Times, shape (samples,)."""
         return _array(self._t)
@@ -282,11 +275,6 @@ class _SnapshotArrays:
         for structure, records, values in self._groups:
             rows = _array(values).reshape(len(records), -1)
             yield from zip(records, map(structure.snapshot, rows), strict=True)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all arrays, reserved capacity included."""
-        return sum(getsizeof(part) for _, *parts in self._groups for part in parts)
 
 
 @dataclass(frozen=True)

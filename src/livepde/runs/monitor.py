@@ -135,7 +135,6 @@ class _Health:
     health: Callable[[], Mapping[str, Any]]
 
     def collect(self) -> Iterator[Metric]:
-        """Return the metrics."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
         found = self.health()

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from livepde.errors import ConfigurationError, SampleError
-from livepde.linalg import Array
 from livepde.samples import is_dataset, is_frame, noise_channel
 from livepde.streams import table as tables
 from livepde.streams.clock import CALLED_TIME, Clock
@@ -215,9 +214,7 @@ class Reading:
             self._need_unit("the times are durations")
             times, unit = np.asarray(times) / np.timedelta64(1, "s"), "s"
         columns = self._columns("data", time, list(series), units)
-        needed = tables.decimal_marks(columns)
-        values = {name: _numbers(name, series[name]) for name in needed}
-        return tables.tabulated(times, values, columns, self._clock(time, unit), where="data")
+        return tables.tabulated(times, series, columns, self._clock(time, unit), where="data")
 
     def _file(self, path: Path) -> tables.DataTable:
         """Return the samples of a file; its extension gives the format."""
@@ -251,15 +248,6 @@ class Reading:
             encoding=written.encoding,
             skip=written.skip,
         )
-
-
-def _numbers(name: str, series: Any) -> Array:
-    """Return a column of pandas as numbers, NaN where one is missing."""
-    try:
-        found: Array = series.to_numpy(dtype=float, na_value=np.nan)
-    except (TypeError, ValueError):
-        raise SampleError(f"data: column '{name}' must contain numbers only.") from None
-    return found
 
 
 def _first_keys(path: Path) -> list[str]:

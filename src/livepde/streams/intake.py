@@ -57,9 +57,6 @@ class Policy:
                 raise DataError(f"intake: {name} must be a time >= 0; got {value}.")
         if not math.isfinite(self.shift):
             raise DataError(f"intake: shift must be a finite time; got {self.shift}.")
-        for choice in (self.repeated, *(habit.repeated for habit in self.channels.values())):
-            if choice not in ("first", "last", None):
-                raise DataError(f"intake: repeated must be first or last; got {choice!r}.")
 
     def keeps(self, channel: str) -> Literal["first", "last"]:
         """Return which of two values of a channel is kept."""

@@ -277,8 +277,11 @@ def tabulated(
     found, dates = read_times(moments, clock, lambda k: f"{where}, sample {k}, times")
 
     def numbers(name: str, use: Any) -> Array:
+        given = values[name]
         try:
-            column: Array = np.asarray(values[name], dtype=float)
+            if hasattr(given, "iloc"):  # of pandas, where a missing value may be no float
+                given = given.to_numpy(dtype=float, na_value=np.nan)
+            column: Array = np.asarray(given, dtype=float)
         except (TypeError, ValueError):
             raise SampleError(f"{where}: column '{name}' must contain numbers only.") from None
         if column.shape != (len(moments),):
