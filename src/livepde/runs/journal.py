@@ -39,11 +39,11 @@ from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Snapshot
 from livepde.runs.database import (
     AGAIN,
     SCHEMA,
+    Connection,
     check_file,
     checksum,
     damaged,
     fill,
-    in_memory,
     locked,
     reader,
     released,
@@ -151,7 +151,7 @@ class Journal:
             "layout": json.dumps(layout.to_dict()),
         }
         if path is None:
-            connection = in_memory()
+            connection = sqlite3.connect(":memory:", factory=Connection)
             fill(connection, meta)
             return cls(MEMORY, connection, None)
         lock = locked(path)

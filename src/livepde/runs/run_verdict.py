@@ -349,18 +349,17 @@ def verdict(data: xr.Dataset) -> Verdict:
     """
     stored = data.attrs.get("verdict")
     # A stored verdict counts the steps of all samples, of which a dataset may hold a part.
-    own = Verdict.from_dict(json.loads(stored)) if stored else _steps(data)
+    if stored:
+        own = Verdict.from_dict(json.loads(stored))
+    else:
+        codes = data["status"].values.astype(int)
+        counts = np.bincount(codes, minlength=len(STATUS_CODES)).tolist()
+        own = Verdict.unjudged().with_findings(
+            step_findings(dict(zip(STATUS_CODES, counts, strict=True)))
+        )
     if not data.sizes["time"]:
         return own
     return own.with_findings(findings_of(data, judged=own.judged))
-
-
-def _steps(data: xr.Dataset) -> Verdict:
-    """Return the findings on the steps of a run that has stored no verdict."""
-    codes = data["status"].values.astype(int)
-    counts = np.bincount(codes, minlength=len(STATUS_CODES)).tolist()
-    found = step_findings(dict(zip(STATUS_CODES, counts, strict=True)))
-    return Verdict.unjudged().with_findings(found)
 
 
 def verdict_table(found: Verdict) -> Table:
