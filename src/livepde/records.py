@@ -373,7 +373,12 @@ class Layout:
         data |= self._snapshots([snapshot for _, snapshot in kept])
         if "correlation" in data:
             coords["unknown"] = ("unknown", list(self.scalars))
-        data |= self._errors(rows)
+        unit = {"units": self.sensor_unit}
+        innovations = np.reshape(rows.innovation, (len(rows), len(self.sensors)))
+        data["innovation"] = (("time", "sensor"), innovations, unit)
+        if self.validation:
+            errors = np.reshape(rows.validation_error, (len(rows), len(self.validation)))
+            data["validation_error"] = (("time", "validation"), errors, unit)
         data["status"] = ("time", rows.status, dict(STATUS_FLAGS))
         data["steps"] = ("time", rows.steps, {"long_name": "substeps taken"})
         for name, values in rows.notes.items():
@@ -446,15 +451,6 @@ class Layout:
         last = kept[-1].correlation
         if last is not None and len(self.scalars) > 1:
             data["correlation"] = (("unknown", "other"), last)
-        return data
-
-    def _errors(self, rows: RecordArrays) -> dict[str, Any]:
-        unit = {"units": self.sensor_unit}
-        innovations = np.reshape(rows.innovation, (len(rows), len(self.sensors)))
-        data: dict[str, Any] = {"innovation": (("time", "sensor"), innovations, unit)}
-        if self.validation:
-            errors = np.reshape(rows.validation_error, (len(rows), len(self.validation)))
-            data["validation_error"] = (("time", "validation"), errors, unit)
         return data
 
 

@@ -171,12 +171,12 @@ def _room_to_write(folder: Path) -> Iterator[None]:
         raise RunError(f"{folder} cannot be written: {why}") from error
 
 
+@dataclass(eq=False, repr=False)
 class RunWriter:
     """Writer of a run directory: a new or empty folder, or that of a run to resume."""
 
-    def __init__(self, path: Path, record: dict[str, Any]) -> None:
-        self.path = path
-        self.record = record
+    path: Path
+    record: dict[str, Any]
 
     @classmethod
     def create(
@@ -316,12 +316,12 @@ class RunWriter:
             write_text(self.path / RECORD, text + "\n")
 
 
+@dataclass(eq=False, repr=False)
 class Run:
     """A run that was written; open one with `livepde.runs.open(path)`."""
 
-    def __init__(self, path: Path, record: dict[str, Any]) -> None:
-        self.path = path
-        self.record = record
+    path: Path
+    record: dict[str, Any]
 
     @property
     def status(self) -> str:

@@ -52,11 +52,11 @@ def configure(kind: str = "text", level: int = logging.INFO) -> None:
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)
 
 
+@dataclass(eq=False)
 class JsonLinesSink(Sink):
     """Each estimate as a line of JSON, as `Estimate.to_dict` has it."""
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+    stream: TextIO
 
     def put(self, estimate: Estimate) -> None:
         """Write one estimate.
@@ -65,12 +65,12 @@ class JsonLinesSink(Sink):
         """
         line = json.dumps(estimate.to_dict(), allow_nan=False)
         try:
-            print(line, file=self._stream, flush=True)
+            print(line, file=self.stream, flush=True)
         except OSError:
             # To the null device from now on: flushing the buffer at exit would fail again.
             nowhere = os.open(os.devnull, os.O_WRONLY)
             with suppress(OSError):
-                os.dup2(nowhere, self._stream.fileno())
+                os.dup2(nowhere, self.stream.fileno())
             os.close(nowhere)
             raise
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, InitVar, dataclass, field, replace
 from datetime import datetime
 from itertools import chain, pairwise
 from typing import Any, Literal, Protocol, TypeAlias
@@ -157,44 +157,26 @@ class _Open:
     tokens: list[Any] = field(default_factory=list)
 
 
+@dataclass(eq=False)
 class Intake:
-    """Ordering of rows into samples.
+    """Ordering of rows into samples."""
 
-    `columns`: channel -> its column.
-    `clock`: conversion of the time column.
-    `policy`: policy for rows out of order.
-    `missing`: numbers that mean a missing value.
-    `origin`: seconds since 1970 of t = 0 where times are dates; default the first row's.
-    `dates`: whether times are dates; default as in the first row.
-    `last`: time of the last sample taken in an earlier session; earlier rows are late.
-    `recent`: times and values of the last samples of an earlier session, for channels that are
-    interpolated or screened.
+    columns: Mapping[str, Column]  # channel -> its column
+    clock: Clock  # conversion of the time column
+    policy: Policy = field(default_factory=Policy)  # for rows out of order
+    _: KW_ONLY
+    missing: Collection[float] = ()  # numbers that mean a missing value
+    origin: float | None = None  # t = 0 in seconds since 1970, of dates; None: the first row's time
+    dates: bool | None = None  # whether times are dates; None: as in the first row
+    last: float = -math.inf  # time of the last sample, also of an earlier session
+    # Last samples of an earlier session, for channels that are interpolated or screened.
+    recent: InitVar[Iterable[Known]] = ()
+    # Samples in the journal, to recognise rows that were accepted before it had them all.
+    past: Past | None = field(default=None, init=False)
 
-    `past`: the samples in the journal, to recognise rows that were accepted before it had them all.
-    """
-
-    def __init__(
-        self,
-        columns: Mapping[str, Column],
-        clock: Clock,
-        policy: Policy | None = None,
-        *,
-        missing: Iterable[float] = (),
-        origin: float | None = None,
-        dates: bool | None = None,
-        last: float = -math.inf,
-        recent: Iterable[tuple[float, Mapping[str, float]]] = (),
-    ) -> None:
-        self.columns = dict(columns)
-        self.clock = clock
-        self.policy = policy or Policy()
-        self.missing = frozenset(float(number) for number in missing)
-        self.origin = origin
-        self._dates = dates
-        self._last = last
-        self._newest = last
+    def __post_init__(self, recent: Iterable[Known]) -> None:
+        self._newest = self.last
         self._received = math.nan  # when the newest row was received
-        self.past: Past | None = None
         self._open: dict[float, _Open] = {}
         self._recent = deque(recent, maxlen=RECENT)
         self._before: dict[str, float] = {}  # held inputs of rows before the first sample
@@ -205,7 +187,7 @@ class Intake:
     @property
     def start(self) -> datetime | None:
         """The date of t = 0, if times are dates."""
-        if self.origin is None or not self._dates:
+        if self.origin is None or not self.dates:
             return None
         return origin_at(self.origin)
 
@@ -234,7 +216,7 @@ class Intake:
         for name, late in self._times.went_back.items():
             return (
                 f"the times of {name} went back to t = {late:g}, and its rows count as late up to "
-                f"t = {self._last:g}; {remedy}"
+                f"t = {self.last:g}; {remedy}"
             )
         if unsteady := self._times.unsteady:
             return (
@@ -290,7 +272,7 @@ class Intake:
 
     def _passed(self, t: float, hour: float, values: Mapping[str, float]) -> bool:
         """Return whether rows of a time or later ones have come, of the same channels."""
-        if t <= self._last:
+        if t <= self.last:
             return True
         mine = set(present(values))
         waiting = (one for one in self._ahead if t <= one.t <= t + hour)
@@ -362,7 +344,7 @@ class Intake:
         if self.origin is None:
             # The first row that is used sets t = 0 for all later ones.
             first = waiting[0].t if waiting else 0.0
-            self.origin = _microseconds(first / self.clock.second) if self._dates else 0.0
+            self.origin = _microseconds(first / self.clock.second) if self.dates else 0.0
             zero = self.origin * self.clock.second
             waiting = [replace(one, t=one.t - zero) for one in waiting]
         for one in waiting:
@@ -396,7 +378,7 @@ class Intake:
         found: list[Known] = [
             (s, sample.values) for s, sample in self._open.items() if low <= s <= high
         ]
-        if low > self._last:
+        if low > self.last:
             return found, []
         for s, values in reversed(self._accepted):
             if s < low:
@@ -407,7 +389,7 @@ class Intake:
 
     def withdraw(self, last: float) -> None:
         """Accept rows later than this time again: the samples after it were withdrawn."""
-        self._last = self._newest = last
+        self.last = self._newest = last
         self._times.withdraw(last)
         while self._accepted and self._accepted[-1][0] > last:
             self._accepted.pop()
@@ -450,7 +432,7 @@ class Intake:
         for name in present(held.values):
             value, before = held.values[name], known.get(name, NAN)
             if math.isnan(before):
-                text = f"t = {held.t:g} is not later than the last sample at {self._last:g}"
+                text = f"t = {held.t:g} is not later than the last sample at {self.last:g}"
                 found.remark("late", name, text, held.token)
             elif value != before:
                 text = f"t = {held.t:g} was accepted with {before:g}, and came again with {value:g}"
@@ -487,15 +469,15 @@ class Intake:
 
         It is the model time once t = 0 is known, else seconds since 1970 if times are dates.
         """
-        stated, dates = row_time(row, self.clock, before=self._dates)
+        stated, dates = row_time(row, self.clock, before=self.dates)
         t = stated + self.policy.shift
         low, high = self.clock.bounds(dates, "data")
         if not low <= t <= high:
             return None
-        if self._dates not in (None, dates):
+        if self.dates not in (None, dates):
             was, is_now = ("number", "date") if dates else ("date", "number")
             raise SampleError(f"the time is a {is_now}; it was a {was} before")
-        self._dates = dates
+        self.dates = dates
         if not dates:
             return t, 0.0
         if self.origin is None:
@@ -509,7 +491,7 @@ class Intake:
         near = [s for s in self._open if abs(s - t) <= self.policy.tolerance]
         if near:
             return min(near, key=lambda s: abs(s - t))
-        return t if t > self._last + self.policy.tolerance else None
+        return t if t > self.last + self.policy.tolerance else None
 
     def _add(
         self, moment: float, values: Mapping[str, float], token: Any, found: IntakeOutcome
@@ -533,7 +515,7 @@ class Intake:
             # Samples leave in order, so one that still waits holds back those after it.
             if not self._ripe(t):
                 return
-            self._last = t
+            self.last = t
             self._complete(t, self._open.pop(t), found)
 
     def _complete(self, t: float, sample: _Open, found: IntakeOutcome) -> None:

@@ -390,12 +390,12 @@ class Exponential(Smoother):
         return float(np.sqrt(share / (2.0 - share)))
 
 
+@dataclass
 class _Fading(Weights):
-    def __init__(self, time: float) -> None:
-        self.time = time
-        # Of each channel: value, variance and time of the last sample that had one.
-        self.state: tuple[Array, Array, Array] | None = None
-        self.seen: Mask | None = None  # which channels the last sample had
+    time: float
+    # Of each channel: value, variance and time of the last sample that had one.
+    state: tuple[Array, Array, Array] | None = None
+    seen: Mask | None = None  # which channels the last sample had
 
     def add(self, t: float, z: Array) -> tuple[Array, Array, Array]:
         present = np.isfinite(z)
