@@ -9,8 +9,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-import numpy as np
-
 from livepde.samples import Sample, by_name
 from livepde.streams.intake import Intake, IntakeOutcome, Ready, Remark, gather
 from livepde.streams.sources import RowSource
@@ -69,23 +67,17 @@ class Feed(Protocol):
         return
 
 
+@dataclass(eq=False)
 class Gathered(Feed):
-    """Samples from the rows of a source, as an `Intake` puts them in order.
+    """Samples from the rows of a source, as an `Intake` puts them in order."""
 
-    `source`, `intake`: source of rows, and the intake that turns them into samples.
-    """
-
-    def __init__(self, source: RowSource, intake: Intake) -> None:
-        self.source = source
-        self.intake = intake
-        self._heard = False
-        self._remarks: list[Remark] = []
-        self._rows = 0  # a token is the number of the row, and what the source gave with it
-        self._flushed = False
-
-    @property
-    def done(self) -> bool:
-        return self._flushed
+    source: RowSource
+    intake: Intake
+    done: bool = field(default=False, init=False)
+    _heard: bool = field(default=False, init=False)
+    _remarks: list[Remark] = field(default_factory=list, init=False)
+    # Number of rows so far; a token is the number of the row, and what the source gave with it.
+    _rows: int = field(default=0, init=False)
 
     def poll(self, wait: float) -> Sequence[Ready]:
         rows = self.source.poll(wait)
@@ -101,8 +93,8 @@ class Gathered(Feed):
             else:
                 outcome = self.intake.take(row.values, token, received)
             found += self._used(outcome)
-        if self.source.done and not self._flushed:
-            self._flushed = True
+        if self.source.done and not self.done:
+            self.done = True
             found += self._used(self.intake.flush())
         return found
 
@@ -159,31 +151,24 @@ def _given(tokens: Iterable[Any]) -> list[Any]:
     return [token for _, token in tokens]
 
 
+@dataclass(eq=False)
 class SampleFeed(Feed):
-    """Feed of samples that are in order already: a table, or any iterable of samples.
+    """Feed of samples that are in order already: a table, or any iterable of samples."""
 
-    `names`: sensors whose values an array z holds.
-    `after`: time of the last sample taken before; samples up to it are skipped.
-    """
+    samples: Iterable[Sample]
+    names: Sequence[str] = ()  # sensors whose values an array z holds
+    after: float = -math.inf  # time of the last sample taken before; samples up to it are skipped
+    done: bool = field(default=False, init=False)
 
-    def __init__(
-        self, samples: Iterable[Sample], names: Sequence[str] = (), after: float = -np.inf
-    ) -> None:
-        self._samples = iter(samples)
-        self._names = names
-        self._after = after
-        self._done = False
-
-    @property
-    def done(self) -> bool:
-        return self._done
+    def __post_init__(self) -> None:
+        self._left = iter(self.samples)
 
     def poll(self, wait: float) -> Sequence[Ready]:
-        for sample in self._samples:
-            if sample.t > self._after:
-                values = {**by_name(sample.z, self._names), **(sample.inputs or {})}
+        for sample in self._left:
+            if sample.t > self.after:
+                values = {**by_name(sample.z, self.names), **(sample.inputs or {})}
                 return [Ready(t=sample.t, values=values, tokens=())]
-        self._done = True
+        self.done = True
         return []
 
 
