@@ -45,23 +45,17 @@ PLAIN = "biufcU"  # kinds of arrays that are plain numbers or text
 
 def flatten(value: Any, prefix: str = "state") -> dict[str, Any]:
     """Return the leaves of nested dataclasses and tuples of arrays, keyed by dotted path."""
-    leaves: dict[str, Any] = {}
-    _gather(value, prefix, leaves)
-    return leaves
-
-
-def _gather(value: Any, prefix: str, leaves: dict[str, Any]) -> None:
+    parts: dict[Any, Any] = {}
     if isinstance(value, tuple):
-        for k, item in enumerate(value):
-            _gather(item, f"{prefix}.{k}", leaves)
-        return
-    kind: Any = type(value)
-    parts = _parts(kind)
-    if parts is None:
-        leaves[prefix] = value
-        return
-    for name, _, _ in parts:
-        _gather(getattr(value, name), f"{prefix}.{name}", leaves)
+        parts = dict(enumerate(value))
+    elif (names := _parts(type(value))) is not None:
+        parts = {name: getattr(value, name) for name, _, _ in names}
+    else:
+        return {prefix: value}
+    leaves: dict[str, Any] = {}
+    for name, part in parts.items():
+        leaves |= flatten(part, f"{prefix}.{name}")
+    return leaves
 
 
 @lru_cache(maxsize=256)

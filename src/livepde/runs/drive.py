@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from livepde.errors import DataError
 from livepde.frames import layout_of
@@ -135,12 +136,10 @@ def journal_of(identifier: Identifier, path: Path | None = None) -> Journal:
     return Journal.create(path, identifier.channels, layout)
 
 
-def _ends(stream: object) -> bool:
+def _ends(stream: Any) -> bool:
     """Return whether a stream is finite: a live one has no length."""
-    if not isinstance(stream, Sized):
-        return False
     try:
         len(stream)
-    except TypeError:  # of a stream that it wraps
+    except TypeError:  # of it, or of a stream that it wraps
         return False
     return True

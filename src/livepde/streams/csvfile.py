@@ -212,20 +212,7 @@ def how_written(path: str | Path, encoding: str = "", skip: int | None = None) -
 
     `encoding` and `skip` are used if they are known.
     """
-    lines, encoding = _first_lines(Path(path), encoding)
-    separator = _separator(lines[skip or 0 :])
-    if skip is None:
-        skip = _titles(lines, separator)
-    found = csv.reader(lines[skip:], delimiter=separator, skipinitialspace=True)
-    header, *rows = [*below_title(filter(None, found), list)] or [[]]
-    cells = [cell for row in rows for cell in row]
-    decimal = "," if any(map(has_decimal_comma, cells)) else "."
-    formats = _time_formats(header, rows, decimal)
-    return Written(separator, decimal, encoding, skip, formats, header, rows)
-
-
-def _first_lines(path: Path, encoding: str) -> tuple[list[str], str]:
-    """Return the first lines of a file, and its encoding: the given one, or a likely one."""
+    path = Path(path)
     try:
         _check_text(path)
         encoding = encoding or _likely(path.read_bytes(), UTF_8)
@@ -238,7 +225,16 @@ def _first_lines(path: Path, encoding: str) -> tuple[list[str], str]:
     # The last line may be cut off.
     whole = text if len(text) < LOOK else text.rpartition("\n")[0]
     # Not `splitlines`, which also splits at form feeds and at separators of Unicode in a cell.
-    return [line.rstrip("\n") for line in io.StringIO(whole, newline=None)], encoding
+    lines = [line.rstrip("\n") for line in io.StringIO(whole, newline=None)]
+    separator = _separator(lines[skip or 0 :])
+    if skip is None:
+        skip = _titles(lines, separator)
+    found = csv.reader(lines[skip:], delimiter=separator, skipinitialspace=True)
+    header, *rows = [*below_title(filter(None, found), list)] or [[]]
+    cells = [cell for row in rows for cell in row]
+    decimal = "," if any(map(has_decimal_comma, cells)) else "."
+    formats = _time_formats(header, rows, decimal)
+    return Written(separator, decimal, encoding, skip, formats, header, rows)
 
 
 def _time_formats(
