@@ -46,9 +46,10 @@ PLAIN = "biufcU"  # kinds of arrays that are plain numbers or text
 def flatten(value: Any, prefix: str = "state") -> dict[str, Any]:
     """Return the leaves of nested dataclasses and tuples of arrays, keyed by dotted path."""
     parts: dict[Any, Any] = {}
+    kind: Any = type(value)
     if isinstance(value, tuple):
         parts = dict(enumerate(value))
-    elif (names := _parts(type(value))) is not None:
+    elif (names := _parts(kind)) is not None:
         parts = {name: getattr(value, name) for name, _, _ in names}
     else:
         return {prefix: value}

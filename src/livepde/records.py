@@ -136,7 +136,8 @@ class RecordArrays:
         self._numbers, self._innovation, self._error = array("d"), array("d"), array("d")
         self._status, self._steps = array("b"), array("i")
         self._notes: dict[str, array[float]] = {}
-        self._snapshots = _SnapshotArrays()
+        self._fields: list[bytes] = []  # of the records with these numbers
+        self._with_fields = array("q")
 
     @classmethod
     def of(cls, records: Iterable[Record]) -> RecordArrays:
@@ -173,7 +174,8 @@ class RecordArrays:
         self._steps.append(record.steps)
         self._t.append(record.t)
         if record.snapshot is not None:
-            self._snapshots.append(count, record.snapshot)
+            self._fields.append(record.snapshot.to_bytes())
+            self._with_fields.append(count)
 
     def with_last(self, numbers: Array, snapshot: Snapshot | None) -> RecordArrays:
         """Return a copy in which numbers and fields of the last record are others."""
@@ -242,71 +244,11 @@ class RecordArrays:
     @property
     def last_snapshot(self) -> int:
         """Number of the last record with a snapshot, -1 if there is none."""
-        return self._snapshots.last
+        return self._with_fields[-1] if self._with_fields else -1
 
     def snapshots(self) -> Iterator[tuple[int, Snapshot]]:
         """Iterate over the snapshots and the numbers of their records."""
-        return iter(self._snapshots)
-
-
-class _SnapshotArrays:
-    """Snapshots as arrays: a group for each structure that they have, which is usually one."""
-
-    def __init__(self) -> None:
-        self._groups: list[tuple[_Structure, array[int], array[float]]] = []
-        self.last = -1
-
-    def append(self, number: int, snapshot: Snapshot) -> None:
-        """Keep the snapshot of a record."""
-        structure = _Structure.of(snapshot)
-        if not self._groups or self._groups[-1][0] != structure:
-            self._groups.append((structure, array("q"), array("d")))
-        _, records, values = self._groups[-1]
-        for profile in snapshot.profiles.values():
-            values.frombytes(profile.tobytes())
-        values.extend(told for told, _ in snapshot.told.values())
-        values.extend(snapshot.left_out.get(name, math.nan) for name in snapshot.told)
-        if snapshot.correlation is not None:
-            values.frombytes(snapshot.correlation.tobytes())
-        records.append(number)
-        self.last = number
-
-    def __iter__(self) -> Iterator[tuple[int, Snapshot]]:
-        for structure, records, values in self._groups:
-            rows = _array(values).reshape(len(records), -1)
-            yield from zip(records, map(structure.snapshot, rows), strict=True)
-
-
-@dataclass(frozen=True)
-class _Structure:
-    """Names and sizes in a snapshot."""
-
-    profiles: tuple[tuple[str, int], ...]
-    told: tuple[tuple[str, int], ...]
-    correlated: int | None
-
-    @classmethod
-    def of(cls, snapshot: Snapshot) -> _Structure:
-        """Return the structure of a snapshot."""
-        profiles = tuple((name, len(values)) for name, values in snapshot.profiles.items())
-        told = tuple((name, count) for name, (_, count) in snapshot.told.items())
-        correlation = snapshot.correlation
-        return cls(profiles, told, None if correlation is None else len(correlation))
-
-    def snapshot(self, row: Array) -> Snapshot:
-        """Return the snapshot whose numbers are a row."""
-        # In this order: profiles, numbers of modes told, shares left out, correlation.
-        sizes = [size for _, size in self.profiles]
-        *parts, rest = np.split(row, np.cumsum(sizes, dtype=int))
-        fields = len(self.told)
-        told, left_out, correlation = np.split(rest, [fields, 2 * fields])
-        n = self.correlated
-        return Snapshot(
-            {name: values for (name, _), values in zip(self.profiles, parts, strict=True)},
-            {name: (float(x), count) for (name, count), x in zip(self.told, told, strict=True)},
-            None if n is None else correlation.reshape(n, n),
-            {name: float(x) for (name, _), x in zip(self.told, left_out, strict=True)},
-        )
+        return zip(self._with_fields, map(Snapshot.from_bytes, self._fields), strict=True)
 
 
 def _array(values: array[float]) -> Array:
@@ -450,7 +392,7 @@ class Layout:
             data[f"{name}_left_out"] = ("snapshot", left, about)
         last = kept[-1].correlation
         if last is not None and len(self.scalars) > 1:
-            data["correlation"] = (("unknown", "other"), last)
+            data["correlation"] = (("unknown", "other"), last.copy())
         return data
 
 

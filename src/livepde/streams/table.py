@@ -44,8 +44,6 @@ class Thinned:
 
     `held`: columns that are no "line", shape (columns,).
 
-    Examples
-    --------
     >>> rows = Thinned(["line", "hold"])
     >>> rows.take(0.0, np.array([20.0, 1.0]), chosen=True, whole=True)
     array([20.,  1.])
