@@ -167,7 +167,7 @@ class SampleFeed(Feed):
         for sample in self._left:
             if sample.t > self.after:
                 values = {**by_name(sample.z, self.names), **(sample.inputs or {})}
-                return [Ready(t=sample.t, values=values, tokens=())]
+                return [Ready(t=sample.t, values=values)]
         self.done = True
         return []
 

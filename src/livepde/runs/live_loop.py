@@ -123,7 +123,7 @@ def _merged(samples: Sequence[Ready]) -> Ready:
             if np.isfinite(value):
                 values.setdefault(channel, []).append(value)
     mean = {channel: float(np.mean(several)) for channel, several in values.items()}
-    tokens = tuple(t for sample in samples for t in sample.tokens)
+    tokens = [token for sample in samples for token in sample.tokens]
     return Ready(t=samples[-1].t, values=mean, tokens=tokens)
 
 

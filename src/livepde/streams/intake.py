@@ -108,13 +108,13 @@ def gather(found: dict[tuple[str, str], Remark], remark: Remark) -> None:
     found[key] = remark if same is None else replace(same, number=same.number + remark.number)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Ready:
-    """A sample that is complete."""
+    """A sample: open as long as rows may add to it, then complete."""
 
     t: float
-    values: dict[str, float]  # of the channels that have come
-    tokens: tuple[Any, ...]  # of the source for the rows of the sample, to acknowledge them
+    values: dict[str, float] = field(default_factory=dict)  # of the channels that have come
+    tokens: list[Any] = field(default_factory=list)  # of its rows, to acknowledge them
 
 
 @dataclass
@@ -151,12 +151,6 @@ class _Held:
     remarks: list[Remark]
 
 
-@dataclass
-class _Open:
-    values: dict[str, float] = field(default_factory=dict)
-    tokens: list[Any] = field(default_factory=list)
-
-
 @dataclass(eq=False)
 class Intake:
     """Ordering of rows into samples."""
@@ -177,7 +171,7 @@ class Intake:
     def __post_init__(self, recent: Iterable[Known]) -> None:
         self._newest = self.last
         self._received = math.nan  # when the newest row was received
-        self._open: dict[float, _Open] = {}
+        self._open: dict[float, Ready] = {}
         self._recent = deque(recent, maxlen=RECENT)
         self._before: dict[str, float] = {}  # held inputs of rows before the first sample
         self._times = ChannelTimes(self._recent)
@@ -496,7 +490,7 @@ class Intake:
     def _add(
         self, moment: float, values: Mapping[str, float], token: Any, found: IntakeOutcome
     ) -> None:
-        sample = self._open.setdefault(moment, _Open())
+        sample = self._open.setdefault(moment, Ready(t=moment))
         sample.tokens.append(token)
         for channel, value in values.items():
             known = sample.values.get(channel, math.nan)
@@ -516,13 +510,13 @@ class Intake:
             if not self._ripe(t):
                 return
             self.last = t
-            self._complete(t, self._open.pop(t), found)
+            self._complete(self._open.pop(t), found)
 
-    def _complete(self, t: float, sample: _Open, found: IntakeOutcome) -> None:
+    def _complete(self, sample: Ready, found: IntakeOutcome) -> None:
         """Release a sample, or leave it out if a channel is missing that it needs."""
-        came = dict(sample.values)
+        t, came = sample.t, dict(sample.values)
         for channel in self.columns:
-            self._bridge(channel, t, sample, found)
+            self._bridge(channel, sample, found)
             if channel in self._before and math.isnan(sample.values.get(channel, NAN)):
                 sample.values[channel] = self._before[channel]
         for channel in without_noise(self.columns, sample.values):
@@ -545,7 +539,7 @@ class Intake:
         self._before.clear()
         self._recent.append((t, sample.values))
         self._remember(t, came)
-        found.ready.append(Ready(t=t, values=sample.values, tokens=tuple(sample.tokens)))
+        found.ready.append(sample)
 
     def _remember(self, t: float, came: dict[str, float]) -> None:
         """Remember an accepted sample, at least until the journal has it."""
@@ -580,9 +574,9 @@ class Intake:
         absent = math.isnan(values.get(channel, NAN))
         return absent and not (of and math.isnan(values.get(of, NAN)))
 
-    def _bridge(self, channel: str, t: float, sample: _Open, found: IntakeOutcome) -> None:
+    def _bridge(self, channel: str, sample: Ready, found: IntakeOutcome) -> None:
         """Interpolate a gap of a sample, or refuse a spike, where later values are known."""
-        habit = self.policy.habit(channel)
+        t, habit = sample.t, self.policy.habit(channel)
         # A sample that does not wait is released before any later value has come.
         waited = self.policy.longest(habit) > 0.0
         if not (waited and (habit.interpolated or habit.screened)):
