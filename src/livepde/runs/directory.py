@@ -442,13 +442,11 @@ class Run:
                 f"{self.path} was run with another case or other settings. Resume it with these, "
                 "or choose another folder."
             )
-        before, now_named = (
-            f"--data {data}" if data else "the data of its case"
-            for data in (self.data_file, _data_of(command))
-        )
-        if before != now_named:
+        files = self.data_file, _data_of(command)
+        if files[0] != files[1]:
+            before, other = (f"--data {d}" if d else "the data of its case" for d in files)
             raise RunError(
-                f"{self.path} was run with {before}, not with {now_named}: resume it so, or choose "
+                f"{self.path} was run with {before}, not with {other}: resume it so, or choose "
                 "another folder."
             )
 

@@ -443,7 +443,7 @@ def without_noise(columns: Mapping[str, Column], values: dict[str, float]) -> li
     return refused
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class JsonLines:
     """Samples from JSON lines, one object with column -> value for each moment, as they come.
 
