@@ -231,14 +231,14 @@ def fill_table(
     and remaining gaps as "missing". Readings of the channels `means` are means since the last one:
     a gap is part of the next mean.
     """
-    import pandas as pd  # slow to load, and rarely needed
-
     values, remarks = table.values.copy(), dict(table.remarks)
     fills, screens, of_means = set(interpolated), set(screened), set(means)
     for k, name in enumerate(table.names):
         if name not in fills | screens | of_means:
             continue
         if name in of_means:
+            import pandas as pd  # slow to load, and rarely needed
+
             column = pd.Series(values[:, k]).bfill().to_numpy(copy=True)
             gaps = np.isnan(values[:, k]) & ~np.isnan(column)
             spikes, fills = np.zeros_like(gaps), fills | {name}
@@ -252,8 +252,10 @@ def fill_table(
         after = len(column) - 1 - int(known[-1]) if len(known) else 0
         ended = after if after > LONG else 0
         left = np.isnan(column).sum() - ended
-        numbered, _ = scipy.ndimage.label(gaps)
-        bridges = (np.bincount(numbered)[numbered[gaps]] > LONG).sum()
+        bridges = 0
+        if gaps.any():
+            numbered, _ = scipy.ndimage.label(gaps)
+            bridges = int((np.bincount(numbered)[numbered[gaps]] > LONG).sum())
         counts = {"spike": spikes.sum(), "interpolated": gaps.sum() - bridges, "bridged": bridges}
         counts |= {"ended": ended, "missing": left}
         remarks |= {(kind, name): int(number) for kind, number in counts.items() if number}
