@@ -30,9 +30,10 @@ def decay(names: list[str], state: str = "") -> lp.Model:
     return lp.Model(field, {name: lp.Normal(0.5, 0.1) for name in names}, A)
 
 
-def run(model: lp.Model, law: Any = None) -> lp.Result:
+def run(model: lp.Model, law: Any = None, validation: Any = None) -> lp.Result:
     points = lp.Points([0.3, 0.7], noise=0.01)
-    identifier = lp.Identifier(model, points, law or lp.SensitivityLaw(), u0=1.0)
+    law = law or lp.SensitivityLaw()
+    identifier = lp.Identifier(model, points, law, u0=1.0, validation=validation)
     rng = np.random.default_rng(0)
     times = 0.1 * np.arange(1, 8)
     noise = 0.01 * rng.standard_normal((7, 2))
@@ -127,8 +128,9 @@ def test_every_name_that_a_dataset_has_is_known_to_the_check():
         {"c": field, "k": lp.Normal(0.5, 0.1, bounds=(0.0, 1.0)), "s": lp.Normal(0.5, 0.1)},
         A=lambda q, u, v, x: (q.c + q.k + q.s) * u * v,
     )
-    result = run(model)
+    result = run(model, validation=lp.Points({"v": 0.4}))
     data = result.to_xarray()
+    assert {"validation_x", "validation_error"} <= {*data.variables}
     own = {"u": STATE_ENDS, "c": FIELD_ENDS, "k": NUMBER_ENDS, "s": NUMBER_ENDS}
     expected = {f"{name}{end}" for name, ends in own.items() for end in ("", *ends)}
     expected |= Layout.own_names("x", ())

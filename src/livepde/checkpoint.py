@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -45,23 +45,18 @@ PLAIN = "biufcU"  # kinds of arrays that are plain numbers or text
 
 def flatten(value: Any, prefix: str = "state") -> dict[str, Any]:
     """Return the leaves of nested dataclasses and tuples of arrays, keyed by dotted path."""
-    leaves: dict[str, Any] = {}
-    _gather(value, prefix, leaves)
-    return leaves
-
-
-def _gather(value: Any, prefix: str, leaves: dict[str, Any]) -> None:
-    if isinstance(value, tuple):
-        for k, item in enumerate(value):
-            _gather(item, f"{prefix}.{k}", leaves)
-        return
+    parts: dict[Any, Any] = {}
     kind: Any = type(value)
-    parts = _parts(kind)
-    if parts is None:
-        leaves[prefix] = value
-        return
-    for name, _, _ in parts:
-        _gather(getattr(value, name), f"{prefix}.{name}", leaves)
+    if isinstance(value, tuple):
+        parts = dict(enumerate(value))
+    elif (names := _parts(kind)) is not None:
+        parts = {name: getattr(value, name) for name, _, _ in names}
+    else:
+        return {prefix: value}
+    leaves: dict[str, Any] = {}
+    for name, part in parts.items():
+        leaves |= flatten(part, f"{prefix}.{name}")
+    return leaves
 
 
 @lru_cache(maxsize=256)
@@ -213,6 +208,7 @@ def read(path: str | os.PathLike[str]) -> bytes:
         ) from error
 
 
+Place: TypeAlias = tuple[Array, Array, Moment]  # latent parameter, state and time
 ROUNDING = 1e-8  # relative: far above what the order of sums changes, far below any other change
 TIMES = (0.37, 1.91)
 SUMS = 2  # for each vector
@@ -293,22 +289,31 @@ def fingerprint(
 
     q0 and u0 are latent parameter and state at the start, without boundary values.
     """
-    probes = _Probes(problem, q0, u0)
+    model, places = problem.model, _places(problem, q0, u0)
+    valued = [(model.latent.value(q), u, at) for q, u, at in places]
     control = replace(problem.control, start=math.nan)
     sensors = [problem.observed] if validation is None else [problem.observed, validation]
-    shown = [each for one in sensors for each in probes.of_sensors(one)]
+    process = [_sums(model.mass @ _weights(model.X.dim)), _sums(model.X.free.astype(float))]
+    shown: list[Array] = []
+    for one in sensors:
+        noise = _sums(np.zeros(0) if one.noise is None else one.noise)
+        shown += [noise, *_evaluated(OF_SENSORS, one, valued)]
+    options = [
+        (part.name, part.size, part.unknown.prior, part.evolution)
+        for part in model.latent.parts.values()
+    ]
     own: dict[str, tuple[Any, Iterable[Array]]] = {
-        "model": ((problem.model.channels, problem.model.X.dim), probes.of_model()),
-        "unknowns": (_unknowns(problem.model), probes.of_unknowns()),
+        "model": ((model.channels, model.X.dim), process + _evaluated(OF_MODEL, model, places)),
+        "unknowns": (options, _of_priors(model)),
         "sensors": ([one.names for one in sensors], shown),
         "law": (law, ()),
         "steps": ((control, problem.input_noise), ()),
         "start": ((), _start(q0, u0, problem.initial_errors)),
     }
     texts, numbers = {}, {}
-    for part, (options, sums) in own.items():
+    for part, (stated_options, sums) in own.items():
         told: list[float] = []
-        texts[part] = _described(options, told)
+        texts[part] = _described(stated_options, told)
         stated = np.array([(value, abs(value)) for value in told]).reshape(-1, 2)
         numbers[part] = np.concatenate([stated, *sums])
     return Fingerprint(texts, numbers)
@@ -317,11 +322,6 @@ def fingerprint(
 def _start(q0: Array, u0: Array, errors: Array) -> list[Array]:
     """Return sums of what a run begins with; none of errors of u0 where there are none."""
     return [_sums(q0), _sums(u0), *([_sums(errors.ravel())] if errors.size else [])]
-
-
-def _unknowns(model: Model) -> list[Any]:
-    parts = model.latent.parts.values()
-    return [(part.name, part.size, part.unknown.prior, part.evolution) for part in parts]
 
 
 def _sums(values: Any) -> Array:
@@ -337,61 +337,52 @@ def _weights(size: int) -> Array:
     return np.cos(np.outer(1.0 + np.arange(size), np.sqrt([2.0, 3.0])[:SUMS]))
 
 
-class _Probes:
-    """Evaluations at the start, and at a state and a parameter near it."""
-
-    def __init__(self, problem: Problem, q0: Array, u0: Array) -> None:
-        self.model = model = problem.model
-        inputs = Inputs({name: 1.0 + 0.3 * k for k, name in enumerate(problem.channels)})
-        first, second = (Moment(t, inputs) for t in TIMES)
-        u = u0 + 0.1 * max(1.0, float(np.abs(u0).max(initial=0.0))) * _weights(len(u0))[:, 0]
-        q = q0.copy()
-        for part in model.latent.parts.values():
-            q[part.part] += 0.3 * part.unknown.prior.latent_std
-        self.places = ((q0, u0, first), (q, u, second))
-
-    def of_model(self) -> Iterator[Array]:
-        """Iterate over sums of what the process is made of."""
-        model = self.model
-        yield _sums(model.mass @ _weights(model.X.dim))
-        yield _sums(model.X.free.astype(float))
-        for q, u, at in self.places:
-            yield from self._of_forms(q, u, at)
-
-    def _of_forms(self, q: Array, u: Array, at: Moment) -> Iterator[Array]:
-        model = self.model
-        yield _tried(lambda: model.initial_state(q, at))
-        yield _tried(lambda: model.impose(np.zeros_like(u), at))
-        yield _tried(lambda: model.B(u, at))
-        yield _tried(lambda: model.form_F.vector("v", at))
-        yield _tried(lambda: model.form_A.vector("v", at, u=u, q=q))
-        yield _tried(lambda: model.A(u, at, q).matrix @ _weights(len(q)))
-
-    def of_unknowns(self) -> Iterator[Array]:
-        """Iterate over sums of their priors."""
-        latent = self.model.latent
-        yield _sums(latent.prior)
-        yield _sums(self.model.Q.dual(_weights(len(latent.prior))[:, 0]))
-        for bound in latent.bounds:
-            yield _sums(np.isfinite(bound).astype(float))
-            yield _sums(np.where(np.isfinite(bound), bound, 0.0))
-
-    def of_sensors(self, sensors: Observed) -> Iterator[Array]:
-        """Iterate over sums of what sensors show."""
-        yield _sums(np.zeros(0) if sensors.noise is None else sensors.noise)
-        for q, u, at in self.places:
-            yield from self._shown(sensors, self.model.latent.value(q), u, at)
-
-    @staticmethod
-    def _shown(sensors: Observed, q: Array, u: Array, at: Moment) -> Iterator[Array]:
-        yield _tried(lambda: sensors.predict(u, q, at))
-        yield _tried(lambda: sensors.jacobian(u, q, at)[0] @ _weights(len(u)))
+def _places(problem: Problem, q0: Array, u0: Array) -> list[Place]:
+    """Return the start, and a parameter and a state near it."""
+    inputs = Inputs({name: 1.0 + 0.3 * k for k, name in enumerate(problem.channels)})
+    first, second = (Moment(t, inputs) for t in TIMES)
+    u = u0 + 0.1 * max(1.0, float(np.abs(u0).max(initial=0.0))) * _weights(len(u0))[:, 0]
+    q = q0.copy()
+    for part in problem.model.latent.parts.values():
+        q[part.part] += 0.3 * part.unknown.prior.latent_std
+    return [(q0, u0, first), (q, u, second)]
 
 
-def _tried(function: Callable[[], Any]) -> Array:
+OF_MODEL: tuple[Callable[..., Any], ...] = (
+    lambda model, q, u, at: model.initial_state(q, at),
+    lambda model, q, u, at: model.impose(np.zeros_like(u), at),
+    lambda model, q, u, at: model.B(u, at),
+    lambda model, q, u, at: model.form_F.vector("v", at),
+    lambda model, q, u, at: model.form_A.vector("v", at, u=u, q=q),
+    lambda model, q, u, at: model.A(u, at, q).matrix @ _weights(len(q)),
+)
+OF_SENSORS: tuple[Callable[..., Any], ...] = (
+    lambda sensors, q, u, at: sensors.predict(u, q, at),
+    lambda sensors, q, u, at: sensors.jacobian(u, q, at)[0] @ _weights(len(u)),
+)
+
+
+def _evaluated(
+    functions: Iterable[Callable[..., Any]], of: Model | Observed, places: Iterable[Place]
+) -> list[Array]:
+    """Return sums of what the process is made of, or of what sensors show, at each place."""
+    return [_tried(function, of, *place) for place in places for function in functions]
+
+
+def _of_priors(model: Model) -> Iterator[Array]:
+    """Iterate over sums of the priors of the unknowns."""
+    latent = model.latent
+    yield _sums(latent.prior)
+    yield _sums(model.Q.dual(_weights(len(latent.prior))[:, 0]))
+    for bound in latent.bounds:
+        yield _sums(np.isfinite(bound).astype(float))
+        yield _sums(np.where(np.isfinite(bound), bound, 0.0))
+
+
+def _tried(function: Callable[..., Any], *arguments: Any) -> Array:
     """Return the sums of what a function returns; NaN if it has no value there."""
     try:
-        return _sums(function())
+        return _sums(function(*arguments))
     except Exception:  # noqa: BLE001  a form may refuse a state in any way; so it does next time
         return np.full((1, 2), np.nan)
 

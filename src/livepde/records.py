@@ -12,7 +12,6 @@ from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
-from sys import getsizeof
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -35,6 +34,13 @@ SMOOTHED = "_smoothed"  # suffix of a variable estimated from all samples of a r
 DATE = "date"  # column of an exported table, beside the variables of the dataset
 # The numbers among the unknowns on axes of their own, in `Result.to_xarray`.
 ESTIMATES, PARAMETER, STATISTIC = "estimates", "parameter", "statistic"
+OWN_NAMES = frozenset(
+    {DATE, ESTIMATES, PARAMETER, f"{PARAMETER}_unit", STATISTIC}
+    | {"time", "snapshot", "vertex", "cell", "corner", "unknown", "other", "correlation"}
+    | {"sensor", "sensor_unit", "innovation", "validation", "validation_unit", "validation_error"}
+    | {"status", "steps"}
+)
+"""Names that every dataset of a run has, without those of its mesh."""
 # Variables beside an unknown or a component of the state: suffix of their names -> meaning.
 STATE_ENDS = {"_std": "the standard deviation"}
 INTERVAL_ENDS = {"_low": "the lower end of the interval", "_high": "the upper end of the interval"}
@@ -96,28 +102,16 @@ class Snapshot:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Record:
-    """The stored part of an estimate.
-
-    Attributes
-    ----------
-    t, steps, notes, innovation, validation_error
-        Attributes of the estimate.
-    numbers
-        Values of the variables `Layout.numbers`, shape (numbers,).
-    status
-        Index in `STATUS_CODES`.
-    snapshot
-        The fields; None where none are kept.
-    """
+    """The stored part of an estimate."""
 
     t: float
-    numbers: Array
+    numbers: Array  # values of the variables `Layout.numbers`, shape (numbers,)
     innovation: Array
     validation_error: Array
-    status: int
+    status: int  # index in `STATUS_CODES`
     steps: int
     notes: Mapping[str, float]
-    snapshot: Snapshot | None = None
+    snapshot: Snapshot | None = None  # the fields; None where none are kept
 
 
 class Records(Protocol):
@@ -142,7 +136,8 @@ class RecordArrays:
         self._numbers, self._innovation, self._error = array("d"), array("d"), array("d")
         self._status, self._steps = array("b"), array("i")
         self._notes: dict[str, array[float]] = {}
-        self._snapshots = _SnapshotArrays()
+        self._fields: list[bytes] = []  # of the records with these numbers
+        self._with_fields = array("q")
 
     @classmethod
     def of(cls, records: Iterable[Record]) -> RecordArrays:
@@ -179,7 +174,8 @@ class RecordArrays:
         self._steps.append(record.steps)
         self._t.append(record.t)
         if record.snapshot is not None:
-            self._snapshots.append(count, record.snapshot)
+            self._fields.append(record.snapshot.to_bytes())
+            self._with_fields.append(count)
 
     def with_last(self, numbers: Array, snapshot: Snapshot | None) -> RecordArrays:
         """Return a copy in which numbers and fields of the last record are others."""
@@ -205,12 +201,6 @@ class RecordArrays:
 
     def _table(self, values: array[float]) -> Array:
         return _array(values).reshape(len(self), -1 if values else 0)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all arrays, reserved capacity included."""
-        single = (self._t, self._numbers, self._innovation, self._error, self._status, self._steps)
-        return self._snapshots.nbytes + sum(map(getsizeof, (*single, *self._notes.values())))
 
     @property
     def t(self) -> Array:
@@ -254,76 +244,11 @@ class RecordArrays:
     @property
     def last_snapshot(self) -> int:
         """Number of the last record with a snapshot, -1 if there is none."""
-        return self._snapshots.last
+        return self._with_fields[-1] if self._with_fields else -1
 
     def snapshots(self) -> Iterator[tuple[int, Snapshot]]:
         """Iterate over the snapshots and the numbers of their records."""
-        return iter(self._snapshots)
-
-
-class _SnapshotArrays:
-    """Snapshots as arrays: a group for each structure that they have, which is usually one."""
-
-    def __init__(self) -> None:
-        self._groups: list[tuple[_Structure, array[int], array[float]]] = []
-        self.last = -1
-
-    def append(self, number: int, snapshot: Snapshot) -> None:
-        """Keep the snapshot of a record."""
-        structure = _Structure.of(snapshot)
-        if not self._groups or self._groups[-1][0] != structure:
-            self._groups.append((structure, array("q"), array("d")))
-        _, records, values = self._groups[-1]
-        for profile in snapshot.profiles.values():
-            values.frombytes(profile.tobytes())
-        values.extend(told for told, _ in snapshot.told.values())
-        values.extend(snapshot.left_out.get(name, math.nan) for name in snapshot.told)
-        if snapshot.correlation is not None:
-            values.frombytes(snapshot.correlation.tobytes())
-        records.append(number)
-        self.last = number
-
-    def __iter__(self) -> Iterator[tuple[int, Snapshot]]:
-        for structure, records, values in self._groups:
-            rows = _array(values).reshape(len(records), -1)
-            yield from zip(records, map(structure.snapshot, rows), strict=True)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all arrays, reserved capacity included."""
-        return sum(getsizeof(part) for _, *parts in self._groups for part in parts)
-
-
-@dataclass(frozen=True)
-class _Structure:
-    """Names and sizes in a snapshot."""
-
-    profiles: tuple[tuple[str, int], ...]
-    told: tuple[tuple[str, int], ...]
-    correlated: int | None
-
-    @classmethod
-    def of(cls, snapshot: Snapshot) -> _Structure:
-        """Return the structure of a snapshot."""
-        profiles = tuple((name, len(values)) for name, values in snapshot.profiles.items())
-        told = tuple((name, count) for name, (_, count) in snapshot.told.items())
-        correlation = snapshot.correlation
-        return cls(profiles, told, None if correlation is None else len(correlation))
-
-    def snapshot(self, row: Array) -> Snapshot:
-        """Return the snapshot whose numbers are a row."""
-        # In this order: profiles, numbers of modes told, shares left out, correlation.
-        sizes = [size for _, size in self.profiles]
-        *parts, rest = np.split(row, np.cumsum(sizes, dtype=int))
-        fields = len(self.told)
-        told, left_out, correlation = np.split(rest, [fields, 2 * fields])
-        n = self.correlated
-        return Snapshot(
-            {name: values for (name, _), values in zip(self.profiles, parts, strict=True)},
-            {name: (float(x), count) for (name, count), x in zip(self.told, told, strict=True)},
-            None if n is None else correlation.reshape(n, n),
-            {name: float(x) for (name, _), x in zip(self.told, left_out, strict=True)},
-        )
+        return zip(self._with_fields, map(Snapshot.from_bytes, self._fields), strict=True)
 
 
 def _array(values: array[float]) -> Array:
@@ -335,25 +260,20 @@ def _array(values: array[float]) -> Array:
 class Layout:
     """Names, units and coordinates of the numbers of records, as plain values."""
 
-    # time_unit, sensor_unit: units of time and innovations; `sensor_unit` is empty if the sensors
-    # have several
     time_unit: str
-    sensor_unit: str
+    sensor_unit: str  # of innovations; empty if the sensors have several
     coordinates: Mapping[str, Sequence[float]]  # axis -> coordinates of the vertices
     # Kind of cell as meshio names it ("triangle", "tetra", ...) -> vertices of each; of an interval
     # none, its vertices are in order
     cells: Mapping[str, Sequence[Sequence[int]]]
-    # sensors, validation: names of the sensors; `validation` is None if there are none
     sensors: Sequence[str]
-    validation: Sequence[str] | None
+    validation: Sequence[str] | None  # names of these sensors; None if there are none
     # Variable over time -> its attributes, in the order of `Record.numbers`
     numbers: Mapping[str, Mapping[str, Any]]
     units: Mapping[str, str]  # unknown or component of the state -> unit
-    # scalars, fields, state: labels of scalar unknowns, names of unknown fields and of variables of
-    # the state
-    scalars: Sequence[str]
-    fields: Sequence[str]
-    state: Sequence[str]
+    scalars: Sequence[str]  # labels of scalar unknowns
+    fields: Sequence[str]  # names of unknown fields
+    state: Sequence[str]  # names of variables of the state
     length_unit: str = ""  # unit of coordinates
     # Sensor, of either kind, that is at one point -> its coordinates
     places: Mapping[str, Sequence[float]] = field(default_factory=dict)
@@ -380,12 +300,7 @@ class Layout:
         """
         import xarray as xr
 
-        return xr.Dataset(*self._contents(RecordArrays.of(records), last))
-
-    def _contents(
-        self, rows: RecordArrays, last: Snapshot | None
-    ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-        """Return variables, coordinates and attributes of the dataset."""
+        rows = RecordArrays.of(records)
         times, kept = rows.t, [*rows.snapshots()]
         if last is not None:
             kept.append((-1, last))
@@ -400,7 +315,12 @@ class Layout:
         data |= self._snapshots([snapshot for _, snapshot in kept])
         if "correlation" in data:
             coords["unknown"] = ("unknown", list(self.scalars))
-        data |= self._errors(rows)
+        unit = {"units": self.sensor_unit}
+        innovations = np.reshape(rows.innovation, (len(rows), len(self.sensors)))
+        data["innovation"] = (("time", "sensor"), innovations, unit)
+        if self.validation:
+            errors = np.reshape(rows.validation_error, (len(rows), len(self.validation)))
+            data["validation_error"] = (("time", "validation"), errors, unit)
         data["status"] = ("time", rows.status, dict(STATUS_FLAGS))
         data["steps"] = ("time", rows.steps, {"long_name": "substeps taken"})
         for name, values in rows.notes.items():
@@ -412,7 +332,7 @@ class Layout:
             "scalars": "\n".join(self.scalars),
             "state": " ".join(self.state),
         }
-        return data, coords, about
+        return xr.Dataset(data, coords, about)
 
     def _coordinates(self, times: Array, snapshots: Array) -> dict[str, Any]:
         """Return the coordinates of the dataset: times of samples and of fields, and places."""
@@ -445,49 +365,14 @@ class Layout:
             return {}
         return {f"{dimension}_unit": (dimension, [self.sensor_units[name] for name in names])}
 
-    @classmethod
-    def own_names(cls, axes: Iterable[str], cells: Iterable[str]) -> set[str]:
+    @staticmethod
+    def own_names(axes: Iterable[str], cells: Iterable[str]) -> set[str]:
         """Return the names of dimensions, coordinates and variables that every dataset has.
 
         `axes`, `cells`: coordinates and kinds of cells of the mesh.
         """
-        pair = ["1", "2"]  # two unknown numbers, so that they have a correlation
-        grid, none = {axis: [0.0] for axis in axes}, {kind: [[0]] for kind in cells}
-        at = {name: [0.0] * len(grid) for name in ("z", "w")}
-        units = {"z": "K", "w": "m"}
-        blank = cls(
-            "",
-            "",
-            grid,
-            none,
-            ["z"],
-            ["w"],
-            {},
-            {},
-            pair,
-            [],
-            [],
-            places=at,
-            sensor_units=units,
-        )
-        rows, snapshot = RecordArrays(), Snapshot({}, {}, np.eye(2))
-        rows.append(
-            Record(
-                t=0.0,
-                numbers=np.zeros(0),
-                innovation=np.zeros(1),
-                validation_error=np.zeros(1),
-                status=0,
-                steps=1,
-                notes={},
-                snapshot=snapshot,
-            )
-        )
-        data, coords, _ = blank._contents(rows, None)
-        found = {DATE, ESTIMATES, PARAMETER, f"{PARAMETER}_unit", STATISTIC}
-        for name, (dimensions, *_) in {**data, **coords}.items():
-            found |= {name, *([dimensions] if isinstance(dimensions, str) else dimensions)}
-        return found
+        places = {f"{of}{axis}" for axis in axes for of in ("", "sensor_", "validation_")}
+        return {*OWN_NAMES, *places, *cells}
 
     def _snapshots(self, kept: Sequence[Snapshot]) -> dict[str, Any]:
         data: dict[str, Any] = {}
@@ -507,16 +392,7 @@ class Layout:
             data[f"{name}_left_out"] = ("snapshot", left, about)
         last = kept[-1].correlation
         if last is not None and len(self.scalars) > 1:
-            data["correlation"] = (("unknown", "other"), last)
-        return data
-
-    def _errors(self, rows: RecordArrays) -> dict[str, Any]:
-        unit = {"units": self.sensor_unit}
-        innovations = np.reshape(rows.innovation, (len(rows), len(self.sensors)))
-        data: dict[str, Any] = {"innovation": (("time", "sensor"), innovations, unit)}
-        if self.validation:
-            errors = np.reshape(rows.validation_error, (len(rows), len(self.validation)))
-            data["validation_error"] = (("time", "validation"), errors, unit)
+            data["correlation"] = (("unknown", "other"), last.copy())
         return data
 
 

@@ -229,24 +229,11 @@ def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """Names of all channels; conversion of samples to validated arrays.
+    """Names of all channels; conversion of samples to validated arrays."""
 
-    Parameters
-    ----------
-    forced
-        Channels that the model reads.
-    observed, validation
-        Assimilated sensors, and validation sensors, which are only scored.
-
-    Raises
-    ------
-    ConfigurationError
-        A sensor is both.
-    """
-
-    forced: tuple[str, ...]
-    observed: Observed
-    validation: Observed | None
+    forced: tuple[str, ...]  # channels that the model reads
+    observed: Observed  # assimilated sensors
+    validation: Observed | None  # sensors that are only scored
 
     def __post_init__(self) -> None:
         both = [name for name in self.hidden if name in self.observed.names]
@@ -376,13 +363,7 @@ class Channels:
         return named
 
     def filled(self, named: Mapping[str, float], known: Inputs) -> tuple[Inputs, tuple[str, ...]]:
-        """Return all inputs, and the names of missing ones that hold their last value.
-
-        Raises
-        ------
-        MissingInputError
-            An input has no value yet.
-        """
+        """Return all inputs, and the names of missing ones that hold their last value."""
         if not self.inputs:
             return known, ()
         values, held = {}, []

@@ -58,11 +58,6 @@ SCHEMA = (
 )
 
 
-def in_memory() -> sqlite3.Connection:
-    """Open a database that is in memory only."""
-    return sqlite3.connect(":memory:", factory=_Connection)
-
-
 def writer(path: Path) -> sqlite3.Connection:
     """Open a file to write it."""
     connection = _connect(path, "mode=rw")
@@ -102,7 +97,7 @@ def check_file(path: Path, connection: sqlite3.Connection) -> None:
         raise RunError(damaged(path, str(found).splitlines()[-1]))
 
 
-class _Connection(sqlite3.Connection):
+class Connection(sqlite3.Connection):
     """A connection that closes on garbage collection; Python 3.13 warns of unclosed ones."""
 
     def __del__(self) -> None:
@@ -112,7 +107,7 @@ class _Connection(sqlite3.Connection):
 
 def _connect(path: Path, options: str) -> sqlite3.Connection:
     connection = sqlite3.connect(
-        f"{path.absolute().as_uri()}?{options}", uri=True, factory=_Connection
+        f"{path.absolute().as_uri()}?{options}", uri=True, factory=Connection
     )
     connection.execute("PRAGMA trusted_schema = OFF")
     connection.execute("PRAGMA cell_size_check = ON")

@@ -35,6 +35,7 @@ from livepde.dates import with_epoch, without_epoch
 from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import RunError
 from livepde.identifier import Identifier
+from livepde.runs.database import DAMAGE
 from livepde.runs.journal import Journal
 from livepde.runs.run_verdict import verdict, verdict_table
 from livepde.runs.summary import arrivals, tables
@@ -158,12 +159,6 @@ def run_names(folder: Path) -> list[str]:
     return sorted(item.parent.name for item in folder.glob(f"*/{RECORD}"))
 
 
-def _refuse_links(path: Path) -> None:
-    for item in path.iterdir():
-        if item.is_symlink():
-            raise RunError(f"{item} is a link: a run is resumed in regular files only.")
-
-
 @contextmanager
 def _room_to_write(folder: Path) -> Iterator[None]:
     """Turn an `OSError` of writing into a folder into a `RunError` with the remedy."""
@@ -176,12 +171,12 @@ def _room_to_write(folder: Path) -> Iterator[None]:
         raise RunError(f"{folder} cannot be written: {why}") from error
 
 
+@dataclass(eq=False, repr=False)
 class RunWriter:
     """Writer of a run directory: a new or empty folder, or that of a run to resume."""
 
-    def __init__(self, path: Path, record: dict[str, Any]) -> None:
-        self.path = path
-        self.record = record
+    path: Path
+    record: dict[str, Any]
 
     @classmethod
     def create(
@@ -256,7 +251,9 @@ class RunWriter:
         Raises `RunError`: there is no such run, or it was of another case.
         """
         run = open_run(path)
-        _refuse_links(path)
+        for item in path.iterdir():
+            if item.is_symlink():
+                raise RunError(f"{item} is a link: a run is resumed in regular files only.")
         run.refuse_other(command, case, settings)
         for left in filter(Path.is_file, path.glob(f"*{PARTIAL}")):  # by one that was killed
             left.unlink(missing_ok=True)
@@ -319,12 +316,12 @@ class RunWriter:
             write_text(self.path / RECORD, text + "\n")
 
 
+@dataclass(eq=False, repr=False)
 class Run:
     """A run that was written; open one with `livepde.runs.open(path)`."""
 
-    def __init__(self, path: Path, record: dict[str, Any]) -> None:
-        self.path = path
-        self.record = record
+    path: Path
+    record: dict[str, Any]
 
     @property
     def status(self) -> str:
@@ -377,14 +374,7 @@ class Run:
             with warnings.catch_warnings(action="error", category=xr.SerializationWarning):
                 raw = io.BytesIO(content)
                 return without_epoch(xr.load_dataset(raw, engine="scipy", decode_times=False))
-        except (
-            OSError,
-            ValueError,
-            TypeError,
-            LookupError,
-            MemoryError,
-            xr.SerializationWarning,
-        ) as error:
+        except (OSError, *DAMAGE, xr.SerializationWarning) as error:
             remedy = "run the case again, into another folder"
             if journal.is_file():
                 remedy = "delete it, so that they are read from the journal"
@@ -441,18 +431,23 @@ class Run:
         if not (self.path / CASE).is_file() or not begun:
             raise RunError(f"{self.path} has no case and journal: it cannot be resumed.")
         kept = (self.path / CASE).read_text(encoding="utf-8", errors="replace")
-        begun_with, now = map(_but_shift, (self.settings, settings))
+        # The correction of a clock may be another one.
+        begun_with, now = (
+            [one for one in given if one.partition("=")[0].strip() != "intake.shift"]
+            for given in (self.settings, settings)
+        )
         same = kept == case or _parts(kept)[0] == _parts(case)[0]
         if not same or begun_with != now:
             raise RunError(
                 f"{self.path} was run with another case or other settings. Resume it with these, "
                 "or choose another folder."
             )
-        named = _data_of(command)
-        if named != self.data_file:
+        files = self.data_file, _data_of(command)
+        if files[0] != files[1]:
+            before, other = (f"--data {d}" if d else "the data of its case" for d in files)
             raise RunError(
-                f"{self.path} was run with {_named(self.data_file)}, not with {_named(named)}: "
-                "resume it so, or choose another folder."
+                f"{self.path} was run with {before}, not with {other}: resume it so, or choose "
+                "another folder."
             )
 
     def arrivals(self) -> list[Table]:
@@ -559,11 +554,6 @@ def _parts(case: str) -> tuple[dict[str, Any], Any]:
     return document | ({"intake": intake} if intake else {}), shift
 
 
-def _but_shift(settings: Sequence[str]) -> list[str]:
-    """Return settings without that of the correction of a clock."""
-    return [one for one in settings if one.partition("=")[0].strip() != "intake.shift"]
-
-
 def markdown(
     title: str,
     shown: Iterable[Table],
@@ -572,17 +562,10 @@ def markdown(
     figures: Iterable[str] = (),
 ) -> str:
     """Return a report in Markdown."""
-    parts = [f"# {title}"]
-    parts += [table.markdown() for table in shown]
+    parts = [f"# {title}", *(table.markdown() for table in shown)]
     rows = [
-        (
-            check.name,
-            f"{check.value:.5g}",
-            check.sense,
-            check.bound_text,
-            "ok" if check.ok else "FAILED",
-        )
-        for check in checks
+        (one.name, f"{one.value:.5g}", one.sense, one.bound_text, "ok" if one.ok else "FAILED")
+        for one in checks
     ]
     if rows:
         parts.append(Table("Checks", ("number", "value", "", "bound", ""), rows).markdown())
@@ -626,7 +609,3 @@ def _data_of(command: Sequence[Any]) -> str | None:
         if word == "--data" and k + 1 < len(words) and words[k + 1] != "-":
             return words[k + 1]
     return None
-
-
-def _named(data: str | None) -> str:
-    return f"--data {data}" if data else "the data of its case"

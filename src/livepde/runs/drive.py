@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from livepde.errors import DataError
 from livepde.frames import layout_of
@@ -116,8 +117,7 @@ def drive(
     """
     from livepde.progress import watched
 
-    if journal is None:
-        journal = journal_of(identifier)
+    journal = journal_of(identifier) if journal is None else journal
     feed = SampleFeed(
         watched(stream, total) if progress else stream, identifier.observed.names, journal.last
     )
@@ -131,17 +131,15 @@ def drive(
 
 def journal_of(identifier: Identifier, path: Path | None = None) -> Journal:
     """Return a new journal for the samples and estimates of an identifier; no path: in memory."""
-    who = identifier
-    layout = layout_of(who.model, who.observed, who.validation, who.ignored)
+    model, observed = identifier.model, identifier.observed
+    layout = layout_of(model, observed, identifier.validation, identifier.ignored)
     return Journal.create(path, identifier.channels, layout)
 
 
-def _ends(stream: object) -> bool:
+def _ends(stream: Any) -> bool:
     """Return whether a stream is finite: a live one has no length."""
-    if not isinstance(stream, Sized):
-        return False
     try:
         len(stream)
-    except TypeError:  # of a stream that it wraps
+    except TypeError:  # of it, or of a stream that it wraps
         return False
     return True

@@ -48,6 +48,7 @@ LONG_NAMES = {
 }
 DIFFERENCES = ("innovation", "validation_error")
 CLOCKS = ("time", "snapshot")
+NO_LEAPS = "leap_seconds: none"
 SYMBOLS = {  # of pint -> of UDUNITS, where they differ
     "°C": "degC",
     "°F": "degF",
@@ -145,13 +146,22 @@ def cf(
     """
     found = bounded(data)
     names = free_names(str(name) for name in found.variables)
-    clock = _clock_attrs(str(data["time"].attrs.get("units", "")), data.attrs.get("origin"))
+    clock = str(data["time"].attrs.get("units", ""))
+    # Without a date, times are no time coordinate of CF, which counts from one: only the unit.
+    counted = since(clock, data.attrs.get("origin"))
+    about = _unit_attrs("time", clock)
+    if counted:
+        about = {"standard_name": "time", "axis": "T", **counted, "units_metadata": NO_LEAPS}
     for name in names:
-        _describe(found, name, clock)
+        _describe(found, name, about)
         beside = [names[other] for end in BESIDE if (other := f"{name}{end}") in found]
         if beside:
             found[name].attrs["ancillary_variables"] = " ".join(beside)
-    found.attrs = plain(data.attrs) | _name_lists(data, names)
+    state = str(data.attrs.get("state", "")).split()
+    lists = {"scalars": scalars(data), "fields": field_names(data), "state": state}
+    found.attrs = plain(data.attrs) | {
+        key: " ".join(names[name] for name in some if name in names) for key, some in lists.items()
+    }
     found.attrs |= {"Conventions": CONVENTIONS, "source": source, "history": history}
     found.attrs["title"] = str(data.attrs.get("title", "")) or title
     found = found.rename(names)
@@ -185,26 +195,6 @@ def free_names(wanted: Iterable[str]) -> dict[str, str]:
             free, number = f"{stem}_{number}", number + 1
         found[name] = free
     return found
-
-
-def _name_lists(data: xr.Dataset, names: Mapping[str, str]) -> dict[str, str]:
-    """Return the attributes that list variables, by their new names."""
-    state = str(data.attrs.get("state", "")).split()
-    lists = {"scalars": scalars(data), "fields": field_names(data), "state": state}
-    return {
-        key: " ".join(names[name] for name in some if name in names) for key, some in lists.items()
-    }
-
-
-def _clock_attrs(clock: str, origin: str | None) -> dict[str, str]:
-    """Return the CF attributes of times in a unit, counted from a date where the run has one.
-
-    Without a date they are no time coordinate of CF, which counts from one: they have a unit only.
-    """
-    counted = since(clock, origin)
-    if not counted:
-        return _unit_attrs("time", clock)
-    return {"standard_name": "time", "axis": "T", **counted, "units_metadata": "leap_seconds: none"}
 
 
 def _unit_attrs(name: str, own: str) -> dict[str, str]:

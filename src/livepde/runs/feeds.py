@@ -6,13 +6,12 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Protocol
-
-import numpy as np
 
 from livepde.samples import Sample, by_name
 from livepde.streams.intake import Intake, IntakeOutcome, Ready, Remark, gather
-from livepde.streams.sources import Row, RowSource
+from livepde.streams.sources import RowSource
 
 
 class Feed(Protocol):
@@ -68,45 +67,36 @@ class Feed(Protocol):
         return
 
 
+@dataclass(eq=False)
 class Gathered(Feed):
-    """Samples from the rows of a source, as an `Intake` puts them in order.
+    """Samples from the rows of a source, as an `Intake` puts them in order."""
 
-    `source`, `intake`: source of rows, and the intake that turns them into samples.
-    """
-
-    def __init__(self, source: RowSource, intake: Intake) -> None:
-        self.source = source
-        self.intake = intake
-        self._heard = False
-        self._remarks: list[Remark] = []
-        self._rows = 0  # a token is the number of the row, and what the source gave with it
-        self._flushed = False
-
-    @property
-    def done(self) -> bool:
-        """True when the source has ended and all its samples were returned."""
-        return self._flushed
+    source: RowSource
+    intake: Intake
+    done: bool = field(default=False, init=False)
+    _heard: bool = field(default=False, init=False)
+    _remarks: list[Remark] = field(default_factory=list, init=False)
+    # Number of rows so far; a token is the number of the row, and what the source gave with it.
+    _rows: int = field(default=0, init=False)
 
     def poll(self, wait: float) -> Sequence[Ready]:
-        """Return the samples that are ready."""
         rows = self.source.poll(wait)
         received = time.monotonic()
         self._heard |= bool(rows)
         found: list[Ready] = []
         for row in rows:
             self._rows += 1
-            found += self._used(self._outcome(row, (self._rows, row.token), received))
-        if self.source.done and not self._flushed:
-            self._flushed = True
+            token = self._rows, row.token
+            outcome = IntakeOutcome(spent=[token])
+            if row.broken:
+                outcome.remark(row.kind, "", row.broken, token)
+            else:
+                outcome = self.intake.take(row.values, token, received)
+            found += self._used(outcome)
+        if self.source.done and not self.done:
+            self.done = True
             found += self._used(self.intake.flush())
         return found
-
-    def _outcome(self, row: Row, token: Any, received: float) -> IntakeOutcome:
-        if row.broken:
-            return IntakeOutcome(
-                remarks=[Remark(row.kind, "", row.broken, row=token)], spent=[token]
-            )
-        return self.intake.take(row.values, token, received)
 
     def _used(self, outcome: IntakeOutcome) -> list[Ready]:
         self._remarks += outcome.remarks
@@ -118,22 +108,18 @@ class Gathered(Feed):
         return [*(token for ready in waiting for token in ready.tokens), *self.intake.waiting]
 
     def heard(self) -> bool:
-        """Return whether a row has come since the last call."""
         heard, self._heard = self._heard, False
         return heard
 
     @property
     def interval(self) -> float:
-        """Seconds of a usual step, and for which a sample waits for its channels."""
         return self.intake.interval if self.source.steady else math.inf
 
     @property
     def doubt(self) -> str:
-        """Reason to doubt the clocks of the source."""
         return self.intake.why
 
     def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
-        """Return remarks on values refused, missing or out of order, each kind and channel once."""
         if not self._remarks:
             return ()
         first = min((number for number, _ in self._waiting(waiting)), default=math.inf)
@@ -148,19 +134,15 @@ class Gathered(Feed):
         return list(found.values())
 
     def position(self, waiting: Sequence[Ready]) -> str:
-        """Return the position of the source before these samples, which are still to be taken."""
         return self.source.position(_given(self._waiting(waiting)))
 
     def acknowledge(self, ready: Ready) -> None:
-        """Acknowledge the rows of a sample to the source."""
         self.source.acknowledge(_given(ready.tokens))
 
     def withdraw(self, last: float) -> None:
-        """Withdraw samples later than a time from the intake."""
         self.intake.withdraw(last)
 
     def close(self) -> None:
-        """Close the source."""
         self.source.close()
 
 
@@ -169,109 +151,78 @@ def _given(tokens: Iterable[Any]) -> list[Any]:
     return [token for _, token in tokens]
 
 
+@dataclass(eq=False)
 class SampleFeed(Feed):
-    """Feed of samples that are in order already: a table, or any iterable of samples.
+    """Feed of samples that are in order already: a table, or any iterable of samples."""
 
-    `names`: sensors whose values an array z holds.
-    `after`: time of the last sample taken before; samples up to it are skipped.
-    """
+    samples: Iterable[Sample]
+    names: Sequence[str] = ()  # sensors whose values an array z holds
+    after: float = -math.inf  # time of the last sample taken before; samples up to it are skipped
+    done: bool = field(default=False, init=False)
 
-    def __init__(
-        self, samples: Iterable[Sample], names: Sequence[str] = (), after: float = -np.inf
-    ) -> None:
-        self._samples = iter(samples)
-        self._names = names
-        self._after = after
-        self._done = False
-
-    @property
-    def done(self) -> bool:
-        """True when all samples were returned."""
-        return self._done
+    def __post_init__(self) -> None:
+        self._left = iter(self.samples)
 
     def poll(self, wait: float) -> Sequence[Ready]:
-        """Return the next sample."""
-        for sample in self._samples:
-            if sample.t > self._after:
-                return [Ready(t=sample.t, values=self._values(sample), tokens=())]
-        self._done = True
+        for sample in self._left:
+            if sample.t > self.after:
+                values = {**by_name(sample.z, self.names), **(sample.inputs or {})}
+                return [Ready(t=sample.t, values=values)]
+        self.done = True
         return []
 
-    def _values(self, sample: Sample) -> dict[str, float]:
-        return {**by_name(sample.z, self._names), **(sample.inputs or {})}
 
-
+@dataclass(eq=False)
 class Paced(Feed):
-    """Samples of the past, replayed at the pace of their times.
+    """Samples of the past, replayed at the pace of their times."""
 
-    `feed`: the feed whose samples are replayed.
-    `pace`: model time that passes in one second.
-    `clock`, `sleep`: functions that return the time and wait, both in seconds.
-    """
-
-    def __init__(
-        self,
-        feed: Feed,
-        pace: float,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
-        self.feed = feed
-        self.pace = pace
-        self._clock = clock
-        self._sleep = sleep
-        self._held: deque[Ready] = deque()
-        self._begun: tuple[float, float] | None = None
+    feed: Feed  # whose samples are replayed
+    pace: float  # model time that passes in one second
+    clock: Callable[[], float] = time.monotonic
+    sleep: Callable[[float], None] = time.sleep
+    _held: deque[Ready] = field(default_factory=deque, init=False)  # until they are due
+    _begun: tuple[float, float] | None = field(default=None, init=False)
 
     @property
     def done(self) -> bool:
-        """True when the last sample was returned."""
         return self.feed.done and not self._held
 
     def poll(self, wait: float) -> Sequence[Ready]:
-        """Return the samples that are due at the pace of the replay."""
         if not self._held:
             self._held.extend(self.feed.poll(wait))
         if not self._held:
             return []
-        now, first = self._clock(), self._held[0].t
+        now, first = self.clock(), self._held[0].t
         begun = self._begun or (now, first)
         self._begun = begun
         # A sample of time t is due (t - t_0) / pace seconds after the first one.
         due = begun[0] + (first - begun[1]) / self.pace
         if due > now:
-            self._sleep(min(wait, due - now))
-        passed = begun[1] + (self._clock() - begun[0]) * self.pace
+            self.sleep(min(wait, due - now))
+        passed = begun[1] + (self.clock() - begun[0]) * self.pace
         found = []
         while self._held and self._held[0].t <= passed:
             found.append(self._held.popleft())
         return found
 
     def heard(self) -> bool:
-        """Return whether rows have come, or samples are held until they are due."""
         return self.feed.heard() or bool(self._held)
 
     @property
     def doubt(self) -> str:
-        """Reason to doubt the times of the feed."""
         return self.feed.doubt
 
     def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
-        """Return the counts of remarks."""
         return self.feed.remarks([*waiting, *self._held])
 
     def position(self, waiting: Sequence[Ready]) -> str:
-        """Return the position of the source before these samples and those held."""
         return self.feed.position([*waiting, *self._held])
 
     def acknowledge(self, ready: Ready) -> None:
-        """Acknowledge a sample to the feed."""
         self.feed.acknowledge(ready)
 
     def withdraw(self, last: float) -> None:
-        """Withdraw from the feed samples later than a time, or than the last one held."""
         self.feed.withdraw(self._held[-1].t if self._held else last)
 
     def close(self) -> None:
-        """Close the feed."""
         self.feed.close()

@@ -39,11 +39,11 @@ from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Snapshot
 from livepde.runs.database import (
     AGAIN,
     SCHEMA,
+    Connection,
     check_file,
     checksum,
     damaged,
     fill,
-    in_memory,
     locked,
     reader,
     released,
@@ -65,6 +65,7 @@ KEPT_EVENTS = 10_000
 FEW = 64  # samples that are compared to recognise a repeated row
 TOGETHER = 1000  # estimates that are read at once: a slow reader must not hold up the writer
 LONGEST = 2000  # characters of the message of an event
+UNLESS_KNOWN = "INSERT OR IGNORE"  # a record with the same key stays as it is
 
 ESTIMATES = (
     "SELECT id, t, status, steps, numbers, notes, estimates.crc, last, content, fields.crc "
@@ -150,7 +151,7 @@ class Journal:
             "layout": json.dumps(layout.to_dict()),
         }
         if path is None:
-            connection = in_memory()
+            connection = sqlite3.connect(":memory:", factory=Connection)
             fill(connection, meta)
             return cls(MEMORY, connection, None)
         lock = locked(path)
@@ -194,11 +195,11 @@ class Journal:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _write(self, action: Callable[..., Any], *arguments: Any) -> Any:
+    def _write(self, action: Callable[..., object], *arguments: Any) -> None:
         if self._failure:
             raise RunError(self._failure)
         try:
-            return action(*arguments)
+            action(*arguments)
         except sqlite3.Error as error:
             self._fail(error)
             raise RunError(self._failure) from error
@@ -234,9 +235,8 @@ class Journal:
         self._failure = self._remedy = ""
         self._stand()
 
-    def _execute(self, command: str, *values: Any) -> sqlite3.Cursor:
-        cursor: sqlite3.Cursor = self._write(self._db.execute, command, values)
-        return cursor
+    def _execute(self, command: str, *values: Any) -> None:
+        self._write(self._db.execute, command, values)
 
     def _read(self, command: str, *values: Any) -> list[Any]:
         try:
@@ -275,9 +275,9 @@ class Journal:
         self._insert("samples", self._newest, float(t), channels, position)
         self._current = self._newest
 
-    def _insert(self, table: str, *values: Any, conflict: str = "") -> None:
+    def _insert(self, table: str, *values: Any, verb: str = "INSERT", conflict: str = "") -> None:
         places = ", ".join("?" * (len(values) + 1))
-        command = f"INSERT INTO {table} VALUES ({places}) {conflict}"
+        command = f"{verb} INTO {table} VALUES ({places}) {conflict}"
         self._execute(command, *values, checksum(table, *values))
 
     def extend(self, rows: Iterable[tuple[Array, Record]], state: bytes) -> None:
@@ -292,16 +292,13 @@ class Journal:
 
     def withdraw(self) -> None:
         """Withdraw the last sample, which the identifier could not use."""
-        self._forget(self._current)
+        for table in ("samples", "estimates", "fields", "checkpoints", "tries"):
+            self._execute(f"DELETE FROM {table} WHERE id = ?", self._current)
+        # The newest number is used again; before later samples a gap remains.
+        if self._current == self._newest:
+            self._newest -= 1
         self._write(self._db.commit)
         self._current = self._last
-
-    def _forget(self, number: int) -> None:
-        for table in ("samples", "estimates", "fields", "checkpoints", "tries"):
-            self._execute(f"DELETE FROM {table} WHERE id = ?", number)
-        # The newest number is used again; before later samples a gap remains.
-        if number == self._newest:
-            self._newest -= 1
 
     def mark(self) -> int:
         """Count and commit one more try of the last sample; return the number of tries."""
@@ -332,7 +329,7 @@ class Journal:
             record.steps,
             b"".join(np.asarray(values, dtype=float).tobytes() for values in found),
             json.dumps(dict(record.notes)),
-            conflict="ON CONFLICT (id) DO NOTHING",
+            verb=UNLESS_KNOWN,
         )
         if record.snapshot is not None:
             self.keep(record.snapshot, number)
@@ -348,7 +345,7 @@ class Journal:
 
     def checkpoint(self, state: bytes) -> None:
         """Keep the identifier's state after the last estimated sample, and commit."""
-        self._insert("checkpoints", self._last, state, conflict="ON CONFLICT (id) DO NOTHING")
+        self._insert("checkpoints", self._last, state, verb=UNLESS_KNOWN)
         # The older checkpoint is kept because `rewind` needs it if the newer one is damaged.
         self._execute(
             "DELETE FROM checkpoints WHERE id NOT IN "
@@ -374,8 +371,7 @@ class Journal:
 
     def _say(self, key: str, value: str) -> None:
         """Set a value of the header."""
-        conflict = "ON CONFLICT (key) DO UPDATE SET value = excluded.value, crc = excluded.crc"
-        self._insert("meta", key, value, conflict=conflict)
+        self._insert("meta", key, value, verb="REPLACE")
 
     def say_health(self, why: str) -> None:
         """Store and commit the reason why the run is not well; empty if it is."""
@@ -384,8 +380,7 @@ class Journal:
 
     def judge(self, verdict: Mapping[str, Any]) -> None:
         """Store the verdict on the run so far, as `Verdict.to_dict` returns it."""
-        conflict = "ON CONFLICT (id) DO UPDATE SET content = excluded.content, crc = excluded.crc"
-        self._insert("verdicts", 1, json.dumps(verdict), conflict=conflict)
+        self._insert("verdicts", 1, json.dumps(verdict), verb="REPLACE")
 
     @property
     def verdict(self) -> str:
@@ -398,8 +393,7 @@ class Journal:
         message = event.message[:LONGEST].encode(errors="replace").decode()
         told = (float(event.t), event.kind, event.channel, message)
         self._execute(
-            "INSERT INTO events (t, kind, channel, message, crc) VALUES (?, ?, ?, ?, ?) "
-            "ON CONFLICT DO NOTHING",
+            f"{UNLESS_KNOWN} INTO events (t, kind, channel, message, crc) VALUES (?, ?, ?, ?, ?)",
             *told,
             checksum("events", *told),
         )
@@ -408,10 +402,8 @@ class Journal:
         """Add to the count of a kind of remark that does not deserve an event each time."""
         known = "SELECT number FROM counts WHERE kind = ? AND channel = ?"
         before = self._read(known, kind, channel)
-        conflict = "ON CONFLICT (kind, channel) DO UPDATE SET number = excluded.number, "
-        conflict += "crc = excluded.crc"
         total = number + (int(before[0][0]) if before else 0)
-        self._insert("counts", kind, channel, total, conflict=conflict)
+        self._insert("counts", kind, channel, total, verb="REPLACE")
 
     # --- reading -------------------------------------------------------------------------------
 
@@ -487,12 +479,9 @@ class Journal:
 
     def readings(self, names: Sequence[str]) -> tuple[Array, Array]:
         """Return times and values of channels in all samples, (samples,), (samples, channels)."""
-        rows = [
-            (one.t, [one.values.get(name, math.nan) for name in names])
-            for one in self._samples("ORDER BY id")
-        ]
-        values = np.array([row for _, row in rows]).reshape(len(rows), len(names))
-        return np.array([t for t, _ in rows]), values
+        found = [*self._samples("ORDER BY id")]
+        values = np.array([[one.values.get(name, math.nan) for name in names] for one in found])
+        return np.array([one.t for one in found]), values.reshape(len(found), len(names))
 
     def values(self, first: int, last: int) -> Iterator[tuple[int, dict[str, float]]]:
         """Iterate over numbers and values of the samples from one to another."""
@@ -527,17 +516,16 @@ class Journal:
         `samples` then yields the samples after it, which have to be taken again.
         """
         numbers = [n for (n,) in self._read("SELECT id FROM checkpoints ORDER BY id DESC")]
-        number, state = 0, None
-        for number in numbers:
-            state = self._state(number)
+        number, state = 0, None  # without a checkpoint all samples are taken again
+        for one in numbers:
+            state = self._state(one)
             if state is not None:
+                number = one
                 break
             # A damaged one is deleted, since its number may be needed for a new checkpoint.
-            self._execute("DELETE FROM checkpoints WHERE id = ?", number)
-        if state is None and numbers:
-            if "thinned" in self._meta() or self.first is None:
-                raise RunError(damaged(self.path, "no checkpoint is as it was"))
-            number = 0  # all samples are taken again
+            self._execute("DELETE FROM checkpoints WHERE id = ?", one)
+        if state is None and numbers and ("thinned" in self._meta() or self.first is None):
+            raise RunError(damaged(self.path, "no checkpoint is as it was"))
         if numbers and number < numbers[0]:
             LOG.warning("%s: the newest checkpoint is damaged: went back further", self.path)
         self._execute("DELETE FROM fields WHERE last")  # later samples will have others
@@ -558,20 +546,17 @@ class Journal:
         """Iterate over the samples after the last estimated one."""
         # One query for each sample: between two of them the caller writes estimates, and may
         # withdraw a sample.
-        while (
-            found := next(self._samples("WHERE id > ? ORDER BY id LIMIT 1", self._current), None)
-        ) is not None:
+        next_one = "WHERE id > ? ORDER BY id LIMIT 1"
+        while found := next(self._samples(next_one, self._current), None):
             self._current = found.id
             yield found
 
     def taken(self) -> Iterator[Taken]:
         """Iterate over all accepted samples that are kept."""
-        number, found = 0, True
-        while found:
-            found = False
-            for taken in self._samples("WHERE id > ? ORDER BY id LIMIT ?", number, TOGETHER):
-                number, found = taken.id, True
-                yield taken
+        number = 0
+        while found := [*self._samples("WHERE id > ? ORDER BY id LIMIT ?", number, TOGETHER)]:
+            yield from found
+            number = found[-1].id
 
     def _samples(self, which: str, *values: Any) -> Iterator[Taken]:
         rows = self._read(f"SELECT * FROM samples {which}", *values)
@@ -579,9 +564,8 @@ class Journal:
             with sound(self.path):
                 if len(channels) not in (8 * len(self.channels), 16 * len(self.channels)):
                     raise ValueError(f"sample {number} has not the size of the others")
-                taken = Taken(
-                    id=number, t=float(t), values=self._named(np.frombuffer(channels).tolist())
-                )
+                named = self._named(np.frombuffer(channels).tolist())
+                taken = Taken(id=number, t=float(t), values=named)
             yield taken
 
     def _named(self, row: Sequence[float]) -> dict[str, float]:
@@ -610,38 +594,29 @@ class Journal:
 
     def _estimate(self, row: Sequence[Any]) -> Record:
         """Return an estimate with its fields, after verifying both checksums."""
-        number = row[0]
-        ((_, *content),) = self._sound("estimates", [row[:7]])
-        fields = None
+        ((number, t, status, steps, numbers, notes),) = self._sound("estimates", [row[:7]])
+        content = None
         if row[9] is not None:
-            ((_, _, fields),) = self._sound("fields", [(number, *row[7:])])
-        with sound(self.path):
-            parts: list[Any] = [*content, fields]
-            return self._record(*parts)
-
-    def _record(
-        self, t: float, status: int, steps: int, numbers: bytes, notes: str, content: bytes | None
-    ) -> Record:
+            ((_, _, content),) = self._sound("fields", [(number, *row[7:])])
         layout = self.layout
         sizes = [len(layout.numbers), len(layout.sensors), len(layout.validation or ())]
-        values = np.frombuffer(numbers)
-        snapshot = None if content is None else Snapshot.from_bytes(content)
-        lengths = set() if snapshot is None else {len(x) for x in snapshot.profiles.values()}
-        if len(values) != sum(sizes) or lengths - {self._vertices}:
-            raise ValueError(f"the estimate at t = {t} has not the size of the others")
-        found, innovation, error, _ = np.split(values, np.cumsum(sizes))
-        found_notes = {str(name): float(number) for name, number in json.loads(notes).items()}
-        code = STATUS_CODES.index(STATUS_CODES[status])
-        return Record(
-            t=float(t),
-            numbers=found,
-            innovation=innovation,
-            validation_error=error,
-            status=code,
-            steps=int(steps),
-            notes=found_notes,
-            snapshot=snapshot,
-        )
+        with sound(self.path):
+            values = np.frombuffer(numbers)
+            snapshot = None if content is None else Snapshot.from_bytes(content)
+            lengths = set() if snapshot is None else {len(x) for x in snapshot.profiles.values()}
+            if len(values) != sum(sizes) or lengths - {self._vertices}:
+                raise ValueError(f"the estimate at t = {t} has not the size of the others")
+            found, innovation, error, _ = np.split(values, np.cumsum(sizes))
+            return Record(
+                t=float(t),
+                numbers=found,
+                innovation=innovation,
+                validation_error=error,
+                status=STATUS_CODES.index(STATUS_CODES[status]),
+                steps=int(steps),
+                notes={str(name): float(value) for name, value in json.loads(notes).items()},
+                snapshot=snapshot,
+            )
 
     def dataset(self) -> xr.Dataset:
         """Return the estimates as a dataset; see `Result.to_xarray`."""

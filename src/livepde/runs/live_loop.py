@@ -123,7 +123,7 @@ def _merged(samples: Sequence[Ready]) -> Ready:
             if np.isfinite(value):
                 values.setdefault(channel, []).append(value)
     mean = {channel: float(np.mean(several)) for channel, several in values.items()}
-    tokens = tuple(t for sample in samples for t in sample.tokens)
+    tokens = [token for sample in samples for token in sample.tokens]
     return Ready(t=samples[-1].t, values=mean, tokens=tokens)
 
 
@@ -235,7 +235,6 @@ class Live:
         }
         self._waiting = deque(begun)
         self._counts = Counter(journal.counts)
-        self._remarked = set(self._counts)
         self._uncounted: deque[Remark] = deque()
         self._events: deque[Event] = deque(maxlen=RECENT)
         self._steps = 0
@@ -388,15 +387,8 @@ class Live:
     def _read(self) -> Result:
         """Return the result that reads estimates from the journal."""
         who, kept = self.identifier, self.journal
-        return Result(
-            who.model,
-            who.observed,
-            who.validation,
-            self.fields_every,
-            kept,
-            layout=kept.layout,
-            count=kept.estimated,
-        )
+        parts = who.model, who.observed, who.validation
+        return Result(*parts, self.fields_every, kept, layout=kept.layout, count=kept.estimated)
 
     def run(self) -> None:
         """Run until the source ends or `stopping` is set, and keep a final checkpoint."""
@@ -546,9 +538,9 @@ class Live:
             if remark.kind in UNUSED:
                 self._refused += remark.number
                 self._refusal = f"{remark.kind}: {remark.message}"
+            first = (remark.kind, remark.channel) not in self._counts
             self._counts[remark.kind, remark.channel] += remark.number
-            if remark.kind == "clock" or (remark.kind, remark.channel) not in self._remarked:
-                self._remarked.add((remark.kind, remark.channel))
+            if first or remark.kind == "clock":
                 self._tell(remark.kind, remark.message, remark.channel)
             self.journal.count(remark.kind, remark.channel, remark.number)
 

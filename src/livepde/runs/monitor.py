@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TextIO
 
 from livepde import __version__
@@ -51,11 +52,11 @@ def configure(kind: str = "text", level: int = logging.INFO) -> None:
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)
 
 
+@dataclass(eq=False)
 class JsonLinesSink(Sink):
     """Each estimate as a line of JSON, as `Estimate.to_dict` has it."""
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+    stream: TextIO
 
     def put(self, estimate: Estimate) -> None:
         """Write one estimate.
@@ -64,17 +65,14 @@ class JsonLinesSink(Sink):
         """
         line = json.dumps(estimate.to_dict(), allow_nan=False)
         try:
-            print(line, file=self._stream, flush=True)
+            print(line, file=self.stream, flush=True)
         except OSError:
-            self._abandon()
+            # To the null device from now on: flushing the buffer at exit would fail again.
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            with suppress(OSError):
+                os.dup2(nowhere, self.stream.fileno())
+            os.close(nowhere)
             raise
-
-    def _abandon(self) -> None:
-        """Redirect the stream to the null device: flushing its buffer at exit would fail again."""
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        with suppress(OSError):
-            os.dup2(nowhere, self._stream.fileno())
-        os.close(nowhere)
 
 
 class Metrics(Sink):
@@ -117,7 +115,6 @@ class Metrics(Sink):
         self._failed = Counter("livepde_failed_steps", "Steps that failed", registry=self.registry)
 
     def put(self, estimate: Estimate) -> None:
-        """Publish one estimate."""
         for label, (value, std) in estimate.parameters.items():
             self._estimate.labels(label).set(value)
             self._deviation.labels(label).set(std)
@@ -131,17 +128,16 @@ class Metrics(Sink):
             self._failed.inc()
 
 
+@dataclass(frozen=True, eq=False)
 class _Health:
     """Collector of metrics from the health of a run at the time of each request."""
 
-    def __init__(self, health: Callable[[], Mapping[str, Any]]) -> None:
-        self._health = health
+    health: Callable[[], Mapping[str, Any]]
 
     def collect(self) -> Iterator[Metric]:
-        """Return the metrics."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-        found = self._health()
+        found = self.health()
         for name, key, text in (
             ("ok", "ok", "1 while samples arrive, are accepted, and steps succeed"),
             ("silent", "silent", "1 while no data arrive from the source"),
@@ -169,7 +165,7 @@ class _Health:
         yield remarks
 
 
-class Monitor:
+class Monitor(Server):
     """Serves /livez, /readyz, /health and /metrics from its own threads.
 
     /livez answers 200 as long as the process does, /readyz and /health while the run goes well,
@@ -189,10 +185,7 @@ class Monitor:
         self._health = health
         metrics.registry.register(_Health(health))
         self._metrics = make_wsgi_app(metrics.registry)
-        self._server = Server(self._answer, address)
-        self.url = self._server.url
-        self.shown = self._server.shown
-        self.port = self._server.port
+        super().__init__(self._answer, address)
 
     def _answer(self, environ: WSGIEnvironment, start: StartResponse) -> Iterable[bytes]:
         path = environ.get("PATH_INFO", "/")
@@ -214,7 +207,3 @@ class Monitor:
             return [f"{waits or 'ok'}\n".encode()]
         start(code, [("Content-Type", "application/json")])
         return [json.dumps(found).encode()]
-
-    def close(self) -> None:
-        """Stop listening."""
-        self._server.close()

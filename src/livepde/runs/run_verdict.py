@@ -50,6 +50,7 @@ WANDERS = 0.3  # scatter of an estimate over its change since the first: it foll
 SHORTEST = 20  # values at least to tell whether an estimate wanders
 LEFT_OUT = 0.25  # of a field's mean variance is that of modes that the law leaves out
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
+AFTER = " The state is re-estimated from there on. The unknowns are kept."
 INPUT_KINDS = {
     "start": "first values were outliers and count as missing",
     "spike": "spikes were rejected",
@@ -62,17 +63,7 @@ INPUT_KINDS = {
 
 
 def findings_of(data: xr.Dataset, *, judged: bool) -> list[Finding]:
-    """Return the findings from the dataset of a run.
-
-    A finding is: an unknown that ends at a bound, or keeps more than 0.9 of its prior standard
-    deviation, so that the data were not informative; a gate that refused more than 2 % of the
-    readings; guards that gave up samples, restarted, or held unknowns that nothing excited; with a
-    fixed gain, an estimate that scatters in the last half of a run by more than 0.3 of its change
-    since the first sample; latent values held at the limits of their prior; a field of whose mean
-    variance more than a quarter is that of modes that the law leaves out; time step, mesh and
-    linear interpolation of inputs that together shifted an unknown by more than two standard
-    deviations; a jump; and, if no law has judged the innovations, a mean square of the last 500 of
-    more than four times its expected value.
+    """Return the findings from the dataset of a run; each function below describes its own.
 
     `judged`: whether the law has judged innovations and refused readings itself.
     """
@@ -109,13 +100,11 @@ def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
         if not parts:
             continue
         held = (counts.get("missing", 0) + counts.get("ended", 0)) / max(len(journal), 1)
-        sentence = FINDINGS["input, counts"]
-        if counts.get("bridged"):
-            sentence = FINDINGS["input, bridged"]
-        elif counts.get("ended"):
-            sentence = FINDINGS["input, ended"]
+        kind = next((kind for kind in ("bridged", "ended") if counts.get(kind)), "counts")
         skip = channel_setting(name, "missing", '"skip"')
-        text, remedy = sentence.filled(name=name, counts=", ".join(parts), skip=skip)
+        text, remedy = FINDINGS[f"input, {kind}"].filled(
+            name=name, counts=", ".join(parts), skip=skip
+        )
         found.append(Finding("input", "note", text, name, held, remedy=remedy))
     return found
 
@@ -144,10 +133,10 @@ def sampling_findings(
     It is called if there is a pause. Without it a leap of the clock is called a pause.
     """
     t, found = data["time"].values, list[Finding]()
-    leaps, breaks = {}, pauses(t)
+    leaps, breaks = list[float](), pauses(t)
     if breaks and readings is not None:
         all_times, values = readings()
-        leaps = {leap.t: leap for leap in clock_leaps(all_times, values, pauses(all_times))}
+        leaps = clock_leaps(all_times, values, pauses(all_times))
     anchors = note(data, "residual") is None  # the gradient law has no covariance
     for k in breaks:
         usual = float(np.median(np.diff(t[:k])))
@@ -157,13 +146,11 @@ def sampling_findings(
         if factor := unit_factor(float(t[k - 1]), float(t[k]), usual, later):
             found.append(_unit_changed(k, at, factor))
             break  # of later steps nothing is known
-        after = " The state is re-estimated from there on. The unknowns are kept."
-        after = after if anchors else ""
+        after = AFTER if anchors else ""
         if float(t[k]) in leaps:
             found.append(_leapt(k, at, times, after))
             continue
-        sentence = FINDINGS["pause"]
-        text, _ = sentence.filled(times=times, at=at, count=length / usual, after=after)
+        text, _ = FINDINGS["pause"].filled(times=times, at=at, count=length / usual, after=after)
         found.append(Finding("pause", "note", text, "", length))
     return found
 
@@ -202,6 +189,7 @@ def _model_error(data: xr.Dataset) -> list[Finding]:
 
 
 def _refused(data: xr.Dataset) -> list[Sentence]:
+    """Return whether the gate refused more than a share `REFUSED` of the readings."""
     values = note(data, "refused")
     if values is None:
         return []
@@ -213,6 +201,7 @@ def _refused(data: xr.Dataset) -> list[Sentence]:
 
 
 def _unknowns(data: xr.Dataset) -> list[Finding]:
+    """Return unknowns at a bound, and those of which the data told little more than the prior."""
     found = []
     for label in scalars(data):
         attrs: dict[Any, Any] = data[label].attrs
@@ -274,6 +263,7 @@ def _jumps(data: xr.Dataset) -> list[Sentence]:
 
 
 def _guards(data: xr.Dataset) -> list[Sentence]:
+    """Return whether guards gave up samples, or restarted the law."""
     tempered, held = _times(data, "tempered"), _times(data, "held")
     restarted, runaway = _times(data, "restarted"), _times(data, "runaway")
     found = list[Sentence]()
@@ -319,15 +309,15 @@ def _last(data: xr.Dataset, name: str) -> float:
     return math.nan if values is None else float(values[-1])
 
 
-def _times(data: xr.Dataset, name: str, more: float = 0.0) -> Array:
-    """Return the times of the samples whose note is larger than a number."""
+def _times(data: xr.Dataset, name: str) -> Array:
+    """Return the times of the samples whose note is positive."""
     values = note(data, name)
-    found: Array = data["time"].values[[] if values is None else values > more]
+    found: Array = data["time"].values[[] if values is None else values > 0.0]
     return found
 
 
 def _gain(data: xr.Dataset) -> list[Sentence]:
-    """Return the findings on a law with a fixed gain, which has no covariance."""
+    """Return the estimates that wander, of a law with a fixed gain, which has no covariance."""
     if note(data, "residual") is None or note(data, "gain") is not None:
         return []
     names = [*scalars(data), *field_names(data)]
@@ -359,18 +349,17 @@ def verdict(data: xr.Dataset) -> Verdict:
     """
     stored = data.attrs.get("verdict")
     # A stored verdict counts the steps of all samples, of which a dataset may hold a part.
-    own = Verdict.from_dict(json.loads(stored)) if stored else _steps(data)
+    if stored:
+        own = Verdict.from_dict(json.loads(stored))
+    else:
+        codes = data["status"].values.astype(int)
+        counts = np.bincount(codes, minlength=len(STATUS_CODES)).tolist()
+        own = Verdict.unjudged().with_findings(
+            step_findings(dict(zip(STATUS_CODES, counts, strict=True)))
+        )
     if not data.sizes["time"]:
         return own
     return own.with_findings(findings_of(data, judged=own.judged))
-
-
-def _steps(data: xr.Dataset) -> Verdict:
-    """Return the findings on the steps of a run that has stored no verdict."""
-    codes = data["status"].values.astype(int)
-    counts = np.bincount(codes, minlength=len(STATUS_CODES)).tolist()
-    found = step_findings(dict(zip(STATUS_CODES, counts, strict=True)))
-    return Verdict.unjudged().with_findings(found)
 
 
 def verdict_table(found: Verdict) -> Table:

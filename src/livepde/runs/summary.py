@@ -150,18 +150,13 @@ def _grouped(channels: Mapping[str, ChannelErrors]) -> dict[str, ChannelErrors]:
     """Return the errors of all channels, pooled by role if there are too many for a table."""
     if len(channels) <= MOST_ROWS:
         return dict(channels)
-    roles: dict[str, list[str]] = {}
-    for name, item in channels.items():
-        roles.setdefault(item.role, []).append(name)
-    return {
-        f"{names[0]} ... {names[-1]}": ChannelErrors(
-            role,
-            np.concatenate([channels[name].errors for name in names]),
-            np.concatenate([channels[name].later for name in names]),
-            sum(channels[name].refused for name in names),
-        )
-        for role, names in roles.items()
-    }
+    found = {}
+    for role in dict.fromkeys(item.role for item in channels.values()):
+        names = [name for name, item in channels.items() if item.role == role]
+        _, errors, later, refused = zip(*(channels[name] for name in names), strict=True)
+        both = np.concatenate(errors), np.concatenate(later)
+        found[f"{names[0]} ... {names[-1]}"] = ChannelErrors(role, *both, sum(refused))
+    return found
 
 
 def rmse(errors: np.ndarray[Any, Any]) -> float:
@@ -213,13 +208,6 @@ def _interval(low: float, high: float, std: float) -> str:
     return f"{digits(low, std)[0]} to {digits(high, std)[0]}"
 
 
-def _deviations(data: xr.Dataset, label: str) -> float:
-    """Return the distance from the last estimate to the reference, in standard deviations."""
-    distance = abs(float(data[label][-1]) - float(data[label].attrs["reference"]))
-    std = float(data[f"{label}_std"][-1])
-    return distance / std if std else math.inf
-
-
 def measures(data: xr.Dataset) -> dict[str, float]:
     """Return the numbers of a run for which a case may state expected bounds, by name.
 
@@ -232,11 +220,12 @@ def measures(data: xr.Dataset) -> dict[str, float]:
     """
     found: dict[str, float] = {}
     for label in scalars(data) if data.sizes["time"] else ():
-        found[label] = float(data[label][-1])
-        found[f"{label}.std"] = float(data[f"{label}_std"][-1])
+        value, std = float(data[label][-1]), float(data[f"{label}_std"][-1])
+        found |= {label: value, f"{label}.std": std}
         if "reference" in data[label].attrs:
+            distance = abs(value - float(data[label].attrs["reference"]))
             found[f"{label}.error"] = relative_error(data, label)
-            found[f"{label}.deviations"] = _deviations(data, label)
+            found[f"{label}.deviations"] = distance / std if std else math.inf
     found |= _channel_measures(data)
     ratios = note(data, "innovation_ratio")
     if ratios is not None and len(ratios):
@@ -350,8 +339,9 @@ def _fields(data: xr.Dataset) -> Table:
         known = f"{name}_std" in data
         std = float(np.mean(data[f"{name}_std"].values[-1])) if known else math.nan
         numbers = [f"{number:.4g}" for number in (last.min(), last.mean(), last.max())]
-        unit = data[name].attrs.get("units", "")
-        rows.append((name, *numbers, shown(std, ".2g"), _left_out(data, name), unit))
+        share = float(data[f"{name}_left_out"][-1]) if f"{name}_left_out" in data else math.nan
+        left_out, unit = shown(100 * share, ".2g", " %"), data[name].attrs.get("units", "")
+        rows.append((name, *numbers, shown(std, ".2g"), left_out, unit))
     columns = ("field", "least", "mean", "largest", "mean std. dev.", "left-out modes", "unit")
     return Table(f"Estimated fields{_first_order(data, names)}", columns, rows)
 
@@ -388,12 +378,6 @@ def _channels(data: xr.Dataset) -> Table:
     more += ["/ noise"] if fitted else []
     columns = ("channel", "role", "RMSE", "2nd half", "mean", "samples", *more, "unit")
     return Table("Measured minus predicted, one step ahead", columns, rows)
-
-
-def _left_out(data: xr.Dataset, name: str) -> str:
-    """Return the share of a field's mean variance in modes that the law leaves out, as text."""
-    share = float(data[f"{name}_left_out"][-1]) if f"{name}_left_out" in data else math.nan
-    return shown(100 * share, ".2g", " %")
 
 
 def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:

@@ -32,10 +32,9 @@ class Discarded(io.BytesIO):
     """A body that is not kept."""
 
     def append(self, data: bytes) -> None:
-        """Take a piece."""
+        return
 
     def getfile(self) -> io.BytesIO:
-        """Return an empty file."""
         return self
 
     def __len__(self) -> int:
@@ -50,7 +49,6 @@ class Request(HTTPRequestParser):  # type: ignore[misc]
         self._refusal = refusal
 
     def parse_header(self, header_plus: bytes) -> None:
-        """Read the header."""
         super().parse_header(header_plus)
         if self.body_rcv is not None:
             header = {f"HTTP_{name}": value for name, value in self.headers.items()}
@@ -64,7 +62,6 @@ class Visitor(HTTPChannel):  # type: ignore[misc]
     begun = 0.0
 
     def parser_class(self, adj: Any) -> Request:
-        """Return a request that is to be read."""
         return Request(adj, self.server.refusal)
 
     def received(self, data: bytes) -> Any:
@@ -100,13 +97,11 @@ class Listener(TcpWSGIServer):  # type: ignore[misc]
                     visitor.socket.shutdown(socket.SHUT_RDWR)
 
     def handle_accept(self) -> None:
-        """Accept a connection."""
         if len(self.active_channels) >= ROOM:
-            here = self.active_channels.values()  # the oldest come first
-            idle = (v for v in here if not (v.requests or v.total_outbufs_len or v.will_close))
-            for visitor in idle:
-                visitor.will_close = True
-                break
+            for visitor in self.active_channels.values():  # the oldest come first
+                if not (visitor.requests or visitor.total_outbufs_len or visitor.will_close):
+                    visitor.will_close = True
+                    break
         super().handle_accept()
 
     def stop(self) -> None:

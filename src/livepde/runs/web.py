@@ -44,18 +44,15 @@ def _loopback(host: str) -> bool:
 class Address:
     """Where to listen, and who may ask.
 
-    `host`, `port`: interface and port; port 0: a free one.
-    `token`: secret of each visitor: `?token=...` once, or the header `Authorization: Bearer ...`.
-    On a loopback address none is required unless one is given; on any other address one is
-    generated if none is given.
-    Raises `RunError`: a token that does not fit into an address, or is too short for the world
-    outside.
+    A client sends the token as `?token=...` once, or in the header `Authorization: Bearer ...`. On
+    a loopback address none is required unless one is given; on any other address one is generated
+    if none is given.
     """
 
     host: str = "127.0.0.1"
-    port: int = 0
+    port: int = 0  # 0: a free one
     token: str = field(default="", repr=False)
-    made: bool = field(default=False, init=False)
+    made: bool = field(default=False, init=False)  # whether the token was generated
 
     def __post_init__(self) -> None:
         alone = _loopback(self.host)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, date, datetime, timedelta, tzinfo
@@ -259,20 +259,18 @@ def guessed_format(text: str) -> str:
 
 def _are_dates(cells: list[Any], clock: Clock, before: bool | None) -> bool:
     """Return whether times are dates: by the first; if it is neither, by those before, or most."""
-
-    def number(cell: Any) -> bool:
-        return number_of(cell, clock.decimal) is not None
-
     first = cells[0]
     if not isinstance(first, str):
         return isinstance(first, date)
     if clock.format:
         return True
-    if number(first) or clock.stamp(first) is not None:
-        return not number(first)
+    if number_of(first, clock.decimal) is not None:
+        return False
+    if clock.stamp(first) is not None:
+        return True
     if before is not None:
         return before
-    return 2 * sum(map(number, cells)) < len(cells)
+    return 2 * sum(number_of(cell, clock.decimal) is not None for cell in cells) < len(cells)
 
 
 def _remedy(cell: Any, clock: Clock, dates: bool) -> str:
@@ -357,8 +355,8 @@ class ChannelTimes:
     `recent`: times and values of the last samples of an earlier session.
     """
 
-    def __init__(self, recent: Iterable[tuple[float, Mapping[str, float]]] = ()) -> None:
-        self._known: dict[str, _Times] = {}
+    def __init__(self, recent: Iterable[tuple[float, Mapping[str, float]]]) -> None:
+        self._known: defaultdict[str, _Times] = defaultdict(_Times)
         for t, values in recent:
             self.use(t, values)
 
@@ -374,12 +372,12 @@ class ChannelTimes:
 
     def use(self, t: float, values: Mapping[str, float]) -> bool:
         """Note the time of a row that is used; return whether its clock was set back before."""
-        shown = [self._known.setdefault(name, _Times()).use(t) for name in present(values)]
+        shown = [self._known[name].use(t) for name in present(values)]
         return any(shown)
 
     def refuse(self, t: float, values: Mapping[str, float]) -> bool:
         """Note the time of a late row; return whether it shows first that its clock went back."""
-        shown = [self._known.setdefault(name, _Times()).refuse(t) for name in present(values)]
+        shown = [self._known[name].refuse(t) for name in present(values)]
         return any(shown)
 
     def withdraw(self, last: float) -> None:

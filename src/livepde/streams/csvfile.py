@@ -95,8 +95,7 @@ def read_csv(
         No such file or column; text or infinity in a channel; times that do not increase. The
         message names file, row (the header is row 1) and column.
     """
-    path = Path(path)
-    decimals = table.decimal_marks(columns)
+    path, decimals = Path(path), table.decimal_marks(columns)
     needed = list(dict.fromkeys([*clock.names, *decimals]))
     try:
         _check_text(path)
@@ -213,20 +212,7 @@ def how_written(path: str | Path, encoding: str = "", skip: int | None = None) -
 
     `encoding` and `skip` are used if they are known.
     """
-    lines, encoding = _first_lines(Path(path), encoding)
-    separator = _separator(lines[skip or 0 :])
-    if skip is None:
-        skip = _titles(lines, separator)
-    found = csv.reader(lines[skip:], delimiter=separator, skipinitialspace=True)
-    header, *rows = [*below_title(filter(None, found), list)] or [[]]
-    cells = [cell for row in rows for cell in row]
-    decimal = "," if any(map(has_decimal_comma, cells)) else "."
-    formats = _time_formats(header, rows, decimal)
-    return Written(separator, decimal, encoding, skip, formats, header, rows)
-
-
-def _first_lines(path: Path, encoding: str) -> tuple[list[str], str]:
-    """Return the first lines of a file, and its encoding: the given one, or a likely one."""
+    path = Path(path)
     try:
         _check_text(path)
         encoding = encoding or _likely(path.read_bytes(), UTF_8)
@@ -239,7 +225,16 @@ def _first_lines(path: Path, encoding: str) -> tuple[list[str], str]:
     # The last line may be cut off.
     whole = text if len(text) < LOOK else text.rpartition("\n")[0]
     # Not `splitlines`, which also splits at form feeds and at separators of Unicode in a cell.
-    return [line.rstrip("\n") for line in io.StringIO(whole, newline=None)], encoding
+    lines = [line.rstrip("\n") for line in io.StringIO(whole, newline=None)]
+    separator = _separator(lines[skip or 0 :])
+    if skip is None:
+        skip = _titles(lines, separator)
+    found = csv.reader(lines[skip:], delimiter=separator, skipinitialspace=True)
+    header, *rows = [*below_title(filter(None, found), list)] or [[]]
+    cells = [cell for row in rows for cell in row]
+    decimal = "," if any(map(has_decimal_comma, cells)) else "."
+    formats = _time_formats(header, rows, decimal)
+    return Written(separator, decimal, encoding, skip, formats, header, rows)
 
 
 def _time_formats(
@@ -267,16 +262,14 @@ def _separator(lines: Sequence[str]) -> str:
 
 def _titles(lines: Sequence[str], separator: str) -> int:
     """Return how many lines at the start have fewer cells than most, and are no header."""
-
-    def width(line: str) -> int:
-        row = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
-        return max((k for k, cell in enumerate(row, start=1) if cell.strip()), default=0)
-
-    widths = [width(line) for line in lines]
+    rows = [
+        next(csv.reader([line], delimiter=separator, skipinitialspace=True), []) for line in lines
+    ]
+    widths = list(map(_width, rows))
     # A title has fewer cells than most lines; of equally frequent widths the smaller one counts.
     usual = min(multimode(found for found in widths if found), default=0)
     start = next((k for k, found in enumerate(widths) if found >= usual), 0)
-    names = next(csv.reader(lines[start : start + 1], delimiter=separator), [])
+    names = rows[start] if rows else []
     titled = all(found <= 1 for found in widths[:start])
     if not titled or any(number_of(name.strip(), ",") is not None for name in names):
         return 0  # it is the header that is short
@@ -312,15 +305,17 @@ def _as_written(
     return " and ".join(filter(None, (", ".join(said[:-1]), said[-1])))
 
 
+def _width(cells: Sequence[str]) -> int:
+    """Return the number of cells up to the last one that is not empty."""
+    return max((k for k, cell in enumerate(cells, start=1) if cell.strip()), default=0)
+
+
 def too_wide(cells: list[str], header: list[str]) -> bool:
     """Return whether a row is longer than the header, and not only by empty fields.
 
     A separator at the end of each row, or of the header, is no field.
     """
-    if len(cells) <= len(header):
-        return False
-    named = max((k for k, name in enumerate(header, start=1) if name), default=0)
-    return any(cell.strip() for cell in cells[named:])
+    return len(cells) > len(header) and _width(cells) > _width(header)
 
 
 def _cells(
@@ -361,7 +356,7 @@ def _cells(
 
 def _check_names(path: Path, header: list[str], needed: list[str]) -> None:
     """Refuse a header without a needed column, or with two of its name."""
-    table.check_columns(str(path), needed, header, told=table.is_data(path))
+    table.check_columns(str(path), needed, header, told=path.suffix.lower() in table.SHOWN)
     for name in needed:
         if header.count(name) > 1:
             raise SampleError(f"{path}: two columns are called '{name}'; rename one.")

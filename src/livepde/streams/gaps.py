@@ -19,7 +19,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy  # scipy.interpolate and scipy.ndimage are slow to load, and rarely needed
@@ -47,17 +47,16 @@ GAUSS = 1.4826  # standard deviation over median absolute deviation of Gaussian 
 
 Series = Sequence[tuple[float, float]]
 """Times and known values of a channel, in order."""
+Waiting: TypeAlias = deque[tuple[Sample, dict[str, float]]]
+"""Samples that are not decided, with the values of the channels, NaN where missing."""
 
 
-class _Residuals(NamedTuple):
-    """Residuals of values to the cubic through two neighbours on each side."""
+def _residuals(t: Array, x: Array) -> tuple[Array, Array]:
+    """Return residuals of values to the cubic through two neighbours on each side, and weights.
 
-    size: Array  # shape (values - 4,), reduced where the neighbours are far away
-    weights: Array  # of the five values in each residual, shape (values - 4, 5)
-
-
-def _residuals(t: Array, x: Array) -> _Residuals:
-    """Return the residuals of at least five values."""
+    The residuals are reduced where the neighbours are far away, shape (values - 4,). The weights
+    are those of the five values in each, shape (values - 4, 5).
+    """
     window = np.lib.stride_tricks.sliding_window_view
     times, values = window(t, NEIGHBOURS), window(x, NEIGHBOURS)
     weights = np.ones(times.shape)
@@ -74,7 +73,7 @@ def _residuals(t: Array, x: Array) -> _Residuals:
     noise = np.sqrt((weights * weights).sum(axis=1))
     far = np.maximum(reach / np.median(reach), noise / np.median(noise))
     weights /= np.maximum(1.0, far)[:, None]
-    return _Residuals((weights * values).sum(axis=1), weights)
+    return (weights * values).sum(axis=1), weights
 
 
 def _curves(t: Array, x: Array) -> IntArray:
@@ -165,7 +164,8 @@ def _explains(t: Array, x: Array, suspect: int, largest: float) -> bool:
     about = np.delete(np.arange(first, min(suspect + ABOUT + 1, len(x))), suspect - first)
     if len(about) < NEIGHBOURS:
         return False
-    return bool((np.abs(_residuals(t[about], x[about]).size) <= largest).all())
+    size, _ = _residuals(t[about], x[about])
+    return bool((np.abs(size) <= largest).all())
 
 
 def bridged(t: float, past: Series, later: Series) -> float:
@@ -185,12 +185,12 @@ def bridged(t: float, past: Series, later: Series) -> float:
     return float(scipy.interpolate.PchipInterpolator(times, values)(t))
 
 
-def is_spike(past: Series, now: tuple[float, float], later: Series, beyond: float) -> bool:
-    """Return whether a value is a spike; False with fewer than two known values after it."""
-    if len(later) < CENTRE or not math.isfinite(beyond):
-        return False
-    t, x = np.array([*past, now, *later]).T
-    return bool(find_spikes(t, x, beyond)[len(past)])
+def _spikes_after(past: Series, later: Series, beyond: float) -> list[bool]:
+    """Return which of the later values are spikes; of the last two of them nothing is known."""
+    if len(later) <= CENTRE or not math.isfinite(beyond):
+        return [False] * len(later)
+    t, x = np.array([*past, *later]).T
+    return list(map(bool, find_spikes(t, x, beyond)[len(past) :]))
 
 
 def filled_column(t: Array, x: Array, beyond: float = BEYOND) -> tuple[Array, Mask, Mask]:
@@ -217,31 +217,10 @@ def filled_column(t: Array, x: Array, beyond: float = BEYOND) -> tuple[Array, Ma
     return new, gaps, spikes
 
 
-def _from_next(x: Array) -> tuple[Array, Mask]:
-    """Return a channel whose missing values are the next known ones, and where they were missing.
-
-    Gaps after the last value stay.
-    """
-    known = np.flatnonzero(np.isfinite(x))
-    later = np.searchsorted(known, np.arange(len(x)))
-    found = np.where(later < len(known), x[known[np.minimum(later, len(known) - 1)]], math.nan)
-    return found, np.isnan(x) & np.isfinite(found)
-
-
-def _long(gaps: Mask) -> Mask:
-    """Return which rows are in gaps of more than `LONG` rows."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], gaps, [False]]).astype(int)))
-    found = np.zeros_like(gaps)
-    for first, last in edges.reshape(-1, 2).tolist():
-        found[first:last] = last - first > LONG
-    return found
-
-
 def fill_table(
     table: DataTable,
     interpolated: Iterable[str],
     screened: Iterable[str],
-    beyond: float = BEYOND,
     *,
     means: Iterable[str] = (),
 ) -> DataTable:
@@ -257,11 +236,14 @@ def fill_table(
     for k, name in enumerate(table.names):
         if name not in fills | screens | of_means:
             continue
-        if name in of_means and np.isfinite(values[:, k]).any():
-            column, gaps = _from_next(values[:, k])
+        if name in of_means:
+            import pandas as pd  # slow to load, and rarely needed
+
+            column = pd.Series(values[:, k]).bfill().to_numpy(copy=True)
+            gaps = np.isnan(values[:, k]) & ~np.isnan(column)
             spikes, fills = np.zeros_like(gaps), fills | {name}
         else:
-            limit = beyond if name in screens else math.inf
+            limit = BEYOND if name in screens else math.inf
             column, gaps, spikes = filled_column(table.t, values[:, k], limit)
         if name not in fills:
             column[gaps], gaps = math.nan, np.zeros_like(gaps)
@@ -270,7 +252,10 @@ def fill_table(
         after = len(column) - 1 - int(known[-1]) if len(known) else 0
         ended = after if after > LONG else 0
         left = np.isnan(column).sum() - ended
-        bridges = _long(gaps).sum()
+        bridges = 0
+        if gaps.any():
+            numbered, _ = scipy.ndimage.label(gaps)
+            bridges = int((np.bincount(numbered)[numbered[gaps]] > LONG).sum())
         counts = {"spike": spikes.sum(), "interpolated": gaps.sum() - bridges, "bridged": bridges}
         counts |= {"ended": ended, "missing": left}
         remarks |= {(kind, name): int(number) for kind, number in counts.items() if number}
@@ -350,7 +335,7 @@ class Filled(Iterable[Sample]):
         recent: dict[str, deque[tuple[float, float]]] = {
             name: deque(maxlen=RECENT) for name in self.stage.channels
         }
-        waiting: deque[tuple[Sample, dict[str, float]]] = deque()
+        waiting: Waiting = deque()
         for sample in in_order(self.stream, "FillGaps"):
             waiting.append((sample, self._values(sample)))
             while waiting and self._decided(waiting):
@@ -360,16 +345,15 @@ class Filled(Iterable[Sample]):
 
     def _values(self, sample: Sample) -> dict[str, float]:
         """Return the values of the channels in a sample, NaN where missing."""
-        named = dict(sample.z) if isinstance(sample.z, Mapping) else {}
-        named |= dict(sample.inputs or {})
+        named = {**(sample.z if isinstance(sample.z, Mapping) else {}), **(sample.inputs or {})}
         return {name: number(named.get(name), f"input '{name}'") for name in self.stage.channels}
 
-    def _later(self, waiting: deque[tuple[Sample, dict[str, float]]], name: str) -> Series:
+    def _later(self, waiting: Waiting, name: str) -> Series:
         """Return the known values of a channel after the first sample that waits."""
         found = [(float(sample.t), values[name]) for sample, values in list(waiting)[1:]]
         return [pair for pair in found if math.isfinite(pair[1])]
 
-    def _decided(self, waiting: deque[tuple[Sample, dict[str, float]]]) -> bool:
+    def _decided(self, waiting: Waiting) -> bool:
         """Return whether the first waiting sample can be released."""
         stage, (first, values) = self.stage, waiting[0]
         expired = waiting[-1][0].t - first.t > stage.wait
@@ -384,9 +368,7 @@ class Filled(Iterable[Sample]):
         return True
 
     def _released(
-        self,
-        waiting: deque[tuple[Sample, dict[str, float]]],
-        recent: Mapping[str, deque[tuple[float, float]]],
+        self, waiting: Waiting, recent: Mapping[str, deque[tuple[float, float]]]
     ) -> Sample:
         """Return the first sample that waits, without gaps as far as possible."""
         sample, values = waiting[0]
@@ -426,21 +408,14 @@ def decided(
             return value, kinds
         return (later[0][1], ("interpolated",)) if later else (value, ("missing",))
     if math.isfinite(value):
-        if not is_spike(past, (t, value), later, beyond):
+        if not _spikes_after(past, [(t, value), *later], beyond)[0]:
             return value, ()
         kinds = ("spike",)
     # Later values are not judged yet, so one of them may be a spike itself.
-    found = bridged(t, past, _plausible(past, later, beyond))
+    spikes = _spikes_after(past, later, beyond)
+    plausible = [pair for pair, spike in zip(later, spikes, strict=True) if not spike]
+    found = bridged(t, past, plausible)
     return found, (*kinds, "interpolated" if math.isfinite(found) else "missing")
-
-
-def _plausible(past: Series, later: Series, beyond: float) -> Series:
-    """Return the values after a gap without those that are spikes."""
-    if not math.isfinite(beyond) or len(later) < CENTRE:
-        return later
-    t, x = np.array([*past, *later]).T
-    spikes = find_spikes(t, x, beyond)[len(past) :]
-    return [pair for pair, spike in zip(later, spikes.tolist(), strict=True) if not spike]
 
 
 def _with(sample: Sample, values: Mapping[str, float]) -> Sample:

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from livepde.errors import ConfigurationError, SampleError
-from livepde.linalg import Array
 from livepde.samples import is_dataset, is_frame, noise_channel
 from livepde.streams import table as tables
 from livepde.streams.clock import CALLED_TIME, Clock
@@ -30,29 +29,19 @@ def _is_time(name: str) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """How the channels of an identifier are read from a table.
+    """How the channels of an identifier are read from a table."""
 
-    `channels`: channels that need a column.
-    `optional`: channels that are read if there is such a column: noise of readings, places.
-    `unit`: the model's unit of time; empty if it has none.
-    `sensor_units`: sensor -> unit of its readings in the model.
-    `time`: the column of times. Default: the index of a table, the coordinate of a dataset, else
-    the one column that is called time, t, date or the like.
-    `time_unit`: unit of times that are numbers, default that of the model.
-    `columns`: channel -> its column, if that has another name.
-    `units`: sensor -> unit of its column, default that of the model.
-    `strict`: whether a column that is no channel is an error; else it is ignored.
-    """
-
-    channels: Sequence[str]
-    optional: Sequence[str]
-    unit: str
-    sensor_units: Mapping[str, str]
+    channels: Sequence[str]  # that need a column
+    optional: Sequence[str]  # that are read if there is such a column: noise of readings, places
+    unit: str  # the model's unit of time; empty if it has none
+    sensor_units: Mapping[str, str]  # sensor -> unit of its readings in the model
+    # The column of times. Default: the index of a table, the coordinate of a dataset, else the one
+    # column that is called time, t, date or the like.
     time: str | None = None
-    time_unit: str | None = None
-    columns: Mapping[str, str] = field(default_factory=dict)
-    units: Mapping[str, str] = field(default_factory=dict)
-    strict: bool = False
+    time_unit: str | None = None  # of times that are numbers, default that of the model
+    columns: Mapping[str, str] = field(default_factory=dict)  # channel -> column of another name
+    units: Mapping[str, str] = field(default_factory=dict)  # sensor -> unit of its column
+    strict: bool = False  # whether a column that is no channel is an error; else it is ignored
 
     def table(self, data: Any) -> tables.DataTable:
         """Return the samples.
@@ -225,9 +214,7 @@ class Reading:
             self._need_unit("the times are durations")
             times, unit = np.asarray(times) / np.timedelta64(1, "s"), "s"
         columns = self._columns("data", time, list(series), units)
-        needed = tables.decimal_marks(columns)
-        values = {name: _numbers(name, series[name]) for name in needed}
-        return tables.tabulated(times, values, columns, self._clock(time, unit), where="data")
+        return tables.tabulated(times, series, columns, self._clock(time, unit), where="data")
 
     def _file(self, path: Path) -> tables.DataTable:
         """Return the samples of a file; its extension gives the format."""
@@ -261,15 +248,6 @@ class Reading:
             encoding=written.encoding,
             skip=written.skip,
         )
-
-
-def _numbers(name: str, series: Any) -> Array:
-    """Return a column of pandas as numbers, NaN where one is missing."""
-    try:
-        found: Array = series.to_numpy(dtype=float, na_value=np.nan)
-    except (TypeError, ValueError):
-        raise SampleError(f"data: column '{name}' must contain numbers only.") from None
-    return found
 
 
 def _first_keys(path: Path) -> list[str]:

@@ -14,7 +14,7 @@ import stat
 import time
 import zlib
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import chain, islice
@@ -302,9 +302,9 @@ class GrowingFile:
         if self._now is not None:
             self._remember(self._now)
             self._left = self.here
-        older = (content for content, _ in self._older)
-        for content in (*([self._now] if self._now else []), *self._next, *older):
-            content.close()
+        for content in (self._now, *self._next, *(older for older, _ in self._older)):
+            if content is not None:
+                content.close()
         self._now = None
         self._next.clear()
         self._older.clear()
@@ -351,16 +351,12 @@ class GrowingFile:
         others = (
             path for path in self._folder() if _inode(path) == place.inode or self._is_rotated(path)
         )
-        for path in chain([self.path], others):
-            content = _Content.open(path)
-            if content is None:
-                continue
-            if content.fits(place):
-                content.go_to(place.start)
-                self._begin(content)
-                return True
-            content.close()
-        return False
+        content = _first(chain([self.path], others), lambda each: each.fits(place))
+        if content is None:
+            return False
+        content.go_to(place.start)
+        self._begin(content)
+        return True
 
     def _changed(self, now: _Content) -> list[Line]:
         """Go over to what has become of a file whose content was changed."""
@@ -384,15 +380,14 @@ class GrowingFile:
 
     def _copy_of(self, now: _Content) -> _Content | None:
         """Return the copy of a file that was made before it was emptied, where it was read to."""
-        for path in reversed(self._rotated()) if now.offset else ():
-            copy = _Content.open(path)
-            if copy is None:
-                continue
-            if not self._was_read(copy) and copy.known(now.head, now.tail, now.offset):
-                copy.go_to(now.offset)
-                return copy
-            copy.close()
-        return None
+
+        def fits(copy: _Content) -> bool:
+            return not self._was_read(copy) and copy.known(now.head, now.tail, now.offset)
+
+        copy = _first(reversed(self._rotated()), fits) if now.offset else None
+        if copy is not None:
+            copy.go_to(now.offset)
+        return copy
 
     def _ended(self, now: _Content) -> bool:
         """Go over to the next file if this one has another name now; return whether it did."""
@@ -456,6 +451,17 @@ class GrowingFile:
         after = rf"{re.escape(self.path.name)}[.\-_~].*"
         fits = re.fullmatch(f"{dated}|{after}", path.name)
         return fits is not None and not path.name.endswith(PACKED)
+
+
+def _first(paths: Iterable[Path], fits: Callable[[_Content], bool]) -> _Content | None:
+    """Open the first file that fits, None if there is none."""
+    for path in paths:
+        content = _Content.open(path)
+        if content is not None:
+            if fits(content):
+                return content
+            content.close()
+    return None
 
 
 def _inode(path: Path) -> int:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, InitVar, dataclass, field, replace
 from datetime import datetime
 from itertools import chain, pairwise
 from typing import Any, Literal, Protocol, TypeAlias
@@ -25,43 +25,30 @@ from livepde.streams.table import Column, channel_value, row_time, without_noise
 
 @dataclass(frozen=True)
 class Habit:
-    """Arrival of one channel: waiting time, repeated values, interpolation and spikes.
+    """Arrival of one channel: waiting time, repeated values, interpolation and spikes."""
 
-    `wait`: time for which a sample waits for this channel, if longer than `Policy.wait`.
-    `repeated`: which of two values for one moment is kept; default that of the policy.
-    `interpolated`: a sample without this channel takes a value interpolated from the next one, if
-    that comes while the sample waits; it waits no longer then.
-    `screened`: a spike is refused, if two later values have come while the sample waited.
-    `between`: how the channel behaves between two readings.
-    """
-
-    wait: float = 0.0
-    repeated: Literal["first", "last"] | None = None
+    wait: float = 0.0  # for which a sample waits for this channel, if longer than `Policy.wait`
+    repeated: Literal["first", "last"] | None = None  # as in the policy; None: as the policy says
+    # A sample without this channel takes a value interpolated from the next one, if that comes
+    # while the sample waits; it waits no longer then.
     interpolated: bool = False
-    screened: bool = False
-    between: Between = "line"
+    screened: bool = False  # a spike is refused, if two later values come while the sample waits
+    between: Between = "line"  # how the channel behaves between two readings
 
 
 @dataclass(frozen=True)
 class Policy:
-    """Policy for rows that are late, incomplete, repeated, or ahead of the others.
+    """Policy for rows that are late, incomplete, repeated, or ahead of the others."""
 
-    `wait`: time for which a row may come after a later one; one that comes later still is refused.
-    `tolerance`: rows whose times differ by at most so much are of one moment: that of the first.
-    `leap`: a row that is later than the newest one by more than this, or by more than ten usual
-    steps of its channels, waits until the rows after it agree with it; a row at the old times
-    refutes it.
-    `repeated`: which of two values of a channel for one moment is kept, while the sample waits.
-    `shift`: correction of a wrong clock, as the user states it: added to all times that come.
-    `channels`: channel -> its own options.
-    """
-
-    wait: float = 0.0
-    tolerance: float = 0.0
+    wait: float = 0.0  # for which a row may come after a later one, before it is refused
+    tolerance: float = 0.0  # rows whose times differ by at most this are of one moment, the first
+    # A row that is later than the newest one by more than this, or by more than ten usual steps of
+    # its channels, waits until the rows after it agree with it; a row at the old times refutes it.
     leap: float = math.inf
+    # Which of two values of a channel for one moment is kept, while the sample waits.
     repeated: Literal["first", "last"] = "first"
-    shift: float = 0.0
-    channels: Mapping[str, Habit] = field(default_factory=dict)
+    shift: float = 0.0  # correction of a wrong clock by the user: added to all times that come
+    channels: Mapping[str, Habit] = field(default_factory=dict)  # channel -> its own options
 
     def __post_init__(self) -> None:
         waits = {f"wait of '{name}'": habit.wait for name, habit in self.channels.items()}
@@ -70,9 +57,6 @@ class Policy:
                 raise DataError(f"intake: {name} must be a time >= 0; got {value}.")
         if not math.isfinite(self.shift):
             raise DataError(f"intake: shift must be a finite time; got {self.shift}.")
-        for choice in (self.repeated, *(habit.repeated for habit in self.channels.values())):
-            if choice not in ("first", "last", None):
-                raise DataError(f"intake: repeated must be first or last; got {choice!r}.")
 
     def keeps(self, channel: str) -> Literal["first", "last"]:
         """Return which of two values of a channel is kept."""
@@ -92,6 +76,7 @@ FEWEST = 3  # times of rows that are far ahead, or first, before they are used
 MOST_AHEAD = 1000  # rows that wait so; more than these are used without a contradiction
 REMEMBERED = 1024  # accepted samples that are remembered though the journal has them
 PLAIN = Habit()
+NO_VALUE = "no value of any channel"
 NAN = math.nan
 Known: TypeAlias = tuple[float, Mapping[str, float]]  # time and values of an accepted sample
 
@@ -107,17 +92,13 @@ class Remark:
     late rows follow one another, so that a clock went back. Used all the same: "shifted" (late rows
     lead on to it: the clock was set back), "disordered" (came after a later row), "missing" (a
     sample without this channel), "interpolated" (the same, with a value between known ones).
-    `channel`: channel of the value; '' for a whole row.
-    `message`: description; of several remarks that of the first.
-    `number`: number of occurrences.
-    `row`: token of its row; for a sample that of the last row.
     """
 
     kind: str
-    channel: str
-    message: str
-    number: int = 1
-    row: Any = None
+    channel: str  # of the value; '' for a whole row
+    message: str  # of several remarks that of the first
+    number: int = 1  # of occurrences
+    row: Any = None  # token of its row; for a sample that of the last row
 
 
 def gather(found: dict[tuple[str, str], Remark], remark: Remark) -> None:
@@ -127,35 +108,26 @@ def gather(found: dict[tuple[str, str], Remark], remark: Remark) -> None:
     found[key] = remark if same is None else replace(same, number=same.number + remark.number)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Ready:
-    """A sample that is complete.
-
-    `t`, `values`: time, and values of the channels that have come.
-    `tokens`: tokens of the source for the rows of the sample, to acknowledge them.
-    """
+    """A sample: open as long as rows may add to it, then complete."""
 
     t: float
-    values: dict[str, float]
-    tokens: tuple[Any, ...]
+    values: dict[str, float] = field(default_factory=dict)  # of the channels that have come
+    tokens: list[Any] = field(default_factory=list)  # of its rows, to acknowledge them
 
 
 @dataclass
 class IntakeOutcome:
-    """Outcome of a row: ready samples, remarks, and tokens of rows that no sample uses.
-
-    `row` is the token of the row, to which remarks refer by default.
-    """
+    """Outcome of a row: ready samples, remarks, and tokens of rows that no sample uses."""
 
     ready: list[Ready] = field(default_factory=list)
     remarks: list[Remark] = field(default_factory=list)
     spent: list[Any] = field(default_factory=list)
-    row: Any = None
 
-    def remark(self, kind: str, channel: str, message: str, row: Any = None) -> None:
-        """Add a remark, about the row that was taken or another one."""
-        about = self.row if row is None else row
-        self.remarks.append(Remark(kind, channel, message, row=about))
+    def remark(self, kind: str, channel: str, message: str, row: Any) -> None:
+        """Add a remark about the row with a token."""
+        self.remarks.append(Remark(kind, channel, message, row=row))
 
 
 class Past(Protocol):
@@ -176,54 +148,30 @@ class _Held:
     t: float
     values: dict[str, float]
     token: Any
-    remarks: tuple[Remark, ...]
+    remarks: list[Remark]
 
 
-@dataclass
-class _Open:
-    values: dict[str, float] = field(default_factory=dict)
-    tokens: list[Any] = field(default_factory=list)
-
-
+@dataclass(eq=False)
 class Intake:
-    """Ordering of rows into samples.
+    """Ordering of rows into samples."""
 
-    `columns`: channel -> its column.
-    `clock`: conversion of the time column.
-    `policy`: policy for rows out of order.
-    `missing`: numbers that mean a missing value.
-    `origin`: seconds since 1970 of t = 0 where times are dates; default the first row's.
-    `dates`: whether times are dates; default as in the first row.
-    `last`: time of the last sample taken in an earlier session; earlier rows are late.
-    `recent`: times and values of the last samples of an earlier session, for channels that are
-    interpolated or screened.
+    columns: Mapping[str, Column]  # channel -> its column
+    clock: Clock  # conversion of the time column
+    policy: Policy = field(default_factory=Policy)  # for rows out of order
+    _: KW_ONLY
+    missing: Collection[float] = ()  # numbers that mean a missing value
+    origin: float | None = None  # t = 0 in seconds since 1970, of dates; None: the first row's time
+    dates: bool | None = None  # whether times are dates; None: as in the first row
+    last: float = -math.inf  # time of the last sample, also of an earlier session
+    # Last samples of an earlier session, for channels that are interpolated or screened.
+    recent: InitVar[Iterable[Known]] = ()
+    # Samples in the journal, to recognise rows that were accepted before it had them all.
+    past: Past | None = field(default=None, init=False)
 
-    `past`: the samples in the journal, to recognise rows that were accepted before it had them all.
-    """
-
-    def __init__(
-        self,
-        columns: Mapping[str, Column],
-        clock: Clock,
-        policy: Policy | None = None,
-        *,
-        missing: Iterable[float] = (),
-        origin: float | None = None,
-        dates: bool | None = None,
-        last: float = -math.inf,
-        recent: Iterable[tuple[float, Mapping[str, float]]] = (),
-    ) -> None:
-        self.columns = dict(columns)
-        self.clock = clock
-        self.policy = policy or Policy()
-        self.missing = frozenset(float(number) for number in missing)
-        self.origin = origin
-        self._dates = dates
-        self._last = last
-        self._newest = last
+    def __post_init__(self, recent: Iterable[Known]) -> None:
+        self._newest = self.last
         self._received = math.nan  # when the newest row was received
-        self.past: Past | None = None
-        self._open: dict[float, _Open] = {}
+        self._open: dict[float, Ready] = {}
         self._recent = deque(recent, maxlen=RECENT)
         self._before: dict[str, float] = {}  # held inputs of rows before the first sample
         self._times = ChannelTimes(self._recent)
@@ -233,7 +181,7 @@ class Intake:
     @property
     def start(self) -> datetime | None:
         """The date of t = 0, if times are dates."""
-        if self.origin is None or not self._dates:
+        if self.origin is None or not self.dates:
             return None
         return origin_at(self.origin)
 
@@ -246,10 +194,14 @@ class Intake:
     @property
     def interval(self) -> float:
         """Seconds between two samples as they usually come; infinite if that is not known."""
-        step = self._times.slowest
-        waits = (self.policy.longest(self.policy.habit(channel)) for channel in self.columns)
-        seconds = (step + max(waits, default=0.0)) / self.clock.second
+        seconds = (self._times.slowest + self._longest) / self.clock.second
         return math.inf if math.isnan(seconds) else seconds
+
+    @property
+    def _longest(self) -> float:
+        """Longest time for which a sample waits for a channel."""
+        waits = (self.policy.longest(self.policy.habit(channel)) for channel in self.columns)
+        return max(waits, default=0.0)
 
     @property
     def why(self) -> str:
@@ -258,7 +210,7 @@ class Intake:
         for name, late in self._times.went_back.items():
             return (
                 f"the times of {name} went back to t = {late:g}, and its rows count as late up to "
-                f"t = {self._last:g}; {remedy}"
+                f"t = {self.last:g}; {remedy}"
             )
         if unsteady := self._times.unsteady:
             return (
@@ -284,7 +236,7 @@ class Intake:
 
         `received`: seconds of a clock of this machine; a row may be ahead by the time that passed.
         """
-        found = IntakeOutcome(row=token)
+        found = IntakeOutcome()
         held = self._read(row, token, found)
         if held is None or not self._judged(held, received, found):
             found.spent.append(token)
@@ -296,28 +248,25 @@ class Intake:
         try:
             times = self._time(row)
         except DataError as error:
-            found.remark("malformed", "", str(error))
+            found.remark("malformed", "", str(error), token)
             return None
-        about = IntakeOutcome(row=token)
+        values, remarks = self._values(row, token)
         if times is None:
-            found.remark("outside", "", "not between start and stop")
-            self._hold_first(self._values(row, about))
+            found.remark("outside", "", "not between start and stop", token)
+            self._hold_first(values)
             return None
-        values = self._values(row, about)
         if not values:
-            if not about.remarks:
-                about.remark("malformed", "", "no value of any channel")
-            found.remarks += about.remarks
+            found.remarks += remarks or [Remark("malformed", "", NO_VALUE, row=token)]
             return None
         t, again = times
         # An hour that clocks show twice: its second pass, unless these values came in the first.
         if again and self._passed(t, again, values) and not self._repeats(t, values):
             t += again
-        return _Held(t=t, values=values, token=token, remarks=tuple(about.remarks))
+        return _Held(t=t, values=values, token=token, remarks=remarks)
 
     def _passed(self, t: float, hour: float, values: Mapping[str, float]) -> bool:
         """Return whether rows of a time or later ones have come, of the same channels."""
-        if t <= self._last:
+        if t <= self.last:
             return True
         mine = set(present(values))
         waiting = (one for one in self._ahead if t <= one.t <= t + hour)
@@ -327,7 +276,7 @@ class Intake:
         """Return whether a row is used or waits for others."""
         if self._repeats(held.t, held.values):
             text = f"t = {held.t:g} has been accepted with the same values before"
-            found.remark("repeated", "", text)
+            found.remark("repeated", "", text, held.token)
             return False
         if self._is_ahead(held, received):
             self._wait(held, received, found)
@@ -353,8 +302,7 @@ class Intake:
 
     def _wait(self, held: _Held, received: float, found: IntakeOutcome) -> None:
         """Let a row wait for others, and use all rows that wait if they agree."""
-        waits = (self.policy.longest(self.policy.habit(channel)) for channel in self.columns)
-        latest = held.t + self.policy.tolerance + max(waits, default=0.0)
+        latest = held.t + self.policy.tolerance + self._longest
         # A row of an earlier time refutes those that have come before it; of the first rows none
         # has privilege, and those that agree decide.
         if self._begun:
@@ -390,7 +338,7 @@ class Intake:
         if self.origin is None:
             # The first row that is used sets t = 0 for all later ones.
             first = waiting[0].t if waiting else 0.0
-            self.origin = _microseconds(first / self.clock.second) if self._dates else 0.0
+            self.origin = _microseconds(first / self.clock.second) if self.dates else 0.0
             zero = self.origin * self.clock.second
             waiting = [replace(one, t=one.t - zero) for one in waiting]
         for one in waiting:
@@ -424,7 +372,7 @@ class Intake:
         found: list[Known] = [
             (s, sample.values) for s, sample in self._open.items() if low <= s <= high
         ]
-        if low > self._last:
+        if low > self.last:
             return found, []
         for s, values in reversed(self._accepted):
             if s < low:
@@ -435,7 +383,7 @@ class Intake:
 
     def withdraw(self, last: float) -> None:
         """Accept rows later than this time again: the samples after it were withdrawn."""
-        self._last = self._newest = last
+        self.last = self._newest = last
         self._times.withdraw(last)
         while self._accepted and self._accepted[-1][0] > last:
             self._accepted.pop()
@@ -455,7 +403,6 @@ class Intake:
     def _placed(self, held: _Held, found: IntakeOutcome) -> bool:
         """Return whether a row became part of a sample."""
         t, values = held.t, held.values
-        about, found.row = found.row, held.token
         found.remarks += held.remarks
         moment = self._moment(t)
         if moment is None:
@@ -463,13 +410,12 @@ class Intake:
         else:
             if t < self._newest - self.policy.tolerance:
                 text = f"t = {t:g} came after {self._newest:g}"
-                found.remark("disordered", "", text)
+                found.remark("disordered", "", text, held.token)
             self._add(moment, values, held.token, found)
             if self._times.use(t, values):
                 text = f"times that went back continue at t = {t:g}: the clock was set back before"
-                found.remark("shifted", "", text)
+                found.remark("shifted", "", text, held.token)
         self._newest = max(self._newest, t)
-        found.row = about
         return moment is not None
 
     def _refuse_late(self, held: _Held, found: IntakeOutcome) -> None:
@@ -480,51 +426,52 @@ class Intake:
         for name in present(held.values):
             value, before = held.values[name], known.get(name, NAN)
             if math.isnan(before):
-                text = f"t = {held.t:g} is not later than the last sample at {self._last:g}"
-                found.remark("late", name, text)
+                text = f"t = {held.t:g} is not later than the last sample at {self.last:g}"
+                found.remark("late", name, text, held.token)
             elif value != before:
                 text = f"t = {held.t:g} was accepted with {before:g}, and came again with {value:g}"
-                found.remark("conflict", name, text)
+                found.remark("conflict", name, text, held.token)
         if self._times.refuse(held.t, held.values):
             text = (
                 f"times went back from t = {self._newest:g} to {held.t:g}: these rows count as late"
             )
-            found.remark("clock", "", text)
+            found.remark("clock", "", text, held.token)
 
-    def _values(self, row: Mapping[str, Any], found: IntakeOutcome) -> dict[str, float]:
-        """Return the valid values of a row, NaN for missing and invalid ones."""
+    def _values(self, row: Mapping[str, Any], token: Any) -> tuple[dict[str, float], list[Remark]]:
+        """Return the valid values of a row, NaN for missing and invalid ones, and remarks."""
         values: dict[str, float] = {}
+        found = IntakeOutcome()
         for channel, column in self.columns.items():
             if not all(name in row for name in column.names):
                 continue
             try:
                 value = channel_value(column, row, self.missing)
             except DataError as error:
-                found.remark("malformed", channel, str(error))
+                found.remark("malformed", channel, str(error), token)
                 continue
             low, high = column.valid
             if value < low or value > high:
                 text = f"{value:g} is not between {low:g} and {high:g}"
-                found.remark("invalid", channel, text)
+                found.remark("invalid", channel, text, token)
                 # Missing, not absent: the channel has come, and the sample must not wait for it.
                 value = math.nan
             values[channel] = value
-        return values
+        return values, found.remarks
 
     def _time(self, row: Mapping[str, Any]) -> tuple[float, float] | None:
         """Return the time of a row, and how much later the clocks show it again; None: outside.
 
         It is the model time once t = 0 is known, else seconds since 1970 if times are dates.
         """
-        stated, dates = row_time(row, self.clock, before=self._dates)
+        stated, dates = row_time(row, self.clock, before=self.dates)
         t = stated + self.policy.shift
         low, high = self.clock.bounds(dates, "data")
         if not low <= t <= high:
             return None
-        if self._dates not in (None, dates):
+        if self.dates not in (None, dates):
             was, is_now = ("number", "date") if dates else ("date", "number")
             raise SampleError(f"the time is a {is_now}; it was a {was} before")
-        self._dates = dates
+        self.dates = dates
         if not dates:
             return t, 0.0
         if self.origin is None:
@@ -538,18 +485,18 @@ class Intake:
         near = [s for s in self._open if abs(s - t) <= self.policy.tolerance]
         if near:
             return min(near, key=lambda s: abs(s - t))
-        return t if t > self._last + self.policy.tolerance else None
+        return t if t > self.last + self.policy.tolerance else None
 
     def _add(
         self, moment: float, values: Mapping[str, float], token: Any, found: IntakeOutcome
     ) -> None:
-        sample = self._open.setdefault(moment, _Open())
+        sample = self._open.setdefault(moment, Ready(t=moment))
         sample.tokens.append(token)
         for channel, value in values.items():
             known = sample.values.get(channel, math.nan)
             if not (math.isnan(known) or math.isnan(value)) and value != known:
                 text = f"a second value for t = {moment:g}: {value:g} after {known:g}"
-                found.remark("conflict", channel, text)
+                found.remark("conflict", channel, text, token)
                 if self.policy.keeps(channel) == "first":
                     continue
             # An empty cell of a second row must not erase a value that has come.
@@ -562,14 +509,14 @@ class Intake:
             # Samples leave in order, so one that still waits holds back those after it.
             if not self._ripe(t):
                 return
-            self._last = t
-            self._complete(t, self._open.pop(t), found)
+            self.last = t
+            self._complete(self._open.pop(t), found)
 
-    def _complete(self, t: float, sample: _Open, found: IntakeOutcome) -> None:
+    def _complete(self, sample: Ready, found: IntakeOutcome) -> None:
         """Release a sample, or leave it out if a channel is missing that it needs."""
-        came = dict(sample.values)
+        t, came = sample.t, dict(sample.values)
         for channel in self.columns:
-            self._bridge(channel, t, sample, found)
+            self._bridge(channel, sample, found)
             if channel in self._before and math.isnan(sample.values.get(channel, NAN)):
                 sample.values[channel] = self._before[channel]
         for channel in without_noise(self.columns, sample.values):
@@ -582,9 +529,8 @@ class Intake:
             found.remark("missing", channel, text, sample.tokens[-1])
         needed = [channel for channel in lacking if self.columns[channel].needed]
         if needed:
-            found.remark(
-                "skipped", needed[0], f"the sample at t = {t:g} was skipped", sample.tokens[-1]
-            )
+            text = f"the sample at t = {t:g} was skipped"
+            found.remark("skipped", needed[0], text, sample.tokens[-1])
             sample.values = self._held(sample.values)
             self._hold_first(sample.values)
             if not (self._recent and sample.values):
@@ -593,7 +539,7 @@ class Intake:
         self._before.clear()
         self._recent.append((t, sample.values))
         self._remember(t, came)
-        found.ready.append(Ready(t=t, values=sample.values, tokens=tuple(sample.tokens)))
+        found.ready.append(sample)
 
     def _remember(self, t: float, came: dict[str, float]) -> None:
         """Remember an accepted sample, at least until the journal has it."""
@@ -628,9 +574,9 @@ class Intake:
         absent = math.isnan(values.get(channel, NAN))
         return absent and not (of and math.isnan(values.get(of, NAN)))
 
-    def _bridge(self, channel: str, t: float, sample: _Open, found: IntakeOutcome) -> None:
+    def _bridge(self, channel: str, sample: Ready, found: IntakeOutcome) -> None:
         """Interpolate a gap of a sample, or refuse a spike, where later values are known."""
-        habit = self.policy.habit(channel)
+        t, habit = sample.t, self.policy.habit(channel)
         # A sample that does not wait is released before any later value has come.
         waited = self.policy.longest(habit) > 0.0
         if not (waited and (habit.interpolated or habit.screened)):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -54,22 +53,17 @@ def sentinels(values: Array) -> list[Sentinel]:
     [-127.0]
     """
     rest, found = values[np.isfinite(values)], list[Sentinel]()
-    while len(found) < MOST_SENTINELS:
-        one = next(filter(None, (_at(rest, end) for end in _ends(rest))), None)
+    while len(rest) and len(found) < MOST_SENTINELS:
+        # The end of the range that lies farther from the median comes first.
+        ends = np.array([rest.min(), rest.max()])
+        ends = ends[np.argsort(-np.abs(ends - np.median(rest)), kind="stable")]
+        one = next(filter(None, (_at(rest, end) for end in ends.tolist())), None)
         if one is None:
             break
         found.append(one)
         rest = rest[rest != one.value]
     # Ranges are those of the values that remain in the end.
     return [one._replace(low=float(rest.min()), high=float(rest.max())) for one in found]
-
-
-def _ends(values: Array) -> list[float]:
-    """Return the least and the largest value, the one that lies farther from the median first."""
-    if not len(values):
-        return []
-    middle = float(np.median(values))
-    return sorted((float(values.min()), float(values.max())), key=lambda x: -abs(x - middle))
 
 
 def _at(values: Array, end: float) -> Sentinel | None:
@@ -118,16 +112,6 @@ def switches(t: Array, x: Array) -> bool:
     return few or (repeats >= STAYS and float(sizes.max()) > UNEVEN * float(sizes.min()))
 
 
-@dataclass(frozen=True)
-class ClockLeap:
-    """A step of time after which the readings continue as if almost no time had passed."""
-
-    row: int  # first sample after it
-    t: float
-    length: float
-    usual: float  # step before
-
-
 def unit_factor(before: float, after: float, usual: float, later: float) -> float:
     """Return by which factor times count in another unit since a sample; 0: they do not.
 
@@ -145,11 +129,12 @@ def unit_factor(before: float, after: float, usual: float, later: float) -> floa
     return 0.0
 
 
-def clock_leaps(t: Array, values: Array, rows: list[int]) -> list[ClockLeap]:
-    """Return the pauses in which the readings did not go on: the clock leapt.
+def clock_leaps(t: Array, values: Array, rows: list[int]) -> list[float]:
+    """Return the ends of pauses after which readings continue as if no time had passed.
 
-    The change of each channel across the step is compared with changes over one usual step, and
-    over as many usual steps as the time says. If it is much likelier as the former, no time passed.
+    The clock leapt there. The change of each channel across the step is compared with changes over
+    one usual step, and over as many usual steps as the time says. If it is much likelier as the
+    former, no time passed.
     `rows` are the samples that end a pause, `values` have the shape (samples, channels).
     """
     found = []
@@ -159,7 +144,7 @@ def clock_leaps(t: Array, values: Array, rows: list[int]) -> list[ClockLeap]:
         logs = [_odds(column, k, lag) for column in values.T]
         known = [log for log in logs if np.isfinite(log)]
         if known and sum(known) > SURE and sum(known) > EACH * len(known):
-            found.append(ClockLeap(k, float(t[k]), float(t[k] - t[k - 1]), usual))
+            found.append(float(t[k]))
     return found
 
 
@@ -194,17 +179,12 @@ def wild_first_rows(t: Array, values: Array, groups: Sequence[Sequence[int]]) ->
     with np.errstate(over="ignore"):
         for group in groups:
             leaps = {k: _leap(t, values[:, k]) for k in group}
-            first = [_first(values[:, k]) for k in group if not len(leaps[k])]
-            peers = np.array(first, dtype=float)
+            calm = (values[:, k] for k in group if not len(leaps[k]))
+            peers = np.concatenate([np.zeros(0), *(x[np.isfinite(x)][:1] for x in calm)])
             for k, rows in leaps.items():
                 if len(rows) and _outside(values[:, k], rows, peers):
                     wild[rows, k] = True
     return wild
-
-
-def _first(x: Array) -> float:
-    known = x[np.isfinite(x)]
-    return float(known[0]) if len(known) else np.nan
 
 
 def _leap(t: Array, x: Array) -> IntArray:
@@ -226,7 +206,7 @@ def _outside(x: Array, rows: IntArray, peers: Array) -> bool:
     """Return whether values lie outside what follows, and peers, by more than their range."""
     following = x[rows[-1] + 1 :]
     following = following[np.isfinite(following)][:FOLLOWING]
-    around = np.concatenate([following, peers[np.isfinite(peers)]])
+    around = np.concatenate([following, peers])
     low, high = around.min(), around.max()
     beyond = np.maximum(low - x[rows], x[rows] - high)
     return bool((beyond > high - low).all())

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import queue
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as OutOfTime
 from contextlib import suppress
@@ -198,9 +198,9 @@ class OpcuaSource(_Client, RowSource):
         super().__init__(server)
 
     async def _serve(self, client: Any) -> None:
-        changes = _Changes(self)
         nodes = {name: client.get_node(name) for name in self._columns}
-        changes.columns = {nodes[name].nodeid: self._columns[name] for name in nodes}
+        columns = {nodes[name].nodeid: self._columns[name] for name in nodes}
+        changes = _Changes(self._take, columns)
         period = 1000.0 * self._interval
         subscription = await client.create_subscription(period, changes)
         answers = await subscription.subscribe_data_change(
@@ -264,16 +264,16 @@ class OpcuaSource(_Client, RowSource):
         return rows
 
 
+@dataclass(eq=False)
 class _Changes:
     """Handler of the notifications of a subscription."""
 
-    def __init__(self, source: OpcuaSource) -> None:
-        self.columns: dict[Any, str] = {}
-        self.ended = ""
-        self._source = source
+    take: Callable[[str, Any], None]
+    columns: Mapping[Any, str]  # identifier of a node -> its column
+    ended: str = ""
 
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
-        self._source._take(self.columns[node.nodeid], data.monitored_item.Value)
+        self.take(self.columns[node.nodeid], data.monitored_item.Value)
 
     def status_change_notification(self, status: Any) -> None:
         self.ended = status.Status.name

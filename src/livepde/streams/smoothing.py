@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from livepde.errors import ConfigurationError, SampleError
-from livepde.linalg import Array
+from livepde.linalg import Array, Mask
 from livepde.samples import Sample, in_order
 
 LARGEST_MEMO = 256  # weights kept for different spacings and patterns of missing samples
@@ -34,16 +34,11 @@ class Weights(ABC):
 
     @abstractmethod
     def add(self, t: float, z: Array) -> tuple[Array, Array, Array]:
-        """Take one sample and return, each of shape (channels,) and NaN where z is missing.
+        """Take one sample and return z~_k and two variances, per variance of the raw noise.
 
-        Returns
-        -------
-        smooth
-            z~_k.
-        variance
-            sum_j w_kj^2: variance of its noise, per variance of the raw noise.
-        change
-            sum_j (w_kj - w_k-1,j)^2: variance of z~_k - z~_k-1, per the same; NaN for the first.
+        They are sum_j w_kj^2, of the noise of z~_k, and sum_j (w_kj - w_k-1,j)^2, of that of
+        z~_k - z~_k-1; NaN for the first sample. All have the shape (channels,), NaN where z is
+        missing.
         """
 
 
@@ -116,8 +111,7 @@ class Smoothed(Iterable[Sample]):
         self._reset()
 
     def _reset(self) -> None:
-        nothing = np.zeros(0)
-        self.std = self.d_rate = self.sigma = nothing
+        self.std = self.d_rate = self.sigma = np.zeros(0)
         self._names: tuple[str, ...] | None = None
         self._noise: _NoiseLevel | None = None
 
@@ -396,20 +390,18 @@ class Exponential(Smoother):
         return float(np.sqrt(share / (2.0 - share)))
 
 
+@dataclass
 class _Fading(Weights):
-    def __init__(self, time: float) -> None:
-        self.time = time
-        self.state: tuple[Array, Array, Array] | None = None
-        self.seen = np.zeros(0, dtype=bool)
+    time: float
+    # Of each channel: value, variance and time of the last sample that had one.
+    state: tuple[Array, Array, Array] | None = None
+    seen: Mask | None = None  # which channels the last sample had
 
     def add(self, t: float, z: Array) -> tuple[Array, Array, Array]:
         present = np.isfinite(z)
-        nothing = np.full(z.shape, np.nan)
-        if self.state is None:
-            smooth, variance, times = z.copy(), np.where(present, 1.0, np.nan), nothing.copy()
-            times[present] = t
-            self.state, self.seen = (smooth, variance, times), present
-            return smooth.copy(), variance.copy(), nothing
+        if self.state is None or self.seen is None:
+            nothing = np.full(z.shape, np.nan)
+            self.state, self.seen = (nothing, nothing, nothing), np.zeros_like(present)
         smooth, variance, times = self.state
         if smooth.shape != z.shape:
             raise SampleError(
@@ -421,9 +413,8 @@ class _Fading(Weights):
         change = share**2 * (1.0 + variance)
         new = np.where(first, z, smooth + share * (z - smooth))
         spread = np.where(first, 1.0, (1.0 - share) ** 2 * variance + share**2)
-        out = np.where(present, new, np.nan)
         result = (
-            out,
+            np.where(present, new, np.nan),
             np.where(present, spread, np.nan),
             np.where(present & self.seen, change, np.nan),
         )

@@ -110,11 +110,6 @@ def drained(waiting: queue.Queue[T], wait: float) -> list[T]:
     return found
 
 
-def _names(cells: list[str]) -> list[str]:
-    """Return the header; of two columns with one name neither is taken: both are missing."""
-    return [name if cells.count(name) == 1 else "" for name in cells]
-
-
 class Follow(RowSource):
     """A CSV file with a header, or a file of JSON lines (.jsonl), also while it grows.
 
@@ -267,14 +262,15 @@ class Follow(RowSource):
         if self._json:
             return json_row(content, token)
         try:
-            cells = self._cells(content)
+            text = content.decode(self._encoding)
+            found = csv.reader([text], delimiter=self._separator, skipinitialspace=True)
+            cells = [cell.strip() for cell in next(found, [""])]
         except (UnicodeError, csv.Error) as error:
             self._labels = 0  # rows have begun
+            why = f"not a line of a CSV file ({type(error).__name__})"
             if content.startswith(UTF_16):
-                return Row(
-                    {}, token=token, broken="the file is in UTF-16, not to be followed: write UTF-8"
-                )
-            return Row({}, token=token, broken=f"not a line of a CSV file ({type(error).__name__})")
+                why = "the file is in UTF-16, not to be followed: write UTF-8"
+            return Row({}, token=token, broken=why)
         if self._header is None:
             return None if is_title(cells) else self._headed(cells, token)
         if cells[0].startswith("#"):
@@ -302,21 +298,17 @@ class Follow(RowSource):
 
     def _headed(self, cells: list[str], token: tuple[int, int]) -> Row | None:
         """Take a line as the header; return a row that reports a wrong or another one."""
-        before, self._header, self._labels = self._header, _names(cells), UNDER
+        before, self._labels = self._header, UNDER
+        # Of two columns with one name neither is taken: both are missing.
+        self._header = [name if cells.count(name) == 1 else "" for name in cells]
         self._headers[token] = self._header
-        twice = sorted(set(cells) - set(self._header))
-        if twice:
-            text = "two columns are called '{}', and neither is used: rename one"
-            return Row({}, token=token, broken=text.format(twice[0]))
+        if twice := sorted(set(cells) - set(self._header)):
+            text = f"two columns are called '{twice[0]}', and neither is used: rename one"
+            return Row({}, token=token, broken=text)
         if before is None or before == self._header:
             return None
         text = f"the header appears again with other columns: {', '.join(cells)}"
         return Row({}, token=token, broken=text, kind="header")
-
-    def _cells(self, line: bytes) -> list[str]:
-        text = line.decode(self._encoding)
-        found = csv.reader([text], delimiter=self._separator, skipinitialspace=True)
-        return [cell.strip() for cell in next(found, [""])]
 
 
 class Lines(RowSource):

@@ -44,8 +44,6 @@ class Thinned:
 
     `held`: columns that are no "line", shape (columns,).
 
-    Examples
-    --------
     >>> rows = Thinned(["line", "hold"])
     >>> rows.take(0.0, np.array([20.0, 1.0]), chosen=True, whole=True)
     array([20.,  1.])
@@ -117,6 +115,7 @@ class _Mean:
 JSON_LINES = (".jsonl", ".ndjson")  # endings of files of JSON lines
 STREAM = "standard input"
 MOST = 12  # names that are listed
+# Endings of files that are data: a case may name any other file, whose columns are not listed.
 SHOWN = (".csv", ".txt", ".tsv", ".tab", ".dat", ".asc", ".log", ".jsonl", ".ndjson", ".parquet")
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--", "---", "#n/a", "#nv"})
 
@@ -206,7 +205,7 @@ def read_json_lines(
     Parameters
     ----------
     columns, clock, every, missing
-        As for `read_csv`; a column that a line has not is missing there.
+        As for `read_csv`; a column that a line does not have is missing there.
 
     Raises
     ------
@@ -276,8 +275,11 @@ def tabulated(
     found, dates = read_times(moments, clock, lambda k: f"{where}, sample {k}, times")
 
     def numbers(name: str, use: Any) -> Array:
+        given = values[name]
         try:
-            column: Array = np.asarray(values[name], dtype=float)
+            if hasattr(given, "iloc"):  # of pandas, where a missing value may be no float
+                given = given.to_numpy(dtype=float, na_value=np.nan)
+            column: Array = np.asarray(given, dtype=float)
         except (TypeError, ValueError):
             raise SampleError(f"{where}: column '{name}' must contain numbers only.") from None
         if column.shape != (len(moments),):
@@ -328,17 +330,16 @@ def to_table(
     any_held = bool(rows.held.any())
     use = _chosen(times, dates, clock, 1 if any_held else every, where)
     holes = tuple(float(number) for number in missing)
-    found = {}
-    for name in decimal_marks(columns):
-        column = numbers(name, use)
-        found[name] = np.where(np.isin(column, holes), np.nan, column)
+
+    def scaled(column: Column, of: IntArray) -> Array:
+        parts = [numbers(name, of) for name in column.names]
+        parts = [np.where(np.isin(part, holes), np.nan, part) for part in parts]
+        value: Array = column.factor * np.mean(parts, axis=0) + column.offset
+        return value
+
     # A column of the array for each channel, shape (samples, channels); there may be none.
     values = np.column_stack(
-        [
-            column.factor * np.mean([found[name] for name in column.names], axis=0) + column.offset
-            for column in columns.values()
-        ]
-        or [np.zeros((len(use), 0))]
+        [scaled(column, use) for column in columns.values()] or [np.zeros((len(use), 0))]
     )
     remarks = Counter(_noise_remarks(columns, values))
     kept = np.zeros(len(use), dtype=bool)
@@ -356,7 +357,7 @@ def to_table(
     if not kept.any():
         raise DataError(f"{where[0]}: no sample has all channels that it needs.")
     if any_held:
-        rows.remember(_known_before(int(use[0]), numbers, columns, holes))
+        rows.remember(_known_before(int(use[0]), columns, scaled))
         values, kept = _with_held(times[use], values, rows, chosen, kept)
     t, values, origin = times[use][kept], values[kept], None
     if dates:
@@ -386,22 +387,16 @@ def _chosen(
 
 
 def _known_before(
-    first: int,
-    numbers: Callable[[str, Any], Array],
-    columns: Mapping[str, Column],
-    holes: tuple[float, ...],
+    first: int, columns: Mapping[str, Column], scaled: Callable[[Column, IntArray], Array]
 ) -> Array:
     """Return the last value of each "hold" channel before a row, NaN of others, (channels,)."""
     found = np.full(len(columns), math.nan)
     for k, column in enumerate(columns.values()):
-        if column.between != "hold" or not first:
-            continue
-        parts = [numbers(name, np.arange(first)) for name in column.names]
-        parts = [np.where(np.isin(part, holes), math.nan, part) for part in parts]
-        values = column.factor * np.mean(parts, axis=0) + column.offset
-        low, high = column.valid
-        known = values[(values >= low) & (values <= high)]
-        found[k] = known[-1] if len(known) else math.nan
+        if column.between == "hold" and first:
+            values = scaled(column, np.arange(first))
+            low, high = column.valid
+            known = values[(values >= low) & (values <= high)]
+            found[k] = known[-1] if len(known) else math.nan
     return found
 
 
@@ -448,38 +443,32 @@ def without_noise(columns: Mapping[str, Column], values: dict[str, float]) -> li
     return refused
 
 
+@dataclass(eq=False, repr=False)
 class JsonLines:
-    """Samples from JSON lines, one object with column -> value for each moment, as they come."""
+    """Samples from JSON lines, one object with column -> value for each moment, as they come.
 
-    def __init__(
-        self,
-        lines: Iterable[str],
-        columns: Mapping[str, Column],
-        clock: Clock,
-        *,
-        every: int = 1,
-        missing: Iterable[float] = (),
-    ) -> None:
-        self._lines = lines
-        self._columns = columns
-        self._clock = clock
-        self._every = every
-        self._missing = tuple(float(number) for number in missing)
-        self.origin: datetime | None = None
+    `origin`: the first sample's date, if times are dates.
+    """
+
+    lines: Iterable[str]
+    columns: Mapping[str, Column]
+    clock: Clock
+    _: KW_ONLY
+    every: int = 1
+    missing: Collection[float] = ()
+    origin: datetime | None = field(default=None, init=False)
 
     def __iter__(self) -> Iterator[Sample]:
-        clock, last, zero = self._clock, -math.inf, 0.0
-        first: dict[float, dict[str, float]] = {}  # rows of an hour that clocks show twice
-        needed = [channel for channel, column in self._columns.items() if column.needed]
-        thinned = Thinned([column.between for column in self._columns.values()])
+        clock, last, zero = self.clock, -math.inf, 0.0
+        first: dict[float, Array] = {}  # rows of an hour that clocks show twice
+        needed = np.array([column.needed for column in self.columns.values()], dtype=bool)
+        thinned = Thinned([column.between for column in self.columns.values()])
         any_held = bool(thinned.held.any())
-        step = 1 if any_held else self._every
-        for k, (where, row, t, dates) in enumerate(
-            islice(self._timed_rows(thinned), 0, None, step)
-        ):
+        rows = islice(self._timed_rows(thinned), 0, None, 1 if any_held else self.every)
+        for k, (where, row, t, dates) in enumerate(rows):
             values = self._values(row, where)
             if dates and is_naive(row.get(clock.name), clock) and (again := clock.repeated_hour(t)):
-                if t <= last and not _same_values(first.get(t), values):
+                if t <= last and not np.array_equal(first.get(t, ()), values, equal_nan=True):
                     t += again
                 else:
                     first[t] = values
@@ -491,25 +480,22 @@ class JsonLines:
                 zero = t
                 self.origin = origin_at(t / clock.second)
             last = t
-            whole = not any(math.isnan(values[channel]) for channel in needed)
-            if not any_held:
-                if whole:
-                    yield Sample(t=t - zero, z=values)
-                continue
-            array = np.array(list(values.values()))
-            left = thinned.take(t, array, chosen=k % self._every == 0, whole=whole)
+            whole = not np.isnan(values[needed]).any()
+            left: Array | None = values if whole else None
+            if any_held:
+                left = thinned.take(t, values, chosen=k % self.every == 0, whole=whole)
             if left is not None:
-                yield Sample(t=t - zero, z=dict(zip(values, left.tolist(), strict=True)))
+                yield Sample(t=t - zero, z=dict(zip(self.columns, left.tolist(), strict=True)))
 
-    def _values(self, row: Mapping[str, Any], where: str) -> dict[str, float]:
+    def _values(self, row: Mapping[str, Any], where: str) -> Array:
         """Return the values of the channels in a row, NaN where they are missing or not valid."""
         values = {}
-        for channel, column in self._columns.items():
-            value = channel_value(column, row, self._missing, where)
+        for channel, column in self.columns.items():
+            value = channel_value(column, row, self.missing, where)
             low, high = column.valid
             values[channel] = value if low <= value <= high else math.nan
-        without_noise(self._columns, values)
-        return values
+        without_noise(self.columns, values)
+        return np.array(list(values.values()))
 
     def _timed_rows(self, thinned: Thinned) -> Iterator[tuple[str, dict[str, Any], float, bool]]:
         """Iterate over the rows between start and stop: name, row, time, and whether it is a date.
@@ -518,19 +504,19 @@ class JsonLines:
         which may have no end of its own.
         """
         dates = None
-        for number, line in enumerate(self._lines, start=1):
+        for number, line in enumerate(self.lines, start=1):
             if not line.strip():
                 continue
             where = f"{STREAM}, line {number}"
             row = _object(line, where)
-            t, dates = row_time(row, self._clock, where, dates)
-            low, high = self._clock.bounds(dates, STREAM)
+            t, dates = row_time(row, self.clock, where, dates)
+            low, high = self.clock.bounds(dates, STREAM)
             if t > high:
                 return
             if t >= low:
                 yield where, row, t, dates
             elif thinned.held.any():
-                thinned.remember(np.array(list(self._values(row, where).values())))
+                thinned.remember(self._values(row, where))
 
 
 def row_time(
@@ -588,14 +574,6 @@ def cell_number(value: Any, where: str, decimal: str = ".") -> float:
     return number
 
 
-def _same_values(known: Mapping[str, float] | None, values: Mapping[str, float]) -> bool:
-    """Return whether a row has the values of a known one."""
-    if known is None:
-        return False
-    pairs = zip(known.values(), values.values(), strict=True)
-    return all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
-
-
 def _disorder(where: str, repeated: bool, set_back: bool) -> TimeOrderError:
     how, remedy = "earlier than the one before", "sort the rows."
     if repeated:
@@ -615,11 +593,6 @@ def check_columns(
         if name not in known:
             ending = hint(name, known) if told else "."
             raise SampleError(f"{where}: there is no column '{name}'{ending}")
-
-
-def is_data(path: Path) -> bool:
-    """Return whether a file is data by its name: a case may name any other file as its data."""
-    return path.suffix.lower() in SHOWN
 
 
 def hint(name: str, known: list[str]) -> str:

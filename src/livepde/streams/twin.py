@@ -206,7 +206,7 @@ class Twin:
         return self.inputs(t) if self.inputs is not None else {}
 
     def _moment(self, t: float) -> Moment:
-        return Moment(t, self._inputs(t))
+        return Moment(float(t), self._inputs(float(t)))
 
     @cached_property
     def observed(self) -> Observed:
@@ -271,28 +271,19 @@ class Twin:
             return tuple(self._simulated(self.model, Advance(self.scheme, self.dt_max)))
         space = self.model.state_space
         if self.truth == "analytic" and self.u_true is not None:
-            return tuple(
-                self.model.impose(space.interpolate(self._exact(t)), self._moment(t))
-                for t in map(float, self.times)
-            )
-        if self.fine is None:
+            found = [space.interpolate(self._exact(float(t))) for t in self.times]
+        elif self.fine is None:
             return tuple(self._fine_states)
-        fine = self.fine.state_space
-        # Values of the fine state at the quadrature points of the estimator, then projected.
-        evaluate = {}
-        for name, block in space.fields.items():
-            points = block.measure.points
-            probe = fine.probe(points.reshape(len(points), -1), of="" if space.single else name)
-            evaluate[name] = probe
-
-        def moved(u: Array) -> Array:
-            parts = [block.project(evaluate[name] @ u) for name, block in space.fields.items()]
-            return np.concatenate(parts)
-
-        return tuple(
-            self.model.impose(moved(u), self._moment(float(t)))
-            for t, u in zip(self.times, self._fine_states, strict=True)
-        )
+        else:
+            # Values of the fine state at the quadrature points of the estimator, then projected.
+            parts = []
+            for name, block in space.fields.items():
+                points, of = block.measure.points, "" if space.single else name
+                probe = self.fine.state_space.probe(points.reshape(len(points), -1), of=of)
+                parts.append([block.project(probe @ u) for u in self._fine_states])
+            found = list(map(np.concatenate, zip(*parts, strict=True)))
+        times = map(self._moment, self.times)
+        return tuple(self.model.impose(u, at) for u, at in zip(found, times, strict=True))
 
     @cached_property
     def exact_data(self) -> Array:
@@ -302,12 +293,10 @@ class Twin:
         if self.truth == "fine" and self.fine is not None and self.observation.portable:
             model, states = self.fine, tuple(self._fine_states)
             observed = _bound(self.observation, model)
-        q = self.q
-        rows = [
-            observed.predict(u, q, self._moment(float(t)))
-            for t, u in zip(self.times, states, strict=True)
-        ]
-        return np.array(rows)
+        times = map(self._moment, self.times)
+        return np.array(
+            [observed.predict(u, self.q, at) for u, at in zip(states, times, strict=True)]
+        )
 
     def u(self, t: float) -> Array:
         """Return the exact state at a sample time as coefficients of the estimator, shape (n,)."""
