@@ -18,7 +18,8 @@ from scipy.spatial import Delaunay
 
 from livepde.dashboard import canvas
 from livepde.linalg import Array
-from livepde.plots import GREY, PALETTE, interval_95, labelled, sensor_places
+from livepde.plots import GREY, PALETTE, interval_95, sensor_places
+from livepde.plots.style import axis_label
 
 MOST_LINES = 120  # of a map in each direction
 OUTSIDE = 1e-9  # barycentric coordinates may be negative by so much
@@ -227,21 +228,17 @@ def drawn_by(data: xr.Dataset, cut: float) -> tuple[Callable[..., go.Figure], st
         hint = f" Translucent surface, and three cuts at {cut:.0%} of its size: drag to rotate."
         return partial(field_solid, cut=cut), hint
     if "y" in data.coords:
-        return field_map, " The region of fine mesh is shown. Double-click to show all." * _zoomed(
-            data
-        )
+        drawn = plane_map(data)
+        zoomed = _fine(drawn.x) or _fine(drawn.y)
+        hint = " The region of fine mesh is shown. Double-click to show all."
+        return field_map, hint if zoomed else ""
     return field_profile, " Grey: initial state."
-
-
-def _zoomed(data: xr.Dataset) -> bool:
-    drawn = plane_map(data)
-    return _fine(drawn.x) is not None or _fine(drawn.y) is not None
 
 
 def field_profile(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure:
     """Draw a field along an interval: with its 95 % band, and as it was at the start."""
     k = canvas.at_time(data, "snapshot", at)
-    figure = canvas.empty(labelled("x", canvas.unit_of(data, "x")), canvas.unit_label(data, name))
+    figure = canvas.empty(axis_label(data, "x"), canvas.unit_label(data, name))
     x, values = data["x"].values, data[name].values
     reach = [values]
     if k > 0:
@@ -262,14 +259,12 @@ def field_map(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure
     """Draw a field on a plane domain, on lines as dense as its mesh."""
     drawn = plane_map(data)
     values = data[name].values[canvas.at_time(data, "snapshot", at)]
-    unit = labelled("", canvas.unit_of(data, "x")).strip()
-    figure = canvas.empty(f"x {unit}", f"y {unit}", height=380)
+    figure = canvas.empty(axis_label(data, "x"), axis_label(data, "x", "y"), height=380)
     figure.add_heatmap(
         x=drawn.x,
         y=drawn.y,
         z=drawn.of(values).astype(np.float32),
-        colorscale=_colours(name),
-        colorbar=_bar(data, name),
+        **_colours(data, name),
         zsmooth="best",
         hovertemplate="x %{x:.4g}, y %{y:.4g}: %{z:.4g}<extra></extra>",
     )
@@ -284,10 +279,10 @@ def field_map(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure
             showlegend=False,
             hovertemplate=f"{kind} %{{text}}<extra></extra>",
         )
-    figure.update_layout(hovermode="closest", yaxis={"scaleanchor": "x", "constrain": "domain"})
-    figure.update_xaxes(constrain="domain", showgrid=False, zeroline=False)
-    figure.update_yaxes(showgrid=False, zeroline=False)
-    figure.update_layout(xaxis_range=_fine(drawn.x), yaxis_range=_fine(drawn.y))
+    plain = {"constrain": "domain", "showgrid": False, "zeroline": False}
+    figure.update_xaxes(range=_fine(drawn.x), **plain)
+    figure.update_yaxes(range=_fine(drawn.y), scaleanchor="x", **plain)
+    figure.update_layout(hovermode="closest")
     return figure
 
 
@@ -318,17 +313,18 @@ def field_solid(
             intensity=surface.of(values),
             cmin=low,
             cmax=high if high > low else low + 1.0,
-            colorscale=_colours(name),
-            colorbar=_bar(data, name),
+            **_colours(data, name),
             showscale=k == 0,
             opacity=opacity,
             flatshading=True,
             lighting={"ambient": 1.0, "diffuse": 0.0, "specular": 0.0},
             hovertemplate="%{x:.4g}, %{y:.4g}, %{z:.4g}: %{intensity:.4g}<extra></extra>",
         )
-    unit = labelled("", canvas.unit_of(data, "x")).strip()
     axes = {
-        f"{axis}axis": {"title": {"text": canvas.text(f"{axis} {unit}")}, "gridcolor": canvas.GRID}
+        f"{axis}axis": {
+            "title": {"text": canvas.text(axis_label(data, "x", axis))},
+            "gridcolor": canvas.GRID,
+        }
         for axis in "xyz"
     }
     camera = {"eye": {"x": 1.5, "y": 1.5, "z": 1.1}, "center": {"x": 0, "y": 0, "z": -0.1}}
@@ -338,10 +334,8 @@ def field_solid(
     return figure
 
 
-def _colours(name: str) -> str:
-    return "Cividis" if name.endswith("_std") else "Viridis"
-
-
-def _bar(data: xr.Dataset, name: str) -> dict[str, Any]:
+def _colours(data: xr.Dataset, name: str) -> dict[str, Any]:
+    """Return the colours of a field and their bar."""
     title = {"text": canvas.text(canvas.unit_label(data, name)), "side": "right"}
-    return {"title": title, "thickness": 14, "outlinewidth": 0, "exponentformat": "power"}
+    bar = {"title": title, "thickness": 14, "outlinewidth": 0, "exponentformat": "power"}
+    return {"colorscale": "Cividis" if name.endswith("_std") else "Viridis", "colorbar": bar}

@@ -15,10 +15,10 @@ from werkzeug.middleware.dispatcher import DispatcherMiddleware
 
 from livepde import __version__
 from livepde.dashboard import cards
-from livepde.dashboard.canvas import CONFIG, unit_of, when_axis
+from livepde.dashboard.canvas import CONFIG, when_axis
 from livepde.dashboard.panels import SECTIONS, Panel, panels
 from livepde.dashboard.view import RunView, View
-from livepde.plots.style import labelled
+from livepde.plots.style import axis_label
 from livepde.records import scalars
 from livepde.runs import run_names
 from livepde.runs.summary import digits
@@ -226,13 +226,8 @@ def _draw(app: dash.Dash, view: View) -> None:
     )
     def tell(at: float | None) -> tuple[Any, ...]:
         seen = view.look()
-        tables = cards.tables(seen)
-        return (
-            cards.verdict(seen),
-            cards.cards(seen.dataset, at),
-            tables["sensors"],
-            tables["events"],
-        )
+        shown = cards.cards(seen.dataset, at)
+        return cards.verdict(seen), shown, cards.sensor_tables(seen), cards.event_tables(seen)
 
     @app.callback(
         *(Output(f"panels-{key}", "children") for key in SECTIONS),
@@ -300,8 +295,6 @@ def harden(app: dash.Dash) -> None:
     @app.server.after_request  # type: ignore[untyped-decorator]
     def add(answer: Response) -> Response:
         answer.headers["Content-Security-Policy"] = policy
-        answer.headers["X-Content-Type-Options"] = "nosniff"
-        answer.headers["Referrer-Policy"] = "no-referrer"
         return answer
 
 
@@ -379,7 +372,7 @@ def _labels(datasets: Iterable[xr.Dataset]) -> dict[str, str]:
 
 def _title(data: xr.Dataset, label: str) -> str:
     """Return the name of an unknown with its unit, and what its column contains."""
-    name = labelled(label, unit_of(data, label))
+    name = axis_label(data, label)
     first_order = "comment" in data[f"{label}_std"].attrs
     return f"{name}, median ± first-order std. dev." if first_order else f"{name} ± std. dev."
 

@@ -193,7 +193,13 @@ class View:
             written=latest,
             problem="",
         )
-        seen = self._judged(self._follow(seen, journal) if live else self._load(seen, run), run)
+        if live:
+            seen = self._follow(seen, journal)
+        elif run.status == "running":
+            seen = replace(seen, dataset=None)
+        else:
+            seen = replace(seen, dataset=run.dataset, samples=run.dataset.sizes["time"])
+        seen = self._judged(seen, run)
         self._mark = mark  # last, so that after an error all is read again
         return seen
 
@@ -208,12 +214,6 @@ class View:
         notes = [note for note in run.notes if note not in found]
         ended = str(run.record.get("ended", ""))
         return replace(seen, doubts=found, notes=notes, checks=run.checks, ended=ended)
-
-    def _load(self, seen: RunView, run: runs.Run) -> RunView:
-        if run.status == "running":
-            return replace(seen, dataset=None)
-        data = run.dataset
-        return replace(seen, dataset=data, samples=data.sizes["time"])
 
     def _follow(self, seen: RunView, path: Path) -> RunView:
         with Journal.open(path) as journal:

@@ -16,6 +16,7 @@ from livepde.plots.style import (
     GREY,
     MOST_LINES,
     PALETTE,
+    axis_label,
     empty,
     figure_class,
     finish,
@@ -27,6 +28,7 @@ from livepde.plots.style import (
     sensor_names,
     sensor_places,
     sensor_units,
+    sensors_by_unit,
     time_axis,
     time_text,
     time_values,
@@ -118,10 +120,7 @@ def _measured_panels(data: xr.Dataset, t: Array, measured: Array) -> list[Callab
     def of(sensors: list[str]) -> Callable[[Axes], Axes]:
         return lambda ax: measured_and_predicted(data, t, measured, sensors=sensors, ax=ax)
 
-    names = sensor_names(data)
-    units = sensor_units(data, names)
-    each = dict.fromkeys(units.values())
-    return [of([name for name in names if units[name] == unit]) for unit in each]
+    return [of(sensors) for sensors in sensors_by_unit(data).values()]
 
 
 def measured_and_predicted(
@@ -154,7 +153,7 @@ def measured_and_predicted(
     shown = names if sensors is None else list(sensors)
     if unknown := [name for name in shown if name not in names]:
         raise ConfigurationError(f"there is no sensor '{unknown[0]}'; there are {names}.")
-    units = sensor_units(data, names)
+    units = sensor_units(data)
     several = list(dict.fromkeys(units[name] for name in shown))
     if len(several) > 1:
         raise ConfigurationError(
@@ -298,9 +297,9 @@ def corner(draws: xr.Dataset, names: Sequence[str] | None = None, *, axes: Any =
                 x, y = draws[against].values, draws[of].values
                 ax.plot(x, y, ".", color=PALETTE[0], markersize=2, alpha=0.3)
             if i == size - 1:
-                ax.set_xlabel(labelled(against, str(draws[against].attrs.get("units", ""))))
+                ax.set_xlabel(axis_label(draws, against))
             if k == 0 and i:
-                ax.set_ylabel(labelled(of, str(draws[of].attrs.get("units", ""))))
+                ax.set_ylabel(axis_label(draws, of))
     return axes
 
 
@@ -366,7 +365,6 @@ def _panels(data: xr.Dataset, times: Sequence[float] | int) -> list[Callable[[Ax
 def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) -> Axes:
     """Draw one unknown over time with its 95 % band; all its regions in one panel."""
     t = time_values(data, data["time"].values)
-    unit = str(data[labels[0]].attrs.get("units", ""))
     # The wide band of the prior would determine the scale and hide all later values.
     late = slice(max(len(t) // 10, scored_from(data) + len(t) // 20), None)
     reach: list[Array] = []
@@ -388,7 +386,7 @@ def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) 
     _mark_failures(data, ax)
     _mark_jumps(data, ax)
     time_axis(ax, data)
-    ax.set_ylabel(labelled(name, unit))
+    ax.set_ylabel(axis_label(data, labels[0], name))
     ax.set_title(f"{name}: estimate and 95 % band" if len(reach) > len(labels) else name)
     return finish(ax)
 
@@ -467,7 +465,7 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
     for kind, sensors in sensor_places(data).items():
         inside, edge = ("white", "black") if kind == "sensor" else ("black", "white")
         ax.plot(sensors.x, sensors.y, "o", ms=4, mec=edge, mfc=inside)
-    what = labelled(name.removesuffix("_std"), str(data[name].attrs.get("units", "")))
+    what = axis_label(data, name, name.removesuffix("_std"))
     ax.figure.colorbar(drawn, ax=ax, label=f"standard deviation of {what}" if spread else what)
     when = time_text(data, data["snapshot"].values[-1])
     whose = f"{'standard deviation of ' if spread else ''}{name.removesuffix('_std')}"
@@ -475,8 +473,8 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
     width, height = np.ptp(x), np.ptp(y)
     ax.set_aspect("equal" if max(width, height) < SLENDER * min(width, height) else "auto")
     ax.margins(0.0)
-    for axis, label in (("x", ax.set_xlabel), ("y", ax.set_ylabel)):
-        label(labelled(axis, str(data[axis].attrs.get("units", ""))))
+    ax.set_xlabel(axis_label(data, "x"))
+    ax.set_ylabel(axis_label(data, "y"))
     return ax
 
 
@@ -487,7 +485,7 @@ def _range_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
     )
     ax.plot(t, np.median(values, axis=1), color=PALETTE[0], label="median")
     time_axis(ax, data)
-    ax.set_ylabel(labelled(name, str(data[name].attrs.get("units", ""))))
+    ax.set_ylabel(axis_label(data, name))
     ax.set_title(f"{name} in space")
     return finish(ax)
 
@@ -521,7 +519,7 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, 
             t, root, color=PALETTE[0], label=f"root mean square; RMSE {_rms(errors[first:]):.3g}"
         )
     time_axis(ax, data)
-    ax.set_ylabel(labelled("measured − expected", str(data[variable].attrs.get("units", ""))))
+    ax.set_ylabel(axis_label(data, variable, "measured − expected"))
     ax.set_title(what)
     return finish(ax)
 
