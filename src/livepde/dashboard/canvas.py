@@ -124,8 +124,7 @@ def show(figure: go.Figure, parts: Sequence[Array]) -> None:
 class TimeAxis:
     """Axis of model times: dates, or numbers in a unit that suits the span."""
 
-    # scale, start: coefficients of the coordinate `start + t * scale`; of dates in milliseconds
-    # since 1970, the convention of Plotly
+    # The coordinate is start + t * scale: of dates in milliseconds since 1970, as Plotly has them
     scale: float
     start: float = 0.0
     unit: str = ""  # unit of numbers

@@ -6,7 +6,7 @@ Matrices that interpolate values at the vertices to the drawn points are cached.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Any
 
@@ -17,9 +17,10 @@ import xarray as xr
 from scipy.spatial import Delaunay
 
 from livepde.dashboard import canvas
-from livepde.linalg import Array
+from livepde.linalg import Array, IntArray
 from livepde.plots import GREY, PALETTE, interval_95, sensor_places
 from livepde.plots.style import axis_label
+from livepde.runs.exported import kinds_of
 
 MOST_LINES = 120  # of a map in each direction
 OUTSIDE = 1e-9  # barycentric coordinates may be negative by so much
@@ -44,8 +45,7 @@ OUT = 4.0  # how many times larger a domain is than where its mesh is fine, to b
 class Map:
     """A plane domain on a grid that is as fine as its mesh."""
 
-    # x, y: lines of the grid
-    x: Array
+    x: Array  # lines of the grid
     y: Array
     # From vertices to the points of the grid, row by row; shape (len(y) * len(x), vertices)
     weights: sp.csr_array
@@ -71,15 +71,32 @@ class Surface:
         return found
 
 
+@dataclass(frozen=True)
+class _Mesh:
+    """Vertices and cells, equal by their content: a key for cached cuts."""
+
+    content: tuple[bytes, bytes]
+    points: Array = field(compare=False)
+    cells: IntArray = field(compare=False)
+
+    @classmethod
+    def of(cls, data: xr.Dataset) -> _Mesh:
+        """Return the mesh of a dataset; without cells those of Delaunay."""
+        points = np.column_stack([data[axis].values for axis in "xyz" if axis in data.coords])
+        kinds = kinds_of(data)
+        cells = data[kinds[0]].values if kinds else Delaunay(points).simplices
+        cells = cells.astype(np.intp)
+        return cls((points.tobytes(), cells.tobytes()), points, cells)
+
+
 def plane_map(data: xr.Dataset) -> Map:
     """Return the map of a run in two space dimensions."""
-    points = np.column_stack([data["x"].values, data["y"].values])
-    return _plane_map(_Mesh(points, _corners(data, ("triangle", "quad"))))
+    return _plane_map(_Mesh.of(data))
 
 
 def boundary(data: xr.Dataset) -> Surface:
     """Return the surface of a solid domain."""
-    return _boundary(_solid(data))
+    return _boundary(_Mesh.of(data))
 
 
 def slices(data: xr.Dataset, share: float = 0.5) -> list[Surface]:
@@ -87,36 +104,7 @@ def slices(data: xr.Dataset, share: float = 0.5) -> list[Surface]:
 
     `share`: position of each plane, as a share of the range of its coordinate.
     """
-    return _slices(_solid(data), share)
-
-
-class _Mesh:
-    """Vertices and cells, hashed by their content: a key for cached cuts."""
-
-    def __init__(self, points: Array, cells: Any) -> None:
-        self.points = points
-        self.cells = cells
-        self._key = (points.tobytes(), cells.tobytes())
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Mesh) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-
-def _corners(data: xr.Dataset, kinds: tuple[str, ...]) -> Any:
-    """Return the vertices of each cell; without cells in the dataset those of Delaunay."""
-    for kind in kinds:
-        if kind in data:
-            return data[kind].values.astype(np.intp)
-    axes = [data[axis].values for axis in "xyz" if axis in data.coords]
-    return Delaunay(np.column_stack(axes)).simplices.astype(np.intp)
-
-
-def _solid(data: xr.Dataset) -> _Mesh:
-    points = np.column_stack([data[axis].values for axis in "xyz"])
-    return _Mesh(points, _corners(data, ("tetra", "hexahedron")))
+    return _slices(_Mesh.of(data), share)
 
 
 def _lines(values: Array) -> Array:

@@ -39,9 +39,8 @@ class Panel:
 
     name: str  # unique name among the panels of a run
     section: str  # key of `SECTIONS`
-    # title, about: title and caption, as plain text
-    title: str
-    about: str
+    title: str  # plain text
+    about: str  # caption, plain text
     figure: go.Figure
 
 
