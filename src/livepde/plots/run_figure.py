@@ -18,6 +18,7 @@ from livepde.plots.style import (
     PALETTE,
     axis_label,
     empty,
+    figure,
     figure_class,
     finish,
     groups,
@@ -105,12 +106,10 @@ def curves(data: xr.Dataset, t: Array, measured: Array, *, title: str = "") -> F
     title
         Title above all panels.
     """
-    figure_class()
     each = _measured_panels(data, t, measured)
-    drawn = empty(len(each), 1, title)
-    grid = drawn.add_gridspec(len(each), 1)
-    for k, draw in enumerate(each):
-        draw(drawn.add_subplot(grid[k, 0]))
+    drawn, axes = figure(len(each), 1, title)
+    for draw, ax in zip(each, axes, strict=True):
+        draw(ax)
     return drawn
 
 
@@ -212,12 +211,10 @@ def residuals(data: xr.Dataset, *, validation: bool = False, ax: Axes | None = N
 
     Parameters
     ----------
-    data
-        Dataset as returned by `Result.to_xarray()`.
+    data, ax
+        As for `estimates`.
     validation
         Draw those of the validation sensors instead.
-    ax
-        Where to draw; default a new figure.
 
     Raises
     ------
@@ -235,14 +232,12 @@ def field(data: xr.Dataset, name: str, *, std: bool = False, ax: Axes | None = N
 
     Parameters
     ----------
-    data
-        Dataset as returned by `Result.to_xarray()`.
+    data, ax
+        As for `estimates`.
     name
         The field.
     std
         Draw its standard deviation, on a plane, with the places of the sensors.
-    ax
-        Where to draw; default a new figure.
 
     Raises
     ------
@@ -427,8 +422,7 @@ def _mark_jumps(data: xr.Dataset, ax: Axes) -> None:
     for k, t in enumerate(time_values(data, times)):
         text = time_text(data, times[k]).removeprefix("t = ")
         label = f"jump at {text}" if len(times) == 1 else f"{len(times)} jumps"
-        if k:
-            label = "_jump"
+        label = "_jump" if k else label
         ax.axvline(t, label=label, color=PALETTE[1], linestyle="--", linewidth=1.0)
 
 
@@ -454,10 +448,8 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
     from matplotlib.tri import Triangulation
 
     x, y = data["x"].values, data["y"].values
-    if "triangle" in data:  # vertices of each cell, (cell, 3): a domain with holes or corners
-        triangles = Triangulation(x, y, data["triangle"].values)
-    else:
-        triangles = Triangulation(x, y)
+    # Vertices of each cell, (cell, 3): a domain may have holes or corners.
+    triangles = Triangulation(x, y, data["triangle"].values if "triangle" in data else None)
     spread = name.endswith("_std")
     drawn = ax.tripcolor(
         triangles, data[name].values[-1], shading="gouraud", cmap="cividis" if spread else "viridis"
@@ -480,9 +472,8 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
 
 def _range_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
     t, values = time_values(data, data["snapshot"].values), data[name].values
-    ax.fill_between(
-        t, values.min(axis=1), values.max(axis=1), color=PALETTE[0], alpha=0.2, label="range"
-    )
+    low, high = values.min(axis=1), values.max(axis=1)
+    ax.fill_between(t, low, high, color=PALETTE[0], alpha=0.2, label="range")
     ax.plot(t, np.median(values, axis=1), color=PALETTE[0], label="median")
     time_axis(ax, data)
     ax.set_ylabel(axis_label(data, name))
@@ -515,9 +506,8 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, 
         low, high = np.nanmin(seen, axis=1), np.nanmax(seen, axis=1)
         ax.fill_between(t, low, high, color=PALETTE[0], alpha=0.25, linewidth=0, label=label)
         root = np.sqrt(np.nanmean(seen**2, axis=1))
-        ax.plot(
-            t, root, color=PALETTE[0], label=f"root mean square; RMSE {_rms(errors[first:]):.3g}"
-        )
+        label = f"root mean square; RMSE {_rms(errors[first:]):.3g}"
+        ax.plot(t, root, color=PALETTE[0], label=label)
     time_axis(ax, data)
     ax.set_ylabel(axis_label(data, variable, "measured − expected"))
     ax.set_title(what)
