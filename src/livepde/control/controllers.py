@@ -14,8 +14,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from scipy.linalg import null_space, solve_discrete_are
 
-from livepde.control.galerkin import Discrete
-from livepde.control.reduced import ReducedModel
+from livepde.control.reduction import Discrete, ReducedModel
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
 

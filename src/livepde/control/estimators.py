@@ -12,8 +12,7 @@ from scipy.linalg import block_diag
 
 from livepde.checkpoint import packed, unpacked
 from livepde.control.controllers import Known
-from livepde.control.galerkin import Discrete
-from livepde.control.reduced import ReducedModel
+from livepde.control.reduction import Discrete, ReducedModel
 from livepde.errors import ConfigurationError, RunError, SampleError, TimeOrderError
 from livepde.identifier import Identifier
 from livepde.linalg import Array

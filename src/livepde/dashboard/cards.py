@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 from dash import html
 
-from livepde.dashboard.canvas import at_time, unit_label, when_axis
+from livepde.dashboard.figures.canvas import at_time, unit_label, when_axis
 from livepde.dashboard.view import RunView
 from livepde.frames import ERRORS
 from livepde.plots.style import axis_label, groups, modes_told, prior_left

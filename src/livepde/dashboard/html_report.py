@@ -40,9 +40,9 @@ def page_of(run: Run) -> str:
     with optional("dashboard", "A report as HTML needs Plotly and Jinja2"):
         from jinja2 import Environment, FileSystemLoader, StrictUndefined
         from plotly.offline import get_plotlyjs
-    from livepde.dashboard.canvas import CONFIG, when_axis
     from livepde.dashboard.cards import findings
-    from livepde.dashboard.panels import SECTIONS, panels
+    from livepde.dashboard.figures.canvas import CONFIG, when_axis
+    from livepde.dashboard.figures.panels import SECTIONS, panels
 
     data, events, counts = run.dataset, list[Event](), dict[tuple[str, str], int]()
     if not data.sizes["time"]:

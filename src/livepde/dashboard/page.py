@@ -15,8 +15,8 @@ from werkzeug.middleware.dispatcher import DispatcherMiddleware
 
 from livepde import __version__
 from livepde.dashboard import cards
-from livepde.dashboard.canvas import CONFIG, when_axis
-from livepde.dashboard.panels import SECTIONS, Panel, panels
+from livepde.dashboard.figures.canvas import CONFIG, when_axis
+from livepde.dashboard.figures.panels import SECTIONS, Panel, panels
 from livepde.dashboard.view import RunView, View
 from livepde.plots.style import axis_label
 from livepde.records import scalars

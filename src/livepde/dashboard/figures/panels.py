@@ -14,8 +14,8 @@ import numpy as np
 import plotly.graph_objects as go
 import xarray as xr
 
-from livepde.dashboard import canvas
-from livepde.dashboard.field_views import drawn_by, field_profile
+from livepde.dashboard.figures import canvas
+from livepde.dashboard.figures.field_views import drawn_by, field_profile
 from livepde.dashboard.view import READINGS
 from livepde.frames import ERRORS
 from livepde.linalg import Array

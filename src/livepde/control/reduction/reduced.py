@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
-from livepde.control.galerkin import Discrete, GalerkinReduction, Output
+from livepde.control.reduction.galerkin import Discrete, GalerkinReduction, Output
 from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Array

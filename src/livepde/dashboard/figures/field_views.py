@@ -16,7 +16,7 @@ import scipy.sparse as sp
 import xarray as xr
 from scipy.spatial import Delaunay
 
-from livepde.dashboard import canvas
+from livepde.dashboard.figures import canvas
 from livepde.linalg import Array, IntArray
 from livepde.plots import GREY, PALETTE, interval_95, sensor_places
 from livepde.plots.style import axis_label
