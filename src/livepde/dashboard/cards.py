@@ -258,29 +258,27 @@ def _field_card(data: xr.Dataset, name: str, at: float | None) -> Any:
 
 
 def event_tables(seen: RunView) -> list[Any]:
-    """Return the tables of events, irregular rows and checks; or that there are none."""
-    return [*_event_tables(seen)] or [html.P("No events and no irregular rows.")]
-
-
-def _event_tables(seen: RunView) -> Iterator[Any]:
-    """Yield the tables of events, irregular rows and checks that are not empty."""
+    """Return the tables of events, irregular rows and checks that are not empty; or a sentence."""
+    found = []
     if seen.events:
         events = [
             (_when(seen.dataset, event.t), event.kind, event.channel, event.message)
             for event in reversed(seen.events)
         ]
         columns: tuple[str, ...] = ("Time", "Event", "Channel", "Details")
-        yield _table("Events, newest first", columns, events)
+        found.append(_table("Events, newest first", columns, events))
     if seen.counts:
         counts = [(kind, channel or "–", n) for (kind, channel), n in seen.counts.items()]
-        yield _table("Irregular rows and values", ("Event", "Channel", "Number"), counts)
+        columns = ("Event", "Channel", "Number")
+        found.append(_table("Irregular rows and values", columns, counts))
     if seen.checks:
         checks = [
             ("✓" if c.ok else "✕ failed", c.name, f"{c.value:.5g}", f"{c.sense} {c.bound_text}")
             for c in seen.checks
         ]
         columns = ("Result", "Quantity", "Value", "Expected")
-        yield _table("Expected results", columns, checks)
+        found.append(_table("Expected results", columns, checks))
+    return found or [html.P("No events and no irregular rows.")]
 
 
 def sensor_tables(seen: RunView) -> list[Any]:

@@ -98,10 +98,6 @@ class FleetEngine(ABC):
         """Return the state at the end of a span, with that before it for members that failed."""
 
     @abstractmethod
-    def finite(self, state: State) -> bool:
-        """Return whether the beliefs about all members together are finite; see `Law.finite`."""
-
-    @abstractmethod
     def settled(self, state: State) -> State:
         """Return the state after the work that the law spreads over samples; see `Law.settled`."""
 
@@ -158,9 +154,6 @@ class SeparateEngine(FleetEngine):
         each = {k: report for k, (_, report) in enumerate(taken)}
         return tuple(new for new, _ in taken), reports.with_members(each)
 
-    def finite(self, state: tuple[Any, ...]) -> bool:
-        return all(self.law.finite(self.work, one) for one in state)
-
     def settled(self, state: tuple[Any, ...]) -> tuple[Any, ...]:
         return tuple(self.law.settled(self.work, one) for one in state)
 
@@ -203,9 +196,6 @@ class BlockEngine(FleetEngine):
         self, state: SensitivityState, span: Span
     ) -> tuple[SensitivityState, laws.MemberReports]:
         return self.law.step_members(self.work, state, span)
-
-    def finite(self, state: SensitivityState) -> bool:
-        return self.law.finite(self.work, state)
 
     def settled(self, state: SensitivityState) -> SensitivityState:
         return self.law.settled(self.work, state)

@@ -15,13 +15,7 @@ from numpy.typing import ArrayLike
 from livepde import checkpoint, errors
 from livepde.checkpoint import Fingerprint
 from livepde.fem import Inputs, Moment
-from livepde.fleet.engines import (
-    Beliefs,
-    BlockEngine,
-    FleetEngine,
-    SeparateEngine,
-    beginnings,
-)
+from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEngine, beginnings
 from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.frames import layout_of
 from livepde.identifier import Identifier
@@ -226,13 +220,12 @@ class Fleet:
                 pairs = zip(self._q0, moments, strict=True)
                 starts = [self.model.initial_state(q, at) for q, at in pairs]
             state = self._engine.start(self._q0, starts, moments)
-        if self.inputs and not self._engine.finite(state):
-            for k, name in enumerate(self.members):
-                if not self.law.finite(self._work, self._engine.member(state, k)):
-                    raise errors.SampleError(
-                        f"member '{name}' gets no finite initial state: check the values of its "
-                        f"inputs {list(self.inputs)}; the run begins with the next sample."
-                    )
+        for k, name in enumerate(self.members if self.inputs else ()):
+            if not self.law.finite(self._work, self._engine.member(state, k)):
+                raise errors.SampleError(
+                    f"member '{name}' gets no finite initial state: check the values of its "
+                    f"inputs {list(self.inputs)}; the run begins with the next sample."
+                )
         self._state, self._inputs, self._known = state, inputs, inputs.copy()
 
     def step(
@@ -500,10 +493,8 @@ class Fleet:
         for name, column in zip(names, array.T, strict=True):
             self._refuse_infinite(name, column)
         # Without names a sample has no values for validation.
-        validation = np.full(
-            (len(self), len(self.validation.names) if self.validation else 0), np.nan
-        )
-        return array, noise, validation, {}
+        hidden = len(self.validation.names) if self.validation else 0
+        return array, noise, np.full((len(self), hidden), np.nan), {}
 
     def _column(self, name: str, values: ArrayLike) -> Array:
         """Return a value of a channel for each member."""

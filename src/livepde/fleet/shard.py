@@ -478,14 +478,17 @@ class JoinedStates:
         index: Any = which
         if np.array_equal(which, np.arange(first, first + length)):
             index = slice(first, first + length)  # no copy
-        found = {
-            path: _repeated(leaf, length) if path in self._once else leaf[index]
-            for path, leaf in self._leaves.items()
-        }
+        found = {}
+        for path, leaf in self._leaves.items():
+            if path not in self._once:
+                found[path] = leaf[index]
+            else:  # one without members stays so
+                found[path] = (
+                    np.broadcast_to(leaf, (length, *leaf.shape[1:])) if len(leaf) else leaf
+                )
         self._taken = found
-        found = {**found, LOG: self._log[which][:, : self._rows[first]]}
-        state: State = checkpoint.rebuild(self._template, found)
-        return state
+        log = self._log[which][:, : self._rows[first]]
+        return checkpoint.rebuild(self._template, {**found, LOG: log})
 
     def put(self, which: IntArray, state: State) -> None:
         """Store states that were stepped: those that were taken last, or begun."""
@@ -539,13 +542,6 @@ class JoinedStates:
             other._once = set()
         other.take(np.array([0]))  # raises unless they have the structure of the template
         return other
-
-
-def _repeated(leaf: Array, length: int) -> Array:
-    """Return a leaf of one member as that of several; one without members stays so."""
-    return (
-        leaf if length == 1 or not len(leaf) else np.broadcast_to(leaf, (length, *leaf.shape[1:]))
-    )
 
 
 def _widened(array: Array, room: int, value: float) -> Array:

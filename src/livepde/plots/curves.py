@@ -89,7 +89,11 @@ def profiles(
     ConfigurationError
         The field does not exist, has more than one space dimension, or Matplotlib is not installed.
     """
-    _refuse_others(data, name)
+    fields = [str(key) for key in data if data[key].dims == ("snapshot", "vertex")]
+    if name not in fields:
+        raise ConfigurationError(f"the dataset has no field '{name}'; it has {fields}.")
+    if "y" in data.coords:
+        raise ConfigurationError("profiles are for one space dimension; use overview for maps.")
     ax = panel(ax)
     chosen = _snapshots(data, times)
     x = data["x"].values
@@ -118,15 +122,6 @@ def profiles(
     ax.set_ylabel(axis_label(data, name))
     ax.margins(x=0.02)
     return finish(ax, legend=legend, outside=True)
-
-
-def _refuse_others(data: xr.Dataset, name: str) -> None:
-    """Refuse what is not a field on an interval."""
-    fields = [str(key) for key in data if data[key].dims == ("snapshot", "vertex")]
-    if name not in fields:
-        raise ConfigurationError(f"the dataset has no field '{name}'; it has {fields}.")
-    if "y" in data.coords:
-        raise ConfigurationError("profiles are for one space dimension; use overview for maps.")
 
 
 def history(

@@ -80,16 +80,15 @@ def overview(
         raise ConfigurationError("the run contains no samples yet, so there is nothing to draw.")
     wide = [] if measured is None else _measured_panels(data, *measured)
     panels = _panels(data, times)
-    columns = 1 if len(panels) == 1 else 2
-    rows = len(wide) + math.ceil(len(panels) / columns)
-    drawn = empty(rows, columns, title)
-    grid = drawn.add_gridspec(rows, columns)
-    for row, draw in enumerate(wide):
-        draw(drawn.add_subplot(grid[row, :]))
-    for k, draw in enumerate(panels):
-        alone = k == len(panels) - 1 and k % columns == 0  # the last one may take the whole row
-        place = len(wide) + k // columns, slice(None) if alone else k % columns
-        draw(drawn.add_subplot(grid[place]))
+    each, columns = [*wide, *panels], 1 if len(panels) == 1 else 2
+    rows: list[Any] = [[k] * columns for k in range(len(wide))]
+    # The last panel may take the whole row.
+    pairs = range(len(wide), len(each), columns)
+    rows += [[k, min(k + 1, len(each) - 1)][:columns] for k in pairs]
+    drawn = empty(len(rows), columns, title)
+    axes = drawn.subplot_mosaic(rows)
+    for k, draw in enumerate(each):
+        draw(axes[k])
     return drawn
 
 

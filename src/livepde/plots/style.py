@@ -118,11 +118,6 @@ def time_values(data: xr.Dataset, times: ArrayLike) -> Array:
     return values
 
 
-def time_label(data: xr.Dataset) -> str:
-    """Return the label of a time axis; empty for dates."""
-    return "" if instants(data, []) is not None else labelled("t", time_scale(data)[1])
-
-
 def time_text(data: xr.Dataset, t: float) -> str:
     """Return one time as text: a date, or a number with its unit."""
     if instants(data, []) is not None:
@@ -216,9 +211,9 @@ def panel(ax: Axes | None) -> Axes:
 
 def time_axis(ax: Axes, data: xr.Dataset) -> None:
     """Label the time axis of a panel whose times are those of `time_values`."""
-    label = time_label(data)
-    ax.set_xlabel(label)
-    if not label:
+    dated = instants(data, []) is not None
+    ax.set_xlabel("" if dated else labelled("t", time_scale(data)[1]))
+    if dated:
         import matplotlib.dates
 
         dates: Any = matplotlib.dates  # has no types

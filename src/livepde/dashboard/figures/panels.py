@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -232,17 +233,10 @@ def unknowns(data: xr.Dataset, labels: Sequence[str], at: float | None = None) -
             if len(labels) <= style.MOST_LINES:
                 canvas.band(figure, t, low, high, colour, label, opacity)
         std = np.nan_to_num(data[f"{label}_std"].values, nan=0.0)
-        figure.add_scatter(
-            x=t,
-            y=value,
-            mode=_line_mode(t),
-            line={"color": colour, "width": 2},
-            name=canvas.text(_short(label)),
-            legendgroup=label,
-            showlegend=len(labels) > 1,
-            customdata=std,
-            hovertemplate="%{y:.4g} ± %{customdata:.2g}" if std.any() else "%{y:.4g}",
-        )
+        about: dict[str, Any] = {"legendgroup": label, "showlegend": len(labels) > 1}
+        about |= {"name": canvas.text(_short(label)), "mode": _line_mode(t), "customdata": std}
+        hover = "%{y:.4g} ± %{customdata:.2g}" if std.any() else "%{y:.4g}"
+        canvas.line(figure, t, value, colour, 2, hovertemplate=hover, **about)
         reference = data[label].attrs.get("reference")
         if reference is not None:
             reach.append(np.array([float(reference)]))
