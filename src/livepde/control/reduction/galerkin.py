@@ -118,6 +118,7 @@ class GalerkinReduction:
     outputs: Observed
     sensors: Observed
     V: Array  # basis, shape (n, r)
+    test: Array  # V^T M, shape (r, n); of a basis that is not orthonormal its dual in M
     # u, q, inputs: linearisation point: state, parameter, and value of each channel
     u: Array
     q: Array
@@ -144,7 +145,8 @@ class GalerkinReduction:
         spaces = (model.state_space, model.X, model.parameter_space)
         seen = outputs.bind(*spaces)
         measured = seen if sensors is None else sensors.bind(*spaces)
-        return cls(model, seen, measured, np.zeros((model.X.dim, 0)), start, physical, given)
+        empty = np.zeros((model.X.dim, 0))
+        return cls(model, seen, measured, empty, empty.T, start, physical, given)
 
     def with_basis(self, modes: int, rates: Sequence[float]) -> GalerkinReduction:
         """Return the reduction on an M-orthonormal basis, zero on fixed coefficients.
@@ -170,12 +172,7 @@ class GalerkinReduction:
         found = _orthonormal(np.hstack([_orthonormal(responses, M), slowest]), M)
         V = np.zeros((mass.shape[0], found.shape[1]))
         V[free] = found
-        return replace(self, V=V)
-
-    @cached_property
-    def test(self) -> Array:
-        """V^T M, shape (r, n)."""
-        return np.asarray(self.V.T @ self.model.mass)
+        return replace(self, V=V, test=V.T @ mass)
 
     @property
     def rows(self) -> list[int]:
