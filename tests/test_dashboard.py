@@ -27,8 +27,9 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cli, runs
-from livepde.dashboard import canvas, cards, field_views, panels, serve
+from livepde.dashboard import cards, serve
 from livepde.dashboard import view as views
+from livepde.dashboard.figures import canvas, field_views, panels
 from livepde.dashboard.view import Spread, View
 from livepde.frames import layout_of
 from livepde.models import heat

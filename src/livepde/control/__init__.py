@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from livepde.control.controllers import LQ, MPC, Controller, Decision, Goal, Known, Plan
 from livepde.control.estimators import Estimator, Kalman, Learned, Trust
-from livepde.control.galerkin import Discrete, Output
 from livepde.control.loop import Action, Loop
-from livepde.control.reduced import ReducedModel, reduce
+from livepde.control.reduction import Discrete, Output, ReducedModel, reduce
 
 __all__ = [
     "LQ",

@@ -9,18 +9,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
-from typing import Any, Literal, Protocol, TypeAlias
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from scipy.linalg import null_space, solve_discrete_are
 
-from livepde.control.galerkin import Discrete
-from livepde.control.reduced import ReducedModel
+from livepde.control.reduction import Discrete, ReducedModel
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
 
 FREE = (-np.inf, np.inf)
-Source: TypeAlias = Literal["estimate", "fallback"]
 
 
 def _finite(value: Any) -> bool:
@@ -66,12 +64,6 @@ class Goal:
     penalty: float | None = None
 
     def __post_init__(self) -> None:
-        for what in ("track", "move", "inputs", "limits", "price"):
-            if not isinstance(getattr(self, what), Mapping):
-                raise ConfigurationError(
-                    f"Goal: {what} must be a mapping from names to numbers; got "
-                    f"{getattr(self, what)!r}."
-                )
         for what, valid, expected in (
             ("track", lambda weight: _finite(weight) and weight >= 0.0, "a positive number"),
             # R of the Riccati equation is made of these and must be regular.
@@ -80,7 +72,12 @@ class Goal:
             ("limits", _range, "(least, largest) with least < largest"),
             ("price", _finite, "a number"),
         ):
-            for name, value in getattr(self, what).items():
+            values = getattr(self, what)
+            if not isinstance(values, Mapping):
+                raise ConfigurationError(
+                    f"Goal: {what} must be a mapping from names to numbers; got {values!r}."
+                )
+            for name, value in values.items():
                 if not valid(value):
                     raise ConfigurationError(
                         f"Goal: {what}['{name}'] must be {expected}; got {value!r}."
@@ -145,7 +142,7 @@ class Known:
     x: Array
     q: Array
     factor: Array
-    source: Source = "estimate"
+    source: Literal["estimate", "fallback"] = "estimate"
     why: str = ""
     offset: Array | None = None
     model: ReducedModel | None = None
@@ -451,34 +448,26 @@ class MPC:
         v = process.set_variable("_u", "v", (len(model.controls), 1))
         d = process.set_variable("_tvp", "d", (len(model.disturbances) or 1, 1))
         reference = process.set_variable("_tvp", "reference", (len(goal.track) or 1, 1))
-        ends = {
-            side: process.set_variable("_tvp", side, (len(goal.limits) or 1, 1))
-            for side in ("low", "high")
-        }
+        low = process.set_variable("_tvp", "low", (len(goal.limits) or 1, 1))
+        high = process.set_variable("_tvp", "high", (len(goal.limits) or 1, 1))
         A = process.set_variable("_p", "A", (r, r))
         B = process.set_variable("_p", "B", (r, len(model.channels)))
         f = process.set_variable("_p", "f", (r, 1))
-        channels = [
-            v[model.controls.index(name)]
-            if name in model.controls
-            else d[model.disturbances.index(name)]
-            for name in model.channels
-        ]
-        c = casadi.vertcat(*channels)
+        order = (*model.controls, *model.disturbances)
+        c = casadi.vertcat(v, d)[[order.index(name) for name in model.channels]]
         after = A @ x + B @ c + f
-        y = casadi.DM(model.outputs.C) @ after + casadi.DM(model.outputs.D) @ c
-        y += casadi.DM(model.outputs.d)
+        C, D, shift = map(casadi.DM, (model.outputs.C, model.outputs.D, model.outputs.d))
+        y = C @ after + D @ c + shift
         process.set_rhs("x", after)
-        cost = 0.0
+        cost, row = 0.0, model.outputs.names.index
         for k, (name, weight) in enumerate(goal.track.items()):
-            cost += weight * (y[model.outputs.names.index(name)] - reference[k]) ** 2
+            cost += weight * (y[row(name)] - reference[k]) ** 2
         for name, price in goal.price.items():
             cost += price * v[model.controls.index(name)]
         process.set_expression("cost", cost)
         for k, name in enumerate(goal.limits):
-            value = y[model.outputs.names.index(name)]
-            process.set_expression(f"low_{name}", ends["low"][k] - value)
-            process.set_expression(f"high_{name}", value - ends["high"][k])
+            process.set_expression(f"low_{name}", low[k] - y[row(name)])
+            process.set_expression(f"high_{name}", y[row(name)] - high[k])
         process.setup()
         return process
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -12,8 +12,7 @@ from scipy.linalg import block_diag
 
 from livepde.checkpoint import packed, unpacked
 from livepde.control.controllers import Known
-from livepde.control.galerkin import Discrete
-from livepde.control.reduced import ReducedModel
+from livepde.control.reduction import Discrete, ReducedModel
 from livepde.errors import ConfigurationError, RunError, SampleError, TimeOrderError
 from livepde.identifier import Identifier
 from livepde.linalg import Array
@@ -66,7 +65,16 @@ class Kalman:
                 "Kalman needs the noise of the sensors: give noise= to the observation."
             )
         offset = offset or {}
-        _check_noise({**drive, **offset}, model.channels)
+        for name, size in {**drive, **offset}.items():
+            if name not in model.channels:
+                raise ConfigurationError(
+                    f"Kalman: there is no channel '{name}'; the model has {list(model.channels)}."
+                )
+            if not (np.isfinite(size) and size >= 0.0):
+                raise ConfigurationError(
+                    f"Kalman: the standard deviation of '{name}' must be a number, at least 0; "
+                    f"got {size}."
+                )
         if not (np.isfinite(period) and period > 0.0):
             raise ConfigurationError(f"Kalman: period must be a positive number; got {period}.")
         self.model = model
@@ -182,19 +190,6 @@ class Kalman:
             raise RunError(f"{where} is of another reduced model: build it as it was then.")
         self.set(dict(zip(self.model.unknowns, leaves["q"].tolist(), strict=True)))
         self._x, self._P, self._t = leaves["x"], leaves["P"], float(leaves["t"])
-
-
-def _check_noise(sizes: Mapping[str, float], channels: Sequence[str]) -> None:
-    for name, size in sizes.items():
-        if name not in channels:
-            raise ConfigurationError(
-                f"Kalman: there is no channel '{name}'; the model has {list(channels)}."
-            )
-        if not (np.isfinite(size) and size >= 0.0):
-            raise ConfigurationError(
-                f"Kalman: the standard deviation of '{name}' must be a number, at least 0; "
-                f"got {size}."
-            )
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """The live page of a run in a browser, during the run and afterwards.
 
-`serve` starts it; `panels` draws datasets, also for reports.
+`serve` starts it; `figures` draws datasets, also for reports.
 """
 
 from __future__ import annotations

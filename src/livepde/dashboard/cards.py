@@ -15,9 +15,10 @@ import numpy as np
 import xarray as xr
 from dash import html
 
-from livepde.dashboard.canvas import at_time, unit_label, when_axis
+from livepde.dashboard.figures.canvas import at_time, unit_label, when_axis
 from livepde.dashboard.view import RunView
-from livepde.plots.style import groups, labelled, modes_told, prior_left
+from livepde.frames import ERRORS
+from livepde.plots.style import axis_label, groups, modes_told, prior_left
 from livepde.records import STATUS_CODES, field_names, interval_95, scalars
 from livepde.runs import Check, severities
 from livepde.runs.summary import STATES, channel_errors, determination, digits
@@ -209,20 +210,21 @@ def cards(data: xr.Dataset | None, at: float | None) -> list[Any]:
 
 def _card(data: xr.Dataset, label: str, k: int) -> Any:
     value, std = float(data[label].values[k]), float(data[f"{label}_std"].values[k])
-    lines: list[Any] = []
+    interval: Any = "no interval: this law has no covariance"
     if math.isfinite(std) and std > 0.0:
         low, high = (digits(float(end[k]), std)[0] for end in interval_95(data, label))
-        lines.append(
-            html.P(["95 % interval: ", html.Span(_between(low, high))], className="interval")
-        )
-    else:
-        lines.append(html.P("no interval: this law has no covariance", className="interval"))
+        interval = ["95 % interval: ", html.Span(_between(low, high))]
+    lines = [html.P(interval, className="interval")]
     if "reference" in data[label].attrs:
         reference = pretty(f"{float(data[label].attrs['reference']):.4g}")
         lines.append(html.P(f"reference {reference}", className="interval"))
     left = prior_left(data, label, k)
     if math.isfinite(left):
-        lines.append(_known(data, label, value, left))
+        state = determination(data[label].attrs, value, left)
+        text = STATES[state]
+        if state in ("partly", "pinned"):
+            text += f": std. dev. {100 * left:.2g}\N{NO-BREAK SPACE}% of the prior's"
+        lines.append(html.P([sign(GAINS[state]), text], className="known"))
     return _article(data, label, pretty(digits(value, std)[0]), "value", lines)
 
 
@@ -232,14 +234,6 @@ def _article(data: xr.Dataset, name: str, value: str, kind: str, lines: list[Any
     return html.Article(
         [html.H3(name), html.P([value, unit], className=kind), *lines], className="card"
     )
-
-
-def _known(data: xr.Dataset, label: str, value: float, left: float) -> Any:
-    state = determination(data[label].attrs, value, left)
-    level, text = GAINS[state], STATES[state]
-    if state in ("partly", "pinned"):
-        text += f": std. dev. {100 * left:.2g}\N{NO-BREAK SPACE}% of the prior's"
-    return html.P([sign(level), text], className="known")
 
 
 def _field_card(data: xr.Dataset, name: str, at: float | None) -> Any:
@@ -263,38 +257,36 @@ def _field_card(data: xr.Dataset, name: str, at: float | None) -> Any:
 # --- tables --------------------------------------------------------------------------------------
 
 
-def tables(seen: RunView) -> dict[str, list[Any]]:
-    """Return the tables: section -> components."""
-    data = seen.dataset
-    sensors = [] if data is None or not data.sizes["time"] else [_sensor_table(data)]
-    nothing = [html.P("No events and no irregular rows.")]
-    return {"sensors": sensors, "events": [*_event_tables(seen)] or nothing}
-
-
-def _event_tables(seen: RunView) -> Iterator[Any]:
-    """Yield the tables of events, irregular rows and checks that are not empty."""
+def event_tables(seen: RunView) -> list[Any]:
+    """Return the tables of events, irregular rows and checks that are not empty; or a sentence."""
+    found = []
     if seen.events:
         events = [
             (_when(seen.dataset, event.t), event.kind, event.channel, event.message)
             for event in reversed(seen.events)
         ]
         columns: tuple[str, ...] = ("Time", "Event", "Channel", "Details")
-        yield _table("Events, newest first", columns, events)
+        found.append(_table("Events, newest first", columns, events))
     if seen.counts:
         counts = [(kind, channel or "–", n) for (kind, channel), n in seen.counts.items()]
-        yield _table("Irregular rows and values", ("Event", "Channel", "Number"), counts)
+        columns = ("Event", "Channel", "Number")
+        found.append(_table("Irregular rows and values", columns, counts))
     if seen.checks:
         checks = [
             ("✓" if c.ok else "✕ failed", c.name, f"{c.value:.5g}", f"{c.sense} {c.bound_text}")
             for c in seen.checks
         ]
         columns = ("Result", "Quantity", "Value", "Expected")
-        yield _table("Expected results", columns, checks)
+        found.append(_table("Expected results", columns, checks))
+    return found or [html.P("No events and no irregular rows.")]
 
 
-def _sensor_table(data: xr.Dataset) -> Any:
-    last: dict[str, float] = {}
-    for variable, dimension in (("innovation", "sensor"), ("validation_error", "validation")):
+def sensor_tables(seen: RunView) -> list[Any]:
+    """Return the table of the sensors, if there are estimates."""
+    data, last = seen.dataset, dict[str, float]()
+    if data is None or not data.sizes["time"]:
+        return []
+    for variable, dimension in ERRORS:
         if variable in data:
             names = [str(name) for name in data[dimension].values]
             last |= dict(zip(names, data[variable].values[-1].tolist(), strict=True))
@@ -309,9 +301,9 @@ def _sensor_table(data: xr.Dataset) -> Any:
         )
         for name, (role, errors, _, refused) in channel_errors(data).items()
     ]
-    unit = labelled("", str(data["innovation"].attrs.get("units", ""))).strip()
-    title = f"Measured minus predicted {unit}".rstrip()
-    return _table(title, ("Channel", "Role", "Last", "Rejected", "Mean", "Root mean square"), rows)
+    title = axis_label(data, "innovation", "Measured minus predicted")
+    columns = ("Channel", "Role", "Last", "Rejected", "Mean", "Root mean square")
+    return [_table(title, columns, rows)]
 
 
 def _when(data: xr.Dataset | None, t: float | None) -> str:

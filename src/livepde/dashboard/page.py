@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html as markup
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -15,10 +15,10 @@ from werkzeug.middleware.dispatcher import DispatcherMiddleware
 
 from livepde import __version__
 from livepde.dashboard import cards
-from livepde.dashboard.canvas import CONFIG, unit_of, when_axis
-from livepde.dashboard.panels import SECTIONS, Panel, panels
+from livepde.dashboard.figures.canvas import CONFIG, when_axis
+from livepde.dashboard.figures.panels import SECTIONS, Panel, panels
 from livepde.dashboard.view import RunView, View
-from livepde.plots.style import labelled
+from livepde.plots.style import axis_label
 from livepde.records import scalars
 from livepde.runs import run_names
 from livepde.runs.summary import digits
@@ -108,38 +108,17 @@ def _skeleton() -> Any:
 
 
 def _timebar() -> Any:
-    """Return the slider that selects the time, and that of the cuts through solids."""
+    """Return the slider that selects the time, and the one of the cuts through solids."""
+    plain: Any = {"marks": None, "allow_direct_input": False}
+    history = dcc.Slider(0, 1, value=1, id="slider", updatemode="drag", disabled=True, **plain)
+    cut = dcc.Slider(0.05, 0.95, step=0.05, value=0.5, id="cut", **plain)
     return html.Div(
         [
             html.Label("History", htmlFor="slider", id="slider-label"),
-            dcc.Slider(
-                id="slider",
-                min=0,
-                max=1,
-                value=1,
-                marks=None,
-                updatemode="drag",
-                allow_direct_input=False,
-                disabled=True,
-            ),
+            history,
             html.Output(id="shown"),
             html.Button("Newest", id="newest", n_clicks=0),
-            html.Div(
-                [
-                    html.Label("Cuts", htmlFor="cut"),
-                    dcc.Slider(
-                        id="cut",
-                        min=0.05,
-                        max=0.95,
-                        step=0.05,
-                        value=0.5,
-                        marks=None,
-                        allow_direct_input=False,
-                    ),
-                ],
-                id="cutbar",
-                hidden=True,
-            ),
+            html.Div([html.Label("Cuts", htmlFor="cut"), cut], id="cutbar", hidden=True),
         ],
         id="timebar",
         role="group",
@@ -157,27 +136,18 @@ def _look(app: dash.Dash, view: View) -> None:
     @app.callback(
         Output("news", "data"),
         Output("tick", "interval"),
-        Output("title", "children"),
-        Output("chip", "children"),
         Output("chip", "className"),
-        Output("summary", "children"),
-        Output("facts", "children"),
+        *(Output(part, "children") for part in ("title", "chip", "summary", "facts")),
         Input("tick", "n_intervals"),
         State("news", "data"),
     )
     def look(_: int | None, known: int | None) -> tuple[Any, ...]:
         seen = view.look()
-        level = cards.STATUS.get(seen.status, ("info", ""))[0]
+        news = no_update if known == seen.version else seen.version
         pace = CATCHING_UP if seen.reading else FAST if seen.status in OPEN else SLOW
-        return (
-            no_update if known == seen.version else seen.version,
-            pace,
-            seen.title,
-            cards.chip(seen),
-            f"chip {level}",
-            cards.summary(seen),
-            cards.facts(seen),
-        )
+        level = cards.STATUS.get(seen.status, ("info", ""))[0]
+        texts = seen.title, cards.chip(seen), cards.summary(seen), cards.facts(seen)
+        return news, pace, f"chip {level}", *texts
 
 
 def _steer(app: dash.Dash, view: View) -> None:
@@ -185,11 +155,7 @@ def _steer(app: dash.Dash, view: View) -> None:
 
     @app.callback(
         Output("at", "data"),
-        Output("slider", "min"),
-        Output("slider", "max"),
-        Output("slider", "step"),
-        Output("slider", "value"),
-        Output("slider", "disabled"),
+        *(Output("slider", key) for key in ("min", "max", "step", "value", "disabled")),
         Output("shown", "children"),
         Input("news", "data"),
         Input("slider", "value"),
@@ -203,11 +169,9 @@ def _steer(app: dash.Dash, view: View) -> None:
             return None, 0, 1, 1, 1, True, ""
         low, high = (float(data["time"].values[k]) for k in (0, -1))
         step = (high - low) / STOPS or 1.0
-        at = before
+        at = None if dash.ctx.triggered_id == "newest" else before
         if dash.ctx.triggered_id == "slider":
             at = None if wanted >= high - step / 2 else wanted  # at the end it follows
-        elif dash.ctx.triggered_id == "newest":
-            at = None
         moment = high if at is None else at
         label = f"{'newest' if at is None else 'history'}: {when_axis(data).text(moment)}"
         return at, low, high, step, moment, not high > low, label
@@ -217,22 +181,15 @@ def _draw(app: dash.Dash, view: View) -> None:
     """Register the callbacks that draw text, tables and figures for the chosen time."""
 
     @app.callback(
-        Output("verdict", "children"),
-        Output("cards", "children"),
-        Output("tables-sensors", "children"),
-        Output("tables-events", "children"),
+        *(Output(part, "children") for part in ("verdict", "cards")),
+        *(Output(f"tables-{key}", "children") for key in ("sensors", "events")),
         Input("at", "data"),
         prevent_initial_call=True,
     )
     def tell(at: float | None) -> tuple[Any, ...]:
         seen = view.look()
-        tables = cards.tables(seen)
-        return (
-            cards.verdict(seen),
-            cards.cards(seen.dataset, at),
-            tables["sensors"],
-            tables["events"],
-        )
+        shown = cards.cards(seen.dataset, at)
+        return cards.verdict(seen), shown, cards.sensor_tables(seen), cards.event_tables(seen)
 
     @app.callback(
         *(Output(f"panels-{key}", "children") for key in SECTIONS),
@@ -253,16 +210,10 @@ def _draw(app: dash.Dash, view: View) -> None:
         if names == [panel.name for panel in shown]:
             same = (no_update,) * (2 * len(SECTIONS) + 1)
             return (*same, [panel.figure for panel in shown], [panel.about for panel in shown])
-        parts = [[panel for panel in shown if panel.section == key] for key in SECTIONS]
+        frames = [[_framed(panel) for panel in shown if panel.section == key] for key in SECTIONS]
         flat = data is None or "z" not in data.coords
         later = [no_update] * len(names)  # they come with their frames
-        return (
-            *([_framed(panel) for panel in part] for part in parts),
-            *(not part for part in parts),
-            flat,
-            later,
-            later,
-        )
+        return *frames, *(not part for part in frames), flat, later, later
 
 
 def _framed(panel: Panel) -> Any:
@@ -283,25 +234,16 @@ def _framed(panel: Panel) -> Any:
 
 def harden(app: dash.Dash) -> None:
     """Tell browsers to load nothing from elsewhere, and to run no script but the page's own."""
-    scripts = " ".join(
-        f"'{found}'" if not found.startswith("'") else found for found in app.csp_hashes()
-    )
-    policy = "; ".join(
-        [
-            "default-src 'self'",
-            # Plotly compiles code for its drawings with WebGL.
-            f"script-src 'self' 'unsafe-eval' {scripts}",
-            "style-src 'self' 'unsafe-inline'",
-            "img-src 'self' data: blob:",
-            "frame-ancestors 'none'",
-        ]
+    scripts = " ".join(app.csp_hashes())
+    policy = (
+        # Plotly compiles code for its drawings with WebGL.
+        f"default-src 'self'; script-src 'self' 'unsafe-eval' {scripts}; style-src 'self' "
+        "'unsafe-inline'; img-src 'self' data: blob:; frame-ancestors 'none'"
     )
 
     @app.server.after_request  # type: ignore[untyped-decorator]
     def add(answer: Response) -> Response:
         answer.headers["Content-Security-Policy"] = policy
-        answer.headers["X-Content-Type-Options"] = "nosniff"
-        answer.headers["Referrer-Policy"] = "no-referrer"
         return answer
 
 
@@ -357,7 +299,10 @@ def overview_page(folder: Path) -> WSGIApplication:
 def overview_table(views: Mapping[str, View]) -> Any:
     """Return a table of runs, those with the gravest verdict first."""
     seen = {name: views[name].look() for name in list(views)[:MOST_RUNS]}
-    labels = _labels(one.dataset for one in seen.values() if one.dataset is not None)
+    labels: dict[str, str] = {}  # unknown -> title of its column; those of the last run first
+    for one in seen.values():
+        if (data := one.dataset) is not None:
+            labels = {label: _title(data, label) for label in scalars(data)} | labels
     shown = list(labels)[:MOST_UNKNOWNS]
     titles = ["Run", "Status", "Assessment", "Newest sample", *(labels[k] for k in shown)]
     levels = {name: cards.gravest(one) for name, one in seen.items()}
@@ -369,17 +314,9 @@ def overview_table(views: Mapping[str, View]) -> Any:
     return [html.P(count), html.Table([head, html.Tbody(rows)])]
 
 
-def _labels(datasets: Iterable[xr.Dataset]) -> dict[str, str]:
-    """Return unknown -> title of its column; those of the last dataset come first."""
-    found: dict[str, str] = {}
-    for data in datasets:
-        found = {k: _title(data, k) for k in scalars(data)} | found
-    return found
-
-
 def _title(data: xr.Dataset, label: str) -> str:
     """Return the name of an unknown with its unit, and what its column contains."""
-    name = labelled(label, unit_of(data, label))
+    name = axis_label(data, label)
     first_order = "comment" in data[f"{label}_std"].attrs
     return f"{name}, median ± first-order std. dev." if first_order else f"{name} ± std. dev."
 

@@ -41,10 +41,7 @@ QUIET = 10.0  # seconds without news after which it is asked whether anyone stil
 
 
 class Spread(Generic[T]):
-    """Items by number, at most so many, spread evenly; the first and the newest are among them.
-
-    `most`: how many are kept.
-    """
+    """Items by number, at most `most`, spread evenly; the first and the newest are among them."""
 
     def __init__(self, most: int) -> None:
         self.most = most
@@ -73,9 +70,6 @@ class Spread(Generic[T]):
             self._settled = kept[-1]
             self._items = {number: self._items[number] for number in [*kept, numbers[-1]]}
 
-    def __len__(self) -> int:
-        return len(self._items)
-
     def __iter__(self) -> Iterator[tuple[int, T]]:
         return iter(self._items.items())
 
@@ -85,24 +79,19 @@ class RunView:
     """Contents of the live page of a run."""
 
     version: int = 0  # number that changes with the contents
-    # title, status: title and status of the run. Status is "waiting" (for the first sample),
-    # "running", "silent" (its source), "stopped" (unfinished, but without a writer), "finished",
-    # "interrupted" or "failed"; "unreadable" with a sentence in `problem`.
     title: str = ""
+    # "waiting" (for the first sample), "running", "silent" (its source), "stopped" (unfinished, but
+    # without a writer), "finished", "interrupted" or "failed"; "unreadable" with a `problem`
     status: str = "waiting"
     dataset: xr.Dataset | None = None  # estimates, thinned; None before the first
-    # samples, gap: number of estimates; one in `gap` of them is in the dataset
-    samples: int = 0
-    gap: int = 1
+    samples: int = 0  # number of estimates
+    gap: int = 1  # one in so many estimates is in the dataset
     reading: bool = False  # true while there is more to read
-    # events, counts: events and counts of the journal
-    events: Sequence[Event] = ()
+    events: Sequence[Event] = ()  # of the journal, as the next
     counts: Mapping[tuple[str, str], int] = field(default_factory=dict)
     unwell: str = ""  # reason why the run is not well, as in /health; empty if it is
-    # doubts, notes, checks: findings against the estimates, further notes of the run, and its
-    # checks
-    doubts: Sequence[str] = ()
-    notes: Sequence[str] = ()
+    doubts: Sequence[str] = ()  # findings against the estimates
+    notes: Sequence[str] = ()  # further notes of the run
     checks: Sequence[Check] = ()
     written: float = 0.0  # time of the last write, in seconds since 1970
     ended: str = ""  # date when the run ended, "" before
@@ -193,7 +182,13 @@ class View:
             written=latest,
             problem="",
         )
-        seen = self._judged(self._follow(seen, journal) if live else self._load(seen, run), run)
+        if live:
+            seen = self._follow(seen, journal)
+        elif run.status == "running":
+            seen = replace(seen, dataset=None)
+        else:
+            seen = replace(seen, dataset=run.dataset, samples=run.dataset.sizes["time"])
+        seen = self._judged(seen, run)
         self._mark = mark  # last, so that after an error all is read again
         return seen
 
@@ -208,12 +203,6 @@ class View:
         notes = [note for note in run.notes if note not in found]
         ended = str(run.record.get("ended", ""))
         return replace(seen, doubts=found, notes=notes, checks=run.checks, ended=ended)
-
-    def _load(self, seen: RunView, run: runs.Run) -> RunView:
-        if run.status == "running":
-            return replace(seen, dataset=None)
-        data = run.dataset
-        return replace(seen, dataset=data, samples=data.sizes["time"])
 
     def _follow(self, seen: RunView, path: Path) -> RunView:
         with Journal.open(path) as journal:

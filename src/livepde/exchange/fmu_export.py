@@ -82,20 +82,20 @@ def recipe_of(source: Case | str) -> Recipe:
 
     Raises `ConfigurationError`: the function cannot be loaded, or does not build an identifier.
     """
-    return _of_function(source) if isinstance(source, str) else _of_case(source)
-
-
-def _of_function(name: str) -> Recipe:
-    function = load_code(name, Path(), name, FUNCTION, allowed=True)
     files: dict[str, bytes] = {}
-    process = of_code(name, function)
-    inside = {"function": _moved(name, Path(), files)}
-    return Recipe(process, {**files, RECIPE: _json(inside)})
+    inside: dict[str, Any]
+    if isinstance(source, str):
+        function = load_code(source, Path(), source, FUNCTION, allowed=True)
+        process, inside = of_code(source, function), {"function": _moved(source, Path(), files)}
+    else:
+        process, inside = _of_case(source, files)
+    return Recipe(process, {**files, RECIPE: json.dumps(inside, indent=1).encode()})
 
 
-def _of_case(case: Case) -> Recipe:
+def _of_case(case: Case, files: dict[str, bytes]) -> tuple[UnitProcess, dict[str, Any]]:
+    """Return process and recipe of a case, and add its files to `files`."""
     spec, folder = case.spec, case.path.parent
-    files = {CASE: case.text.encode()}
+    files[CASE] = case.text.encode()
     settings = {}
     if ":" in spec.equation:
         settings["equation"] = _moved(spec.equation, folder, files)
@@ -105,15 +105,13 @@ def _of_case(case: Case) -> Recipe:
         settings["mesh.file"] = _taken(folder / spec.mesh.file, files)
     # Times of the data become the default experiment of the unit.
     origin, experiment = _dated(case)
-    inside = {
+    return replace(of_case(case, origin), experiment=experiment), {
         "name": case.name,
         "settings": settings,
         "allow_code": any(":" in value for value in settings.values()),
         "origin": None if origin is None else origin.isoformat(),
         "experiment": None if experiment is None else asdict(experiment),
     }
-    process = replace(of_case(case, origin), experiment=experiment)
-    return Recipe(process, {**files, RECIPE: _json(inside)})
 
 
 def _dated(case: Case) -> tuple[datetime | None, DataTimes | None]:
@@ -142,10 +140,6 @@ def _taken(path: Path, files: dict[str, bytes]) -> str:
     if files.setdefault(path.name, content) != content:
         raise ConfigurationError(f"{path}: the unit holds another file of that name: rename it.")
     return path.name
-
-
-def _json(content: Mapping[str, Any]) -> bytes:
-    return json.dumps(content, indent=1).encode()
 
 
 def opened(folder: Path) -> UnitProcess:

@@ -41,12 +41,18 @@ SAME = 1e-9
 
 
 @dataclass(frozen=True)
-class Port:
-    """Input or output channel of a unit, in the unit of its data."""
+class Variable:
+    """Description of a variable of a unit."""
 
     name: str
     unit: str
     text: str
+
+
+@dataclass(frozen=True)
+class Port(Variable):
+    """Input or output channel of a unit, in the unit of its data."""
+
     column: Column  # conversion of values to the unit of the model
 
     def taken(self, value: float, missing: frozenset[float]) -> float:
@@ -62,15 +68,6 @@ class Port:
 
 
 @dataclass(frozen=True)
-class OutputVariable:
-    """Description of an output variable."""
-
-    name: str
-    unit: str
-    text: str
-
-
-@dataclass(frozen=True)
 class DataTimes:
     """First and last time and usual step of the data, in seconds; None: unknown."""
 
@@ -83,9 +80,8 @@ class DataTimes:
 class UnitProcess:
     """An identifier with the inputs and outputs of a co-simulation unit."""
 
-    # name, title: a short name, and one line about it
     name: str
-    title: str
+    title: str  # one line about it
     model: Model
     inputs: tuple[Port, ...]  # input channels, read at each communication point
     # Sensor channels whose model values are outputs, including those for validation
@@ -114,12 +110,12 @@ class UnitProcess:
             if name not in self.fields
         ]
 
-    def outputs(self) -> list[OutputVariable]:
+    def outputs(self) -> list[Variable]:
         """Return descriptions of the outputs except the status, in the order of `shown`.
 
         Raises `ConfigurationError`: two outputs have the same name.
         """
-        found = [OutputVariable("estimate_time", "s", "Time of the last sample that was used.")]
+        found = [Variable("estimate_time", "s", "Time of the last sample that was used.")]
         space = self.model.parameter_space
         for label in space.labels:
             found += self._estimated(label, label)
@@ -128,7 +124,7 @@ class UnitProcess:
                 found += self._estimated(name, f"{name}[{k + 1}]")
         for port in self.sensors:
             text = f"The model's value of {port.name}."
-            found.append(OutputVariable(f"{port.name}_model", port.unit, text))
+            found.append(Variable(f"{port.name}_model", port.unit, text))
         names = [port.name for port in self.inputs] + [item.name for item in found]
         names += ["status", "time", PERIOD]
         for name in names:
@@ -139,13 +135,12 @@ class UnitProcess:
                 )
         return found
 
-    def _estimated(self, label: str, name: str) -> Iterator[OutputVariable]:
+    def _estimated(self, label: str, name: str) -> Iterator[Variable]:
         unit = self.model.parameter_space.unknown_of(label).unit
-        yield OutputVariable(name, unit, f"Estimate of {name}.")
+        yield Variable(name, unit, f"Estimate of {name}.")
         if self.covariance:
-            yield OutputVariable(
-                f"{name}_std", STEPS.get(unit, unit), f"Standard deviation of {name}."
-            )
+            text = f"Standard deviation of {name}."
+            yield Variable(f"{name}_std", STEPS.get(unit, unit), text)
 
     def unknown(self) -> list[float]:
         """Return the outputs before the first sample: the prior, and NaN for model values."""
@@ -202,7 +197,7 @@ def of_case(case: Case, origin: datetime | None = None) -> UnitProcess:
         lambda first: case.begin(first, origin).identifier,
         case.clock.second,
         frozenset(case.spec.data.missing),
-        _has_covariance(case.law),
+        not isinstance(case.law, GradientLaw),
     )
 
 
@@ -223,9 +218,7 @@ def of_code(name: str, build: Callable[[], Identifier]) -> UnitProcess:
             f"{name} returned {type(identifier).__name__}; expected () -> livepde.Identifier."
         )
     sensors = _ports(identifier.observed, "Sensor.")
-    unseen = (
-        [] if identifier.validation is None else _ports(identifier.validation, "Validation sensor.")
-    )
+    unseen = _ports(identifier.validation, "Validation sensor.")
     inputs = [Port(c, "", "Input of model or sensors.", Column((c,))) for c in identifier.inputs]
     time_unit = identifier.model.time_unit
     second = conversion("s", time_unit, f"{name}: time_unit").factor if time_unit else 1.0
@@ -238,18 +231,16 @@ def of_code(name: str, build: Callable[[], Identifier]) -> UnitProcess:
         # Each instance of the unit starts from a copy: `identifier` stays as it was built.
         lambda first: copy.deepcopy(identifier),
         second,
-        covariance=_has_covariance(identifier.law),
+        covariance=not isinstance(identifier.law, GradientLaw),
         experiment=DataTimes(identifier.t / second),
     )
 
 
-def _ports(observed: Observed, text: str) -> list[Port]:
+def _ports(observed: Observed | None, text: str) -> list[Port]:
+    if observed is None:
+        return []
     named = zip(observed.names, observed.units, strict=True)
     return [Port(name, unit, text, Column((name,))) for name, unit in named]
-
-
-def _has_covariance(law: object) -> bool:
-    return not isinstance(law, GradientLaw)
 
 
 class Component:
@@ -317,9 +308,8 @@ class Component:
             self._identifier = None
             return
         # A new identifier is built only if the state began with another sample.
-        if self._identifier is None or not np.array_equal(
-            self._first, leaves["first"], equal_nan=True
-        ):
+        same = np.array_equal(self._first, leaves["first"], equal_nan=True)
+        if self._identifier is None or not same:
             self._identifier = self._begun(leaves["first"])
         self._identifier.restore(leaves["identifier"].tobytes(), where)
 

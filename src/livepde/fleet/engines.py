@@ -6,7 +6,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 
@@ -74,13 +74,16 @@ class FleetEngine(ABC):
     A state is a value: a returned state never changes.
     """
 
-    def __init__(self, law: Any, work: Any) -> None:
+    def __init__(self, law: Any, work: Any, begins: Sequence[Any]) -> None:
         self.law = law
         self.work = work
+        self._begins = begins  # the parts of the law with which each member begins
 
-    def subset(self, which: IntArray) -> FleetEngine:
+    def subset(self, which: IntArray) -> Self:
         """Return a stepper of some members, by number."""
-        return self
+        other = copy.copy(self)
+        other._begins = [self._begins[k] for k in which]
+        return other
 
     @abstractmethod
     def start(self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]) -> State:
@@ -93,10 +96,6 @@ class FleetEngine(ABC):
     @abstractmethod
     def step(self, state: State, span: Span) -> tuple[State, laws.MemberReports]:
         """Return the state at the end of a span, with that before it for members that failed."""
-
-    @abstractmethod
-    def finite(self, state: State) -> bool:
-        """Return whether the beliefs about all members together are finite; see `Law.finite`."""
 
     @abstractmethod
     def settled(self, state: State) -> State:
@@ -122,19 +121,14 @@ class FleetEngine(ABC):
 class SeparateEngine(FleetEngine):
     """Any law, member by member, with its precomputed parts shared by all members.
 
-    The state is a tuple of the states of the law. `begins` are the parts with which each member
-    begins.
+    The state is a tuple of the states of the law.
     """
 
     def __init__(
-        self, law: laws.AnyLaw, work: Any, problem: laws.Problem, begins: Sequence[Any]
+        self, law: laws.AnyLaw, work: Any, begins: Sequence[Any], problem: laws.Problem
     ) -> None:
-        super().__init__(law, work)
+        super().__init__(law, work, begins)
         self.problem = problem
-        self._begins = begins
-
-    def subset(self, which: IntArray) -> SeparateEngine:
-        return SeparateEngine(self.law, self.work, self.problem, [self._begins[k] for k in which])
 
     def start(
         self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]
@@ -152,19 +146,13 @@ class SeparateEngine(FleetEngine):
     def step(
         self, state: tuple[Any, ...], span: Span
     ) -> tuple[tuple[Any, ...], laws.MemberReports]:
-        taken = self._stepped(state, span)
+        parts = self.law, self.work, self.problem
+        taken = [laws.stepped(*parts, one, span.member(k)) for k, one in enumerate(state)]
         members, sensors = len(taken), len(taken[0][1].predicted)
         blank = np.zeros((members, sensors)), np.zeros(members, dtype=int)
         reports = laws.MemberReports((laws.Status(),) * members, *blank)
         each = {k: report for k, (_, report) in enumerate(taken)}
         return tuple(new for new, _ in taken), reports.with_members(each)
-
-    def _stepped(self, state: tuple[Any, ...], span: Span) -> list[tuple[Any, laws.Report]]:
-        parts = self.law, self.work, self.problem
-        return [laws.stepped(*parts, one, span.member(k)) for k, one in enumerate(state)]
-
-    def finite(self, state: tuple[Any, ...]) -> bool:
-        return all(self.law.finite(self.work, one) for one in state)
 
     def settled(self, state: tuple[Any, ...]) -> tuple[Any, ...]:
         return tuple(self.law.settled(self.work, one) for one in state)
@@ -185,22 +173,10 @@ class SeparateEngine(FleetEngine):
 
 
 class BlockEngine(FleetEngine):
-    """All members as arrays, by `SensitivityLaw.step_members`; the leading axis is the members.
-
-    `begins` are the parts with which each member begins.
-    """
+    """All members as arrays, by `SensitivityLaw.step_members`; the leading axis is the members."""
 
     law: laws.SensitivityLaw
     work: SensitivityWork
-
-    def __init__(self, law: Any, work: SensitivityWork, begins: Sequence[SensitivityWork]) -> None:
-        super().__init__(law, work)
-        self._begins = begins
-
-    def subset(self, which: IntArray) -> BlockEngine:
-        other = copy.copy(self)
-        other._begins = [self._begins[k] for k in which]
-        return other
 
     def start(
         self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]
@@ -220,9 +196,6 @@ class BlockEngine(FleetEngine):
         self, state: SensitivityState, span: Span
     ) -> tuple[SensitivityState, laws.MemberReports]:
         return self.law.step_members(self.work, state, span)
-
-    def finite(self, state: SensitivityState) -> bool:
-        return self.law.finite(self.work, state)
 
     def settled(self, state: SensitivityState) -> SensitivityState:
         return self.law.settled(self.work, state)

@@ -141,6 +141,7 @@ class _Row:
     """Record of an estimate: numbers over members, and no state."""
 
     t: float
+    parameters: Mapping[str, tuple[Array, Array]]
     innovation: Array
     validation_error: Array
     status: IntArray
@@ -153,6 +154,7 @@ class _Row:
         codes = [STATUS_CODES.index(status.code) for status in estimate.statuses]
         return cls(
             t=estimate.t,
+            parameters=estimate.parameters,
             innovation=estimate.innovation,
             validation_error=estimate.validation_error,
             status=np.array(codes, dtype=np.int32),
@@ -160,13 +162,6 @@ class _Row:
             diagnostics=estimate.diagnostics.named(),
             **more,
         )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _NumbersRow(_Row):
-    """Record with the unknown numbers and their standard deviations."""
-
-    parameters: Mapping[str, tuple[Array, Array]]
 
 
 class FleetResult:
@@ -181,14 +176,14 @@ class FleetResult:
         self.members = tuple(members)
         self.layout = layout
         self.last: FleetEstimate | None = None
-        self._rows: list[_NumbersRow] = []
+        self._rows: list[_Row] = []
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def add(self, estimate: FleetEstimate) -> None:
         """Add one estimate."""
-        self._rows.append(_NumbersRow.of(estimate, parameters=estimate.parameters))
+        self._rows.append(_Row.of(estimate))
         self.last = estimate
 
     def _settle(self, estimate: FleetEstimate) -> None:
@@ -228,20 +223,13 @@ class FleetResult:
         data["status"] = (both, self._series("status"), dict(STATUS_FLAGS))
         steps = self._series("steps")
         data["steps"] = (both, steps.astype(np.int32), {"long_name": "substeps taken"})
-        for name, values in self._diagnostics().items():
+        nothing = np.full(len(self.members), np.nan)  # of a law at samples without a number
+        for name in dict.fromkeys(chain.from_iterable(row.diagnostics for row in rows)):
+            values = self._table([row.diagnostics.get(name, nothing) for row in rows])
             # A diagnostic may have the name of an unknown, which comes first.
             data[f"{NOTE}{name}" if name in data else name] = (both, values)
         data.attrs["scalars"] = "\n".join(layout.scalars)
         return data
-
-    def _diagnostics(self) -> dict[str, Array]:
-        """Return numbers of the law, (members, times) each; NaN at samples that have none."""
-        names = dict.fromkeys(chain.from_iterable(row.diagnostics for row in self._rows))
-        nothing = np.full(len(self.members), np.nan)
-        return {
-            name: self._table([row.diagnostics.get(name, nothing) for row in self._rows])
-            for name in names
-        }
 
     def _series(self, name: str, *more: int) -> Array:
         return self._table([getattr(row, name) for row in self._rows], *more)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -15,13 +15,7 @@ from numpy.typing import ArrayLike
 from livepde import checkpoint, errors
 from livepde.checkpoint import Fingerprint
 from livepde.fem import Inputs, Moment
-from livepde.fleet.engines import (
-    Beliefs,
-    BlockEngine,
-    FleetEngine,
-    SeparateEngine,
-    beginnings,
-)
+from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEngine, beginnings
 from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.frames import layout_of
 from livepde.identifier import Identifier
@@ -158,17 +152,19 @@ class Fleet:
         begins = beginnings(self._work, readings, self._errors, u0s)
         if not self.note:
             return BlockEngine(self.law, self._work, begins)
-        if any(not np.array_equal(one, self._errors[0]) for one in self._errors):
-            raise errors.ConfigurationError(
-                "u0_errors differ between members, which are stepped separately, as "
-                f"{self.note}: give all the same."
-            )
-        if any(one.keys() != made_of[0].keys() for one in made_of):
-            raise errors.ConfigurationError(
-                "u0_from differs between members, which are stepped separately, as "
-                f"{self.note}: give all the same."
-            )
-        return SeparateEngine(self.law, self._work, self.problem, begins)
+        unlike = {
+            "u0_errors differ": any(
+                not np.array_equal(one, self._errors[0]) for one in self._errors
+            ),
+            "u0_from differs": any(one.keys() != made_of[0].keys() for one in made_of),
+        }
+        for what, differ in unlike.items():
+            if differ:
+                raise errors.ConfigurationError(
+                    f"{what} between members, which are stepped separately, as {self.note}: give "
+                    "all the same."
+                )
+        return SeparateEngine(self.law, self._work, begins, self.problem)
 
     def _each(self, what: str, value: Any) -> list[Any]:
         """Return a value for each member: a list has one for each."""
@@ -224,13 +220,12 @@ class Fleet:
                 pairs = zip(self._q0, moments, strict=True)
                 starts = [self.model.initial_state(q, at) for q, at in pairs]
             state = self._engine.start(self._q0, starts, moments)
-        if self.inputs and not self._engine.finite(state):
-            for k, name in enumerate(self.members):
-                if not self.law.finite(self._work, self._engine.member(state, k)):
-                    raise errors.SampleError(
-                        f"member '{name}' gets no finite initial state: check the values of its "
-                        f"inputs {list(self.inputs)}; the run begins with the next sample."
-                    )
+        for k, name in enumerate(self.members if self.inputs else ()):
+            if not self.law.finite(self._work, self._engine.member(state, k)):
+                raise errors.SampleError(
+                    f"member '{name}' gets no finite initial state: check the values of its "
+                    f"inputs {list(self.inputs)}; the run begins with the next sample."
+                )
         self._state, self._inputs, self._known = state, inputs, inputs.copy()
 
     def step(
@@ -290,21 +285,17 @@ class Fleet:
             span = ending(inputs0=self._inputs, z0=self._z, gaps=gaps if gaps.any() else None)
             span = span.driven(self.problem.control.held)
             self._state, report = self._engine.step(self._state, span)
-        self._count(t, report.statuses)
+        self._samples += 1
         self._keep(t, used, values, missing, report.statuses)
         return self._estimate(span, measured, validation, report, held)
-
-    def _count(self, t: float, statuses: Sequence[Status]) -> None:
-        """Count the steps that end at t."""
-        self._samples += 1
-        codes = [STATUS_CODES.index(status.code) for status in statuses]
-        self._steps = self._steps + np.eye(COUNTS, dtype=np.int64)[codes]
-        self._steps[:, -1] += [*map(self.problem.control.stretches, (t - self._t).tolist())]
 
     def _keep(
         self, t: float, used: Array, values: Array, missing: Array, statuses: Sequence[Status]
     ) -> None:
-        """Keep time and values of a sample for the members whose step was taken."""
+        """Count the steps; keep time and values of a sample where the step was taken."""
+        codes = [STATUS_CODES.index(status.code) for status in statuses]
+        self._steps = self._steps + np.eye(COUNTS, dtype=np.int64)[codes]
+        self._steps[:, -1] += [*map(self.problem.control.stretches, (t - self._t).tolist())]
         # A member whose step failed keeps its time and values: its next step covers both intervals.
         good = np.array([status.taken for status in statuses])
         lasting = (self._held + (t - self._t)[:, None]) * missing
@@ -338,15 +329,9 @@ class Fleet:
         return found
 
     def _expected(self, span: Span) -> MemberReports:
-        members = range(len(self))
-        beliefs = [self._believed(self._state, k) for k in members]
-        predicted = [
-            self.observed.predict(belief.u, belief.q, span.end.member(k))
-            for k, belief in zip(members, beliefs, strict=True)
-        ]
-        return MemberReports(
-            (Status(),) * len(self), np.array(predicted), np.zeros(len(self), dtype=int)
-        )
+        beliefs, count = self._engine.beliefs(self._state), len(self)
+        predicted = self._shown(self.observed, beliefs, span)
+        return MemberReports((Status(),) * count, predicted, np.zeros(count, dtype=int))
 
     def _believed(self, state: Any, k: int) -> Belief:
         return self.problem.physical(self._engine.believed(state, k))
@@ -360,11 +345,9 @@ class Fleet:
         held: dict[str, Array],
     ) -> FleetEstimate:
         state, engine, error = self._state, self._engine, validation
-        read: Callable[[], Beliefs] = lambda: engine.beliefs(state)  # noqa: E731
+        read = cache(lambda: engine.beliefs(state))
         if self.validation is not None:
-            beliefs = read()
-            read = lambda: beliefs  # noqa: E731
-            error = validation - self._shown(self.validation, beliefs.u, beliefs.q, span)
+            error = validation - self._shown(self.validation, read(), span)
         return FleetEstimate(
             t=span.t1,
             members=self.members,
@@ -381,8 +364,9 @@ class Fleet:
         )
 
     @staticmethod
-    def _shown(observed: Observed, u: Array, q: Array, span: Span) -> Array:
+    def _shown(observed: Observed, beliefs: Beliefs, span: Span) -> Array:
         """Return the predicted readings, shape (members, sensors)."""
+        u, q = beliefs.u, beliefs.q
         if type(observed) is Observed and observed.linear:
             shown: Array = (observed.G @ u.T).T
             return shown
@@ -506,14 +490,11 @@ class Fleet:
                 f"z has shape {array.shape}; {expected[0]} members with {expected[1]} sensors each "
                 f"need {expected}, NaN where a sample is missing."
             )
-        if np.isinf(array).any():
-            for name, column in zip(names, array.T, strict=True):
-                self._refuse_infinite(name, column)
+        for name, column in zip(names, array.T, strict=True):
+            self._refuse_infinite(name, column)
         # Without names a sample has no values for validation.
-        validation = np.full(
-            (len(self), len(self.validation.names) if self.validation else 0), np.nan
-        )
-        return array, noise, validation, {}
+        hidden = len(self.validation.names) if self.validation else 0
+        return array, noise, np.full((len(self), hidden), np.nan), {}
 
     def _column(self, name: str, values: ArrayLike) -> Array:
         """Return a value of a channel for each member."""
@@ -612,11 +593,7 @@ class Fleet:
             if header["begun"]:
                 moments = self._moments(self._t, np.zeros_like(self._inputs))
                 template = self._engine.start(self._q0, self._u0, moments)
-                inner = {
-                    path.removeprefix("state/"): leaf
-                    for path, leaf in leaves.items()
-                    if path.startswith("state/")
-                }
+                inner = {path.removeprefix("state/"): leaf for path, leaf in leaves.items()}
                 state = self._engine.restored(template, inner)
             ends, samples = {name: leaves[name] for name in self.ends}, int(leaves["samples"])
         except (KeyError, ValueError) as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -201,7 +202,8 @@ class Shard:
         self._fleet = Fleet(model, observation, law, members, **options)
         self.offset = 0
         self._places = {name: k for k, name in enumerate(self._fleet.members)}
-        self._states = states_of(self._fleet)
+        store = JoinedStates if self._fleet.together else OwnStates
+        self._states: JoinedStates | OwnStates = store(self._fleet.template(), len(self))
         self._taken: IntArray = np.zeros(len(self._fleet), dtype=np.int64)  # samples of each member
         self._torn = False
 
@@ -279,21 +281,19 @@ class Shard:
             f"were not: read the log again from {here} on."
         )
 
-    def _waves(self, items: Sequence[Item], estimates: ShardEstimates) -> Iterator[list[int]]:
-        """Yield rows in waves, in each of which a member has one sample at most."""
-        waves: list[list[int]] = []
-        counts: dict[str, int] = {}
+    def _waves(self, items: Sequence[Item], estimates: ShardEstimates) -> Iterable[list[int]]:
+        """Return rows in waves, in each of which a member has one sample at most."""
+        waves: dict[int, list[int]] = {}
+        counts: Counter[str] = Counter()
         for row, item in enumerate(items):
             try:
                 name = self._checked(item)
             except DataError as error:
                 estimates.refuse(row, str(error))
                 continue
-            k = counts[name] = counts.get(name, -1) + 1
-            if k == len(waves):
-                waves.append([])
-            waves[k].append(row)
-        yield from waves
+            waves.setdefault(counts[name], []).append(row)
+            counts[name] += 1
+        return waves.values()
 
     def _checked(self, item: Item) -> str:
         """Return the name of the member of a sample that has the right parts."""
@@ -478,14 +478,17 @@ class JoinedStates:
         index: Any = which
         if np.array_equal(which, np.arange(first, first + length)):
             index = slice(first, first + length)  # no copy
-        found = {
-            path: _repeated(leaf, length) if path in self._once else leaf[index]
-            for path, leaf in self._leaves.items()
-        }
+        found = {}
+        for path, leaf in self._leaves.items():
+            if path not in self._once:
+                found[path] = leaf[index]
+            else:  # one without members stays so
+                found[path] = (
+                    np.broadcast_to(leaf, (length, *leaf.shape[1:])) if len(leaf) else leaf
+                )
         self._taken = found
-        found = {**found, LOG: self._log[which][:, : self._rows[first]]}
-        state: State = checkpoint.rebuild(self._template, found)
-        return state
+        log = self._log[which][:, : self._rows[first]]
+        return checkpoint.rebuild(self._template, {**found, LOG: log})
 
     def put(self, which: IntArray, state: State) -> None:
         """Store states that were stepped: those that were taken last, or begun."""
@@ -541,25 +544,9 @@ class JoinedStates:
         return other
 
 
-def _repeated(leaf: Array, length: int) -> Array:
-    """Return a leaf of one member as that of several; one without members stays so."""
-    return (
-        leaf if length == 1 or not len(leaf) else np.broadcast_to(leaf, (length, *leaf.shape[1:]))
-    )
-
-
 def _widened(array: Array, room: int, value: float) -> Array:
     """Return an array with so many entries on its second axis."""
     more = room - array.shape[1]
     if more <= 0:
         return array
     return np.pad(array, ((0, 0), (0, more), (0, 0)), constant_values=value)
-
-
-MemberStates = OwnStates | JoinedStates
-
-
-def states_of(fleet: Fleet) -> MemberStates:
-    """Return room for the states of the members of a fleet."""
-    store = JoinedStates if fleet.together else OwnStates
-    return store(fleet.template(), len(fleet))

@@ -283,8 +283,7 @@ class DolfinxModel:
         # How many shape functions a row has depends on the element, so none are preallocated.
         G.setOption(petsc_module().Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
         for k in np.flatnonzero(first == comm.rank).tolist():
-            dofs, values = rows[k] or ([], [])
-            G.setValues([k], dofs, values)
+            G.setValues([k], *(rows[k] or ([], [])))
         G.assemble()
         return G
 

@@ -36,9 +36,10 @@ def save_state(
     numbers: dict[str, Any] = {"vectors": beside.name, "kind": type(state).__name__}
     numbers["sizes"] = _sizes(model)
     viewer = petsc_module().Viewer().createMPIIO(str(beside), "w", comm=comm)
-    for name, value in ((one.name, getattr(state, one.name)) for one in fields(state)):
+    for name, value in vars(state).items():
         if name in OF_Q + OF_U:
-            parts, order = _parts(value), model.numbers_q if name in OF_Q else model.numbers_u
+            parts = value if isinstance(value, tuple) else () if value is None else (value,)
+            order = model.numbers_q if name in OF_Q else model.numbers_u
             for vector in parts:
                 _ordered(vector, order).view(viewer)
             numbers[name] = len(parts)
@@ -83,13 +84,6 @@ def load_state(path: Path | str, model: PetscModel) -> Any:
 
 def _sizes(model: PetscModel) -> list[int]:
     return [model.mass.getSize()[0], model.gram.getSize()[0]]
-
-
-def _parts(value: Any) -> tuple[Any, ...]:
-    """Return the vectors of a field of a state: none, one or several."""
-    if isinstance(value, tuple):
-        return value
-    return () if value is None else (value,)
 
 
 def _encoded(value: Any) -> Any:

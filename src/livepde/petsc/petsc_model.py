@@ -16,6 +16,15 @@ from livepde.laws.law import Status
 from livepde.linalg import Array, IntArray
 from livepde.stepping import StepFailed
 
+RIESZ, PREFIX = "livepde_riesz_", "livepde_state_"  # prefixes of PETSc's options
+RESTING = 1e-6  # of u: residuals of smaller changes in a step are relative to it
+TINY = 1e-300
+SAME = 1e-9  # of a step: steps that are the same but for rounding
+REBUILD = 1.5  # times the iterations with a new preconditioner: then it is built again
+SHORTEST = 64  # steps that an interval is divided into at the most
+STEP = 1e-6  # of the differences of a check, relative
+CLOSE = 1e-5  # to a derivative, of a central difference with such a step
+ROUNDING = 1e-10
 MISSING = (
     "livepde.petsc needs petsc4py, mpi4py and, for UFL, DOLFINx; deploy/petsc.sh sets up an "
     "environment with Debian's packages: see docs/parallel.md."
@@ -79,38 +88,28 @@ class PetscModel(Protocol):
     @property
     def numbers_u(self) -> IntArray:
         """Number of each owned coefficient of u in an order that no number of ranks changes."""
-        ...
 
     @property
     def numbers_q(self) -> IntArray:
         """The same for q."""
-        ...
 
     def impose(self, u: Any, t: float) -> None:
         """Set the Dirichlet values of a time in u."""
-        ...
 
     def residual(self, u: Any, q: Any, t: float, w: Any = None) -> Any:
         """Return F(u, q, t), a new dual vector, shape (n,)."""
-        ...
 
     def jacobian_u(self, u: Any, q: Any, t: float, w: Any = None) -> Any:
         """Return dF/du, assembled, shape (n, n); None: zero, as for w with all of u observed."""
-        ...
 
     def jacobian_q(self, u: Any, q: Any, t: float, w: Any = None) -> Any:
         """Return dF/dq, shape (n, m); assembled if a `PetscObserver` uses it."""
-        ...
 
     def coupling(self, w: Any, q: Any, t: float) -> Any:
         """Return A(w), the derivative of F in q integrated over omega, assembled, shape (n, m).
 
         With all of u observed it is `jacobian_q` at w.
         """
-        ...
-
-
-RIESZ = "livepde_riesz_"  # prefix of PETSc's options
 
 
 def combined(weights: Array, vectors: Sequence[Any], onto: Any = None) -> Any:
@@ -181,14 +180,6 @@ def standard_vector(comm: Any, local: int) -> Any:
     vector.setType("standard")
     vector.set(0.0)
     return vector
-
-
-RESTING = 1e-6  # of u: residuals of smaller changes in a step are relative to it
-TINY = 1e-300
-SAME = 1e-9  # of a step: steps that are the same but for rounding
-REBUILD = 1.5  # times the iterations with a new preconditioner: then it is built again
-PREFIX = "livepde_state_"
-SHORTEST = 64  # steps that an interval is divided into at the most
 
 
 def advance(stage: Callable[..., Any], state: Any, t0: float, t1: float) -> tuple[Any, Status]:
@@ -305,11 +296,6 @@ class ImplicitStep:
         return x
 
 
-STEP = 1e-6  # of the differences, relative
-CLOSE = 1e-5  # to a derivative, of a central difference with such a step
-ROUNDING = 1e-10
-
-
 def check_petsc_model(
     model: PetscModel, u: Any, q: Any, t: float = 0.0, w: Any = None, *, seed: int = 1
 ) -> CheckReport:
@@ -330,14 +316,13 @@ def check_petsc_model(
     by_q = model.residual(u, q + dq * STEP, t, w) - model.residual(u, q - dq * STEP, t, w)
     wrong = "The matrix has to be the derivative of the residual."
     exchanged = "An inner product must be symmetric and positive."
-    size = driven.norm() * v.norm()
+    transposed = "multTranspose has to be the transpose of mult."
+    odd = abs(driven.dot(v) - dq.dot(back)) / (driven.norm() * v.norm() or 1.0)
     found = [
         ("dF/du as differences", _apart(by_u / (2.0 * STEP), slope), CLOSE, wrong),
         ("dF/dq as differences", _apart(by_q / (2.0 * STEP), driven), CLOSE, wrong),
+        ("(A q, v) = (q, A^T v)", odd, ROUNDING, transposed),
     ]
-    odd = abs(driven.dot(v) - dq.dot(back)) / (size or 1.0)
-    transposed = "multTranspose has to be the transpose of mult."
-    found.append(("(A q, v) = (q, A^T v)", odd, ROUNDING, transposed))
     named = (("M", model.mass, du, v), ("M_op", model.pull, du, v), ("G_Q", model.gram, dq, back))
     for name, matrix, a, b in named:
         size = (matrix * a).norm() * b.norm() or 1.0

@@ -13,6 +13,7 @@ from livepde.linalg import Array
 from livepde.plots.style import (
     GREY,
     PALETTE,
+    axis_label,
     empty,
     finish,
     labelled,
@@ -88,7 +89,11 @@ def profiles(
     ConfigurationError
         The field does not exist, has more than one space dimension, or Matplotlib is not installed.
     """
-    _refuse_others(data, name)
+    fields = [str(key) for key in data if data[key].dims == ("snapshot", "vertex")]
+    if name not in fields:
+        raise ConfigurationError(f"the dataset has no field '{name}'; it has {fields}.")
+    if "y" in data.coords:
+        raise ConfigurationError("profiles are for one space dimension; use overview for maps.")
     ax = panel(ax)
     chosen = _snapshots(data, times)
     x = data["x"].values
@@ -113,19 +118,10 @@ def profiles(
         ax.plot([], [], color=GREY, linewidth=1.0, label="exact")
     elif exact is not None:
         ax.plot(x, truth, color="black", linewidth=2.0, zorder=1.5, label="exact")
-    ax.set_xlabel(labelled("x", str(data["x"].attrs.get("units", ""))))
-    ax.set_ylabel(labelled(name, str(data[name].attrs.get("units", ""))))
+    ax.set_xlabel(axis_label(data, "x"))
+    ax.set_ylabel(axis_label(data, name))
     ax.margins(x=0.02)
     return finish(ax, legend=legend, outside=True)
-
-
-def _refuse_others(data: xr.Dataset, name: str) -> None:
-    """Refuse what is not a field on an interval."""
-    fields = [str(key) for key in data if data[key].dims == ("snapshot", "vertex")]
-    if name not in fields:
-        raise ConfigurationError(f"the dataset has no field '{name}'; it has {fields}.")
-    if "y" in data.coords:
-        raise ConfigurationError("profiles are for one space dimension; use overview for maps.")
 
 
 def history(
@@ -189,7 +185,7 @@ def loops(runs: Mapping[str, xr.Dataset], rows: Sequence[str], *, title: str = "
             if row == 0:
                 ax.set_title(label, fontsize="medium")
             if column == 0:
-                ax.set_ylabel(labelled(name, str(data[name].attrs.get("units", ""))))
+                ax.set_ylabel(axis_label(data, name))
             if row == len(rows) - 1:
                 ax.set_xlabel(labelled("t", clock))
             finish(ax, legend=column == 0)

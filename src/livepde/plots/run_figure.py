@@ -16,7 +16,9 @@ from livepde.plots.style import (
     GREY,
     MOST_LINES,
     PALETTE,
+    axis_label,
     empty,
+    figure,
     figure_class,
     finish,
     groups,
@@ -27,6 +29,7 @@ from livepde.plots.style import (
     sensor_names,
     sensor_places,
     sensor_units,
+    sensors_by_unit,
     time_axis,
     time_text,
     time_values,
@@ -77,16 +80,15 @@ def overview(
         raise ConfigurationError("the run contains no samples yet, so there is nothing to draw.")
     wide = [] if measured is None else _measured_panels(data, *measured)
     panels = _panels(data, times)
-    columns = 1 if len(panels) == 1 else 2
-    rows = len(wide) + math.ceil(len(panels) / columns)
-    drawn = empty(rows, columns, title)
-    grid = drawn.add_gridspec(rows, columns)
-    for row, draw in enumerate(wide):
-        draw(drawn.add_subplot(grid[row, :]))
-    for k, draw in enumerate(panels):
-        alone = k == len(panels) - 1 and k % columns == 0  # the last one may take the whole row
-        place = len(wide) + k // columns, slice(None) if alone else k % columns
-        draw(drawn.add_subplot(grid[place]))
+    each, columns = [*wide, *panels], 1 if len(panels) == 1 else 2
+    rows: list[Any] = [[k] * columns for k in range(len(wide))]
+    # The last panel may take the whole row.
+    pairs = range(len(wide), len(each), columns)
+    rows += [[k, min(k + 1, len(each) - 1)][:columns] for k in pairs]
+    drawn = empty(len(rows), columns, title)
+    axes = drawn.subplot_mosaic(rows)
+    for k, draw in enumerate(each):
+        draw(axes[k])
     return drawn
 
 
@@ -103,12 +105,10 @@ def curves(data: xr.Dataset, t: Array, measured: Array, *, title: str = "") -> F
     title
         Title above all panels.
     """
-    figure_class()
     each = _measured_panels(data, t, measured)
-    drawn = empty(len(each), 1, title)
-    grid = drawn.add_gridspec(len(each), 1)
-    for k, draw in enumerate(each):
-        draw(drawn.add_subplot(grid[k, 0]))
+    drawn, axes = figure(len(each), 1, title)
+    for draw, ax in zip(each, axes, strict=True):
+        draw(ax)
     return drawn
 
 
@@ -118,10 +118,7 @@ def _measured_panels(data: xr.Dataset, t: Array, measured: Array) -> list[Callab
     def of(sensors: list[str]) -> Callable[[Axes], Axes]:
         return lambda ax: measured_and_predicted(data, t, measured, sensors=sensors, ax=ax)
 
-    names = sensor_names(data)
-    units = sensor_units(data, names)
-    each = dict.fromkeys(units.values())
-    return [of([name for name in names if units[name] == unit]) for unit in each]
+    return [of(sensors) for sensors in sensors_by_unit(data).values()]
 
 
 def measured_and_predicted(
@@ -154,7 +151,7 @@ def measured_and_predicted(
     shown = names if sensors is None else list(sensors)
     if unknown := [name for name in shown if name not in names]:
         raise ConfigurationError(f"there is no sensor '{unknown[0]}'; there are {names}.")
-    units = sensor_units(data, names)
+    units = sensor_units(data)
     several = list(dict.fromkeys(units[name] for name in shown))
     if len(several) > 1:
         raise ConfigurationError(
@@ -213,12 +210,10 @@ def residuals(data: xr.Dataset, *, validation: bool = False, ax: Axes | None = N
 
     Parameters
     ----------
-    data
-        Dataset as returned by `Result.to_xarray()`.
+    data, ax
+        As for `estimates`.
     validation
         Draw those of the validation sensors instead.
-    ax
-        Where to draw; default a new figure.
 
     Raises
     ------
@@ -236,14 +231,12 @@ def field(data: xr.Dataset, name: str, *, std: bool = False, ax: Axes | None = N
 
     Parameters
     ----------
-    data
-        Dataset as returned by `Result.to_xarray()`.
+    data, ax
+        As for `estimates`.
     name
         The field.
     std
         Draw its standard deviation, on a plane, with the places of the sensors.
-    ax
-        Where to draw; default a new figure.
 
     Raises
     ------
@@ -298,9 +291,9 @@ def corner(draws: xr.Dataset, names: Sequence[str] | None = None, *, axes: Any =
                 x, y = draws[against].values, draws[of].values
                 ax.plot(x, y, ".", color=PALETTE[0], markersize=2, alpha=0.3)
             if i == size - 1:
-                ax.set_xlabel(labelled(against, str(draws[against].attrs.get("units", ""))))
+                ax.set_xlabel(axis_label(draws, against))
             if k == 0 and i:
-                ax.set_ylabel(labelled(of, str(draws[of].attrs.get("units", ""))))
+                ax.set_ylabel(axis_label(draws, of))
     return axes
 
 
@@ -366,7 +359,6 @@ def _panels(data: xr.Dataset, times: Sequence[float] | int) -> list[Callable[[Ax
 def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) -> Axes:
     """Draw one unknown over time with its 95 % band; all its regions in one panel."""
     t = time_values(data, data["time"].values)
-    unit = str(data[labels[0]].attrs.get("units", ""))
     # The wide band of the prior would determine the scale and hide all later values.
     late = slice(max(len(t) // 10, scored_from(data) + len(t) // 20), None)
     reach: list[Array] = []
@@ -388,7 +380,7 @@ def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) 
     _mark_failures(data, ax)
     _mark_jumps(data, ax)
     time_axis(ax, data)
-    ax.set_ylabel(labelled(name, unit))
+    ax.set_ylabel(axis_label(data, labels[0], name))
     ax.set_title(f"{name}: estimate and 95 % band" if len(reach) > len(labels) else name)
     return finish(ax)
 
@@ -429,8 +421,7 @@ def _mark_jumps(data: xr.Dataset, ax: Axes) -> None:
     for k, t in enumerate(time_values(data, times)):
         text = time_text(data, times[k]).removeprefix("t = ")
         label = f"jump at {text}" if len(times) == 1 else f"{len(times)} jumps"
-        if k:
-            label = "_jump"
+        label = "_jump" if k else label
         ax.axvline(t, label=label, color=PALETTE[1], linestyle="--", linewidth=1.0)
 
 
@@ -456,10 +447,8 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
     from matplotlib.tri import Triangulation
 
     x, y = data["x"].values, data["y"].values
-    if "triangle" in data:  # vertices of each cell, (cell, 3): a domain with holes or corners
-        triangles = Triangulation(x, y, data["triangle"].values)
-    else:
-        triangles = Triangulation(x, y)
+    # Vertices of each cell, (cell, 3): a domain may have holes or corners.
+    triangles = Triangulation(x, y, data["triangle"].values if "triangle" in data else None)
     spread = name.endswith("_std")
     drawn = ax.tripcolor(
         triangles, data[name].values[-1], shading="gouraud", cmap="cividis" if spread else "viridis"
@@ -467,7 +456,7 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
     for kind, sensors in sensor_places(data).items():
         inside, edge = ("white", "black") if kind == "sensor" else ("black", "white")
         ax.plot(sensors.x, sensors.y, "o", ms=4, mec=edge, mfc=inside)
-    what = labelled(name.removesuffix("_std"), str(data[name].attrs.get("units", "")))
+    what = axis_label(data, name, name.removesuffix("_std"))
     ax.figure.colorbar(drawn, ax=ax, label=f"standard deviation of {what}" if spread else what)
     when = time_text(data, data["snapshot"].values[-1])
     whose = f"{'standard deviation of ' if spread else ''}{name.removesuffix('_std')}"
@@ -475,19 +464,18 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
     width, height = np.ptp(x), np.ptp(y)
     ax.set_aspect("equal" if max(width, height) < SLENDER * min(width, height) else "auto")
     ax.margins(0.0)
-    for axis, label in (("x", ax.set_xlabel), ("y", ax.set_ylabel)):
-        label(labelled(axis, str(data[axis].attrs.get("units", ""))))
+    ax.set_xlabel(axis_label(data, "x"))
+    ax.set_ylabel(axis_label(data, "y"))
     return ax
 
 
 def _range_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
     t, values = time_values(data, data["snapshot"].values), data[name].values
-    ax.fill_between(
-        t, values.min(axis=1), values.max(axis=1), color=PALETTE[0], alpha=0.2, label="range"
-    )
+    low, high = values.min(axis=1), values.max(axis=1)
+    ax.fill_between(t, low, high, color=PALETTE[0], alpha=0.2, label="range")
     ax.plot(t, np.median(values, axis=1), color=PALETTE[0], label="median")
     time_axis(ax, data)
-    ax.set_ylabel(labelled(name, str(data[name].attrs.get("units", ""))))
+    ax.set_ylabel(axis_label(data, name))
     ax.set_title(f"{name} in space")
     return finish(ax)
 
@@ -517,11 +505,10 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, 
         low, high = np.nanmin(seen, axis=1), np.nanmax(seen, axis=1)
         ax.fill_between(t, low, high, color=PALETTE[0], alpha=0.25, linewidth=0, label=label)
         root = np.sqrt(np.nanmean(seen**2, axis=1))
-        ax.plot(
-            t, root, color=PALETTE[0], label=f"root mean square; RMSE {_rms(errors[first:]):.3g}"
-        )
+        label = f"root mean square; RMSE {_rms(errors[first:]):.3g}"
+        ax.plot(t, root, color=PALETTE[0], label=label)
     time_axis(ax, data)
-    ax.set_ylabel(labelled("measured − expected", str(data[variable].attrs.get("units", ""))))
+    ax.set_ylabel(axis_label(data, variable, "measured − expected"))
     ax.set_title(what)
     return finish(ax)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -75,16 +74,32 @@ def groups(data: xr.Dataset) -> dict[str, list[str]]:
     return found
 
 
-def labelled(name: str, unit: str) -> str:
-    """Return the label of an axis."""
+def unit_of(data: xr.Dataset, name: str) -> str:
+    """Return the unit of a variable as the dataset states it."""
+    return str(data[name].attrs.get("units", ""))
+
+
+def shown_unit(unit: str) -> str:
+    """Return a unit as figures show it; empty for 1."""
     for plain, pretty in (("degC", "°C"), ("**", "^"), ("^2", "²"), ("^3", "³")):
         unit = unit.replace(plain, pretty)
-    return f"{name} [{unit}]" if unit and unit != "1" else name
+    return "" if unit == "1" else unit
+
+
+def labelled(name: str, unit: str) -> str:
+    """Return the label of an axis."""
+    shown = shown_unit(unit)
+    return f"{name} [{shown}]" if shown else name
+
+
+def axis_label(data: xr.Dataset, name: str, text: str = "") -> str:
+    """Return the label of an axis for a variable: its name, or a text, and its unit."""
+    return labelled(text or name, unit_of(data, name))
 
 
 def time_scale(data: xr.Dataset) -> tuple[float, str]:
     """Return factor and unit of the time axis: days or hours for long runs in seconds."""
-    unit = str(data["time"].attrs.get("units", ""))
+    unit = unit_of(data, "time")
     if unit in ("s", "second", "seconds") and data.sizes["time"]:
         span = float(data["time"][-1] - data["time"][0])
         for least, factor, name in CLOCKS:
@@ -101,11 +116,6 @@ def time_values(data: xr.Dataset, times: ArrayLike) -> Array:
         return scaled
     values: Array = dates.tz_localize(None).to_numpy()
     return values
-
-
-def time_label(data: xr.Dataset) -> str:
-    """Return the label of a time axis; empty for dates."""
-    return "" if instants(data, []) is not None else labelled("t", time_scale(data)[1])
 
 
 def time_text(data: xr.Dataset, t: float) -> str:
@@ -130,14 +140,22 @@ def sensor_names(data: xr.Dataset) -> list[str]:
     return [str(name) for of in ("sensor", "validation") if of in data for name in data[of].values]
 
 
-def sensor_units(data: xr.Dataset, names: Sequence[str]) -> dict[str, str]:
+def sensor_units(data: xr.Dataset) -> dict[str, str]:
     """Return the unit of each sensor."""
-    units = dict.fromkeys(names, str(data["innovation"].attrs.get("units", "")))
+    units = dict.fromkeys(sensor_names(data), unit_of(data, "innovation"))
     for dimension in ("sensor", "validation"):
         if f"{dimension}_unit" in data.coords:
             own = data[f"{dimension}_unit"].values
             units |= dict(zip(map(str, data[dimension].values), map(str, own), strict=True))
     return units
+
+
+def sensors_by_unit(data: xr.Dataset) -> dict[str, list[str]]:
+    """Return a mapping from unit to the names of its sensors."""
+    found: dict[str, list[str]] = {}
+    for name, unit in sensor_units(data).items():
+        found.setdefault(unit, []).append(name)
+    return found
 
 
 class SensorPlaces(NamedTuple):
@@ -193,9 +211,9 @@ def panel(ax: Axes | None) -> Axes:
 
 def time_axis(ax: Axes, data: xr.Dataset) -> None:
     """Label the time axis of a panel whose times are those of `time_values`."""
-    label = time_label(data)
-    ax.set_xlabel(label)
-    if not label:
+    dated = instants(data, []) is not None
+    ax.set_xlabel("" if dated else labelled("t", time_scale(data)[1]))
+    if dated:
         import matplotlib.dates
 
         dates: Any = matplotlib.dates  # has no types

@@ -225,43 +225,25 @@ def first(progress: bool = False) -> tuple[dict[float, Track], Table]:
 # --- second figure -------------------------------------------------------------------------------
 
 COLUMNS = [
-    "noise, law",
-    "level",
-    "q = 0",
-    "error of q, best",
-    "at t",
-    "error at t = 75",
-    "+-",
-    "energy at 0",
-    "smallest",
-    "at t",
-    "+-",
-    "energy at t = 75",
-    "mean, t >= 50",
-    "failed",
+    *("noise, law", "level", "q = 0", "error of q, best", "at t", "error at t = 75", "+-"),
+    *("energy at 0", "smallest", "at t", "+-", "energy at t = 75", "mean, t >= 50", "failed"),
 ]
 
 
 def row(kind: str, level: float, runs: Ensemble) -> list[Any]:
     """Return one row of a table of noisy runs: means over the seeds +- standard deviations."""
-    error, ends = runs.error.mean(axis=0), runs.error[:, -1]
+    error, ends, energy, turning = (
+        runs.error.mean(axis=0),
+        runs.error[:, -1],
+        runs.mean,
+        runs.turning,
+    )
     best = int(error.argmin())
-    return [
-        kind,
-        level,
-        float(error[0]),
-        float(error[best]),
-        float(runs.times[best]),
-        float(ends.mean()),
-        float(ends.std()),
-        float(runs.mean[0]),
-        float(runs.mean.min()),
-        float(runs.turning.mean()),
-        float(runs.turning.std()),
-        float(runs.mean[-1]),
-        runs.late,
-        runs.failed,
+    numbers = [
+        *(error[0], error[best], runs.times[best], ends.mean(), ends.std()),
+        *(energy[0], energy.min(), turning.mean(), turning.std(), energy[-1], runs.late),
     ]
+    return [kind, level, *map(float, numbers), runs.failed]
 
 
 def paper_noise(
@@ -466,19 +448,8 @@ def _first(found: Track) -> Any:
     drawn, axes = plots.figure(
         1, 2, f"Parameter and state estimate, data on ({seed.OMEGA[0]}, {seed.OMEGA[1]})"
     )
-    data = found.result.to_xarray()
-    x = [data["x"].values]
-    states = np.array([seed.u_true(x, t) for t in seed.SHOWN])
-    for ax, name, exact in zip(axes, ("q", "u"), (seed.q_true(x), states), strict=True):
-        plots.profiles(
-            data,
-            name,
-            times=seed.SHOWN,
-            exact=exact,
-            observed=seed.OMEGA,
-            ax=ax,
-            legend=name == "u",
-        )
+    for ax, name in zip(axes, ("q", "u"), strict=True):
+        seed.draw_profiles(found, name, ax=ax, legend=name == "u")
     axes[0].set_title("$\\hat q(t, x)$")
     axes[1].set_title("$\\hat u(t, x)$")
     return drawn

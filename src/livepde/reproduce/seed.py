@@ -192,20 +192,12 @@ def _learned(
     late = [found.errors[found.times >= SETTLED_FROM - 1e-9] for found in settled]
     data = tracks[LIKE_PAPER].result.to_xarray()
     x, q = data["x"].values, data["q"].values[-1]
+    end = max(found.error(60.0) for found in settled)
+    name = f"shift of q to the right at t = 60, {_label(*LIKE_PAPER)} (0 for q = 0 and for q*)"
     checks += [
-        Check(
-            "largest error of q at t = 60, gain 1e4",
-            max(found.error(60.0) for found in settled),
-            SMALL,
-            "<=",
-        ),
+        Check("largest error of q at t = 60, gain 1e4", end, SMALL, "<="),
         Check("largest error of q from t = 6 on, gain 1e4", float(np.max(late)), SMALL, "<="),
-        Check(
-            f"shift of q to the right at t = 60, {_label(*LIKE_PAPER)} (0 for q = 0 and for q*)",
-            shift(x, q),
-            SHIFTED,
-            "in",
-        ),
+        Check(name, shift(x, q), SHIFTED, "in"),
     ]
     notes = [
         f"The data carry almost no information: q* against q = 0 changes u by {effect:.2%} at "
@@ -246,14 +238,17 @@ def _figure(tracks: dict[tuple[float, float], Track], twin: Twin, name: str) -> 
     what = {"q": "Parameter estimate $\\hat q(t, x)$", "u": "State estimate $\\hat u(t, x)$"}[name]
     drawn, axes = plots.figure(1, 2, f"{what}, data on ({OMEGA[0]}, {OMEGA[1]})")
     for ax, case in zip(axes, (LIKE_PAPER, BEST), strict=True):
-        data = tracks[case].result.to_xarray()
-        x = [data["x"].values]
-        exact = q_true(x) if name == "q" else np.array([u_true(x, t) for t in SHOWN])
-        plots.profiles(
-            data, name, times=SHOWN, exact=exact, observed=OMEGA, ax=ax, legend=ax is axes[-1]
-        )
+        draw_profiles(tracks[case], name, ax=ax, legend=ax is axes[-1])
         ax.set_title(_label(*case))
     return drawn
+
+
+def draw_profiles(found: Track, name: str, **options: Any) -> None:
+    """Draw q or u of a run, and the exact one; `options` are those of `profiles`."""
+    data = found.result.to_xarray()
+    x = [data["x"].values]
+    exact = q_true(x) if name == "q" else np.array([u_true(x, t) for t in SHOWN])
+    plots.profiles(data, name, times=SHOWN, exact=exact, observed=OMEGA, **options)
 
 
 SEED = Experiment(

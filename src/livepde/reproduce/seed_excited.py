@@ -112,15 +112,9 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
         ],
         [
             [
-                name,
-                twin.baseline(0.0),
-                found.error(1.0),
-                found.error(10.0),
-                found.error(60.0),
+                *(name, twin.baseline(0.0), *map(found.error, (1.0, 10.0, 60.0))),
                 EXPECTED[name] if truth == "discrete" else None,
-                found.u_error,
-                found.divided,
-                found.failed,
+                *(found.u_error, found.divided, found.failed),
             ]
             for name, found in tracks.items()
         ],

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
-from livepde.control.galerkin import Discrete, GalerkinReduction, Output, basis
+from livepde.control.reduction.galerkin import Discrete, GalerkinReduction, Output
 from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
@@ -127,12 +127,10 @@ class ReducedModel:
             Unknown numbers, shape (m,).
         """
         K, E, f = self.system(q)
-        r, columns = self.size, np.column_stack([E, f])
         # Van Loan's method: one exponential of the augmented matrix gives A, B and f together, also
         # for singular K.
-        whole = np.zeros((r + columns.shape[1], r + columns.shape[1]))
-        whole[:r, :r], whole[:r, r:] = -h * K, h * columns
-        moved = np.asarray(expm(whole))[:r]
+        upper, r = h * np.column_stack([-K, E, f]), self.size
+        moved = expm(np.vstack([upper, np.zeros((upper.shape[1] - r, upper.shape[1]))]))[:r]
         return Discrete(moved[:, :r], moved[:, r:-1], moved[:, -1])
 
     def project(self, u: Array) -> Array:
@@ -233,7 +231,13 @@ class ReducedModel:
                     f"coefficients, so it needs {mine.shape}."
                 )
         _known("about", inputs, self.channels)
-        return ReducedModel.of(frame.moved(u, q, inputs), self.controls)
+        frame = replace(
+            frame,
+            u=frame.u if u is None else u,
+            q=frame.q if q is None else q,
+            inputs={**frame.inputs, **(inputs or {})},
+        )
+        return ReducedModel.of(frame, self.controls)
 
     def error(
         self, q: Mapping[str, float] | None = None, *, h: float, samples: int = 100
@@ -364,9 +368,6 @@ def reduce(
         )
     frame = GalerkinReduction.linearised(model, outputs, sensors, u, q, inputs)
     frame.check_linear()
-    systems = [frame.at(value) for value in frame.extremes()]
-    lifting = np.column_stack(frame.boundary)
-    V = basis(model.mass, np.flatnonzero(model.X.free), systems, lifting, modes, rates)
-    frame = replace(frame, V=V, test=V.T @ model.mass)
+    frame = frame.with_basis(modes, rates)
     frame.check()
     return ReducedModel.of(frame, tuple(controls))

@@ -14,10 +14,12 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 import xarray as xr
+from plotly.colors import hex_to_rgb
 
 from livepde.dates import dated, since_1970
 from livepde.linalg import Array
 from livepde.plots import PALETTE, labelled, time_scale
+from livepde.plots.style import shown_unit, unit_of
 from livepde.runs import jumps
 
 FAR = 1e11  # seconds from the origin beyond which times are numbers
@@ -34,14 +36,9 @@ def text(value: object) -> str:
     return html.escape(str(value), quote=False)
 
 
-def unit_of(data: xr.Dataset, name: str) -> str:
-    """Return the unit of a variable as the dataset states it."""
-    return str(data[name].attrs.get("units", ""))
-
-
 def unit_label(data: xr.Dataset, name: str) -> str:
     """Return the unit of a variable for an axis."""
-    return labelled("", unit_of(data, name)).strip().strip("[]")
+    return shown_unit(unit_of(data, name))
 
 
 def empty(xlabel: str = "", ylabel: str = "", height: int = HEIGHT) -> go.Figure:
@@ -102,16 +99,11 @@ def band(
     figure: go.Figure, x: Any, low: Array, high: Array, colour: str, name: str, opacity: float = 0.2
 ) -> None:
     """Fill the area between two lines."""
-    shared: dict[str, Any] = {
-        "mode": "lines",
-        "line": {"width": 0, "color": colour},
-        "legendgroup": name,
-        "showlegend": False,
-    }
-    figure.add_scatter(x=x, y=low, name="from", hoverinfo="skip", **shared)
-    red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
+    shared: Any = {"legendgroup": name, "showlegend": False, "hoverinfo": "skip"}
+    line(figure, x, low, colour, 0, name="from", **shared)
+    red, green, blue = hex_to_rgb(colour)
     fill = f"rgba({red},{green},{blue},{opacity})"
-    figure.add_scatter(x=x, y=high, fill="tonexty", fillcolor=fill, hoverinfo="skip", **shared)
+    line(figure, x, high, colour, 0, fill="tonexty", fillcolor=fill, **shared)
 
 
 def show(figure: go.Figure, parts: Sequence[Array]) -> None:
@@ -132,8 +124,7 @@ def show(figure: go.Figure, parts: Sequence[Array]) -> None:
 class TimeAxis:
     """Axis of model times: dates, or numbers in a unit that suits the span."""
 
-    # scale, start: coefficients of the coordinate `start + t * scale`; of dates in milliseconds
-    # since 1970, the convention of Plotly
+    # The coordinate is start + t * scale: of dates in milliseconds since 1970, as Plotly has them
     scale: float
     start: float = 0.0
     unit: str = ""  # unit of numbers

@@ -7,16 +7,18 @@ back to.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 import xarray as xr
 
-from livepde.dashboard import canvas
-from livepde.dashboard.field_views import drawn_by, field_profile
+from livepde.dashboard.figures import canvas
+from livepde.dashboard.figures.field_views import drawn_by, field_profile
 from livepde.dashboard.view import READINGS
+from livepde.frames import ERRORS
 from livepde.linalg import Array
 from livepde.plots import GREY, PALETTE, style
 from livepde.records import field_names, interval_95, scalars, used_errors
@@ -38,9 +40,8 @@ class Panel:
 
     name: str  # unique name among the panels of a run
     section: str  # key of `SECTIONS`
-    # title, about: title and caption, as plain text
-    title: str
-    about: str
+    title: str  # plain text
+    about: str  # caption, plain text
     figure: go.Figure
 
 
@@ -53,72 +54,46 @@ def panels(data: xr.Dataset, at: float | None = None, cut: float = 0.5) -> list[
     """
     if not data.sizes.get("time"):
         return []
-    found = [*_measured_panels(data, at), *_unknown_panels(data, at)]
-    found += _field_panels(data, at, cut)
-    for variable, dimension in (("innovation", "sensor"), ("validation_error", "validation")):
-        if variable in data and data.sizes.get(dimension):
-            found.append(_residual_panel(data, variable, dimension, at))
-    if style.note(data, "innovation_ratio") is not None:
-        about = (
-            "Ratio of squared innovations to their expected square. If the model is right, it is "
-            "about 1 or less. Above 4, the model does not fit the data."
-        )
-        title = "Innovation ratio"
-        found.append(Panel("ratio", "sensors", title, about, ratio(data, at)))
-    if open_shares(data, at):
-        about = (
-            "Standard deviation as a share of the prior's. Below 10 %, an unknown is well "
-            "determined. Above 90 %, it is not identifiable from these data."
-        )
-        found.append(Panel("told", "told", "Remaining uncertainty", about, told(data, at)))
-    if "correlation" in data:
-        about = (
-            "Near +1 or −1, only a combination of both unknowns is identifiable (newest estimate)."
-        )
-        title = "Correlation of the estimates"
-        found.append(Panel("correlation", "told", title, about, correlation(data)))
-    return found
+    return [
+        *_measured_panels(data, at),
+        *_unknown_panels(data, at),
+        *_field_panels(data, at, cut),
+        *_residual_panels(data, at),
+        *_told_panels(data, at),
+    ]
 
 
-def _measured_panels(data: xr.Dataset, at: float | None) -> list[Panel]:
-    """Return a panel for the sensors of each unit, where the readings are known."""
+def _measured_panels(data: xr.Dataset, at: float | None) -> Iterator[Panel]:
+    """Yield a panel for the sensors of each unit, where the readings are known."""
     if not any(name in data for name in READINGS.values()):
-        return []
-    names, found = style.sensor_names(data), list[Panel]()
-    units = style.sensor_units(data, names)
-    for unit in dict.fromkeys(units.values()):
-        shown = [name for name in names if units[name] == unit]
+        return
+    units = style.sensors_by_unit(data)
+    for unit, names in units.items():
         about = "Points: readings. Lines: what the model expected of them one step ahead."
-        if any(name in data["validation"] for name in shown if "validation" in data):
+        if "validation" in data and set(names) & set(map(str, data["validation"].values)):
             about += " Dashed: validation sensors, which it never uses."
-        if len(shown) > style.MOST_LINES:
-            about += f" The first {style.MOST_LINES} of {len(shown)} sensors."
-        title = f"Measured and modelled{f', {unit}' if len(set(units.values())) > 1 else ''}"
-        figure = measured(data, shown[: style.MOST_LINES], unit, at)
-        found.append(Panel(f"measured:{unit}", "measured", title, about, figure))
-    return found
+        if len(names) > style.MOST_LINES:
+            about += f" The first {style.MOST_LINES} of {len(names)} sensors."
+        title = f"Measured and modelled{f', {unit}' if len(units) > 1 else ''}"
+        figure = measured(data, names[: style.MOST_LINES], unit, at)
+        yield Panel(f"measured:{unit}", "measured", title, about, figure)
 
 
-def measured(
-    data: xr.Dataset, sensors: Sequence[str], unit: str, at: float | None = None
-) -> go.Figure:
+def measured(data: xr.Dataset, sensors: Sequence[str], unit: str, at: float | None) -> go.Figure:
     """Draw the readings of sensors of one unit, and what the model expected of them."""
     data = _bounded(data)
-    figure, axis = canvas.over_time(data, style.labelled("", unit).strip().strip("[]"), at)
+    figure, axis = canvas.over_time(data, style.shown_unit(unit), at)
     t = axis.values(data["time"].values)
-    for error, dimension in (("innovation", "sensor"), ("validation_error", "validation")):
+    for error, dimension in ERRORS:
         if error not in data:
             continue
-        names = [str(name) for name in data[dimension].values]
-        columns = (
+        readings, errors = (
             data[name].transpose("time", dimension).values for name in (READINGS[error], error)
         )
-        readings, errors = columns
-        for k, name in enumerate(names):
+        for k, name in enumerate(map(str, data[dimension].values)):
             if name not in sensors:
                 continue
             colour = PALETTE[list(sensors).index(name) % len(PALETTE)]
-            validation = dimension == "validation"
             about = {"legendgroup": name, "hovertemplate": "%{y:.4g}"}
             figure.add_scatter(
                 x=t,
@@ -129,26 +104,21 @@ def measured(
                 showlegend=False,
                 **about,
             )
-            label = canvas.text(f"{name} (validation)" if validation else name)
-            dash = "dash" if validation else None
-            mode = "lines+markers" if len(t) == 1 else "lines"
-            canvas.line(
-                figure,
-                t,
-                readings[:, k] - errors[:, k],
-                colour,
-                1.6,
-                dash,
-                name=label,
-                mode=mode,
-                **about,
-            )
+            label, dash = name, None
+            if dimension == "validation":
+                label, dash = f"{name} (validation)", "dash"
+            about |= {"name": canvas.text(label), "mode": _line_mode(t)}
+            canvas.line(figure, t, readings[:, k] - errors[:, k], colour, 1.6, dash, **about)
     figure.update_layout(showlegend=True)
     return figure
 
 
-def _unknown_panels(data: xr.Dataset, at: float | None) -> list[Panel]:
-    found = []
+def _line_mode(t: Array) -> str:
+    """Return the mode of a line, of which a single point would not be seen."""
+    return "lines+markers" if len(t) == 1 else "lines"
+
+
+def _unknown_panels(data: xr.Dataset, at: float | None) -> Iterator[Panel]:
     for name, labels in style.groups(data).items():
         about = "Line: estimate."
         if np.isfinite(data[f"{labels[0]}_std"].values).any():
@@ -156,15 +126,13 @@ def _unknown_panels(data: xr.Dataset, at: float | None) -> list[Panel]:
         if any("reference" in data[label].attrs for label in labels):
             about += " Dashed: reference value."
         figure = unknowns(data, labels, at)
-        found.append(Panel(f"unknown:{name}", "estimates", f"Unknown {name}", about, figure))
-    return found
+        yield Panel(f"unknown:{name}", "estimates", f"Unknown {name}", about, figure)
 
 
-def _field_panels(data: xr.Dataset, at: float | None, cut: float) -> list[Panel]:
-    unknown, state = (str(data.attrs.get(key, "")).split() for key in ("fields", "state"))
-    found: list[Panel] = []
+def _field_panels(data: xr.Dataset, at: float | None, cut: float) -> Iterator[Panel]:
     if not data.sizes.get("snapshot"):
-        return found
+        return
+    unknown, state = (str(data.attrs.get(key, "")).split() for key in ("fields", "state"))
     k = canvas.at_time(data, "snapshot", at)
     when = canvas.when_axis(data).text(float(data["snapshot"].values[k]))
     draw, hint = drawn_by(data, cut)
@@ -173,45 +141,59 @@ def _field_panels(data: xr.Dataset, at: float | None, cut: float) -> list[Panel]
             continue
         title = f"{'Unknown field' if name in unknown else 'State'} {name}"
         deviates = f"{name}_std" in data and bool(data[f"{name}_std"].values[k].any())
-        about = f"Estimate at {when}.{hint}"
         profile = draw is field_profile
-        if profile and deviates:
-            about += " Band: 95 % interval."
-        found.append(Panel(f"field:{name}", "estimates", title, about, draw(data, name, at)))
+        about = f"Estimate at {when}.{hint}{' Band: 95 % interval.' * (profile and deviates)}"
+        yield Panel(f"field:{name}", "estimates", title, about, draw(data, name, at))
         if not profile and deviates and name in unknown:
             about = f"Standard deviation at {when}.{hint}"
             spread = draw(data, f"{name}_std", at)
             title = f"Standard deviation of {name}"
-            found.append(Panel(f"field:{name}_std", "estimates", title, about, spread))
-    return found
+            yield Panel(f"field:{name}_std", "estimates", title, about, spread)
 
 
-def _residual_panel(data: xr.Dataset, variable: str, dimension: str, at: float | None) -> Panel:
-    figure = residuals(data, variable, dimension, at)
-    if variable == "innovation":
+def _residual_panels(data: xr.Dataset, at: float | None) -> Iterator[Panel]:
+    for variable, dimension in ERRORS:
+        if variable not in data or not (count := data.sizes.get(dimension)):
+            continue
+        title = "Validation sensors: measured − estimated"
         about = (
-            "Measured minus predicted, one step ahead. If the model is right, it scatters about "
-            "zero. If it stays on one side, there is an offset or a missing process."
+            "Measured minus estimated, of the validation sensors, which the estimate does not use."
         )
-        if style.note(data, "residual") is not None:
+        if variable == "innovation":
+            title = "Sensors: measured − predicted"
             about = (
-                "Measured minus estimated, after the step. If the model is right, it is about zero."
+                "Measured minus predicted, one step ahead. If the model is right, it scatters "
+                "about zero. If it stays on one side, there is an offset or a missing process."
             )
-        title = "Sensors: measured − predicted"
-        return Panel(variable, "sensors", title, about + _crowd(data, dimension), figure)
-    about = "Measured minus estimated, of the validation sensors, which the estimate does not use."
-    about += _crowd(data, dimension)
-    return Panel(variable, "sensors", "Validation sensors: measured − estimated", about, figure)
+            if style.note(data, "residual") is not None:
+                about = (
+                    "Measured minus estimated, after the step. If the model is right, it is about "
+                    "zero."
+                )
+        if count > style.MOST_LINES:
+            about += f" Line: root mean square of {count}; band: their range."
+        yield Panel(variable, "sensors", title, about, residuals(data, variable, dimension, at))
+    if style.note(data, "innovation_ratio") is not None:
+        about = (
+            "Ratio of squared innovations to their expected square. If the model is right, it is "
+            "about 1 or less. Above 4, the model does not fit the data."
+        )
+        yield Panel("ratio", "sensors", "Innovation ratio", about, ratio(data, at))
 
 
-def _crowd(data: xr.Dataset, dimension: str) -> str:
-    """Return how many sensors are drawn as one."""
-    count = data.sizes[dimension]
-    return (
-        f" Line: root mean square of {count}; band: their range."
-        if count > style.MOST_LINES
-        else ""
-    )
+def _told_panels(data: xr.Dataset, at: float | None) -> Iterator[Panel]:
+    if shares := open_shares(data, at):
+        about = (
+            "Standard deviation as a share of the prior's. Below 10 %, an unknown is well "
+            "determined. Above 90 %, it is not identifiable from these data."
+        )
+        yield Panel("told", "told", "Remaining uncertainty", about, told(shares))
+    if "correlation" in data:
+        about = (
+            "Near +1 or −1, only a combination of both unknowns is identifiable (newest estimate)."
+        )
+        title = "Correlation of the estimates"
+        yield Panel("correlation", "told", title, about, correlation(data))
 
 
 def _bounded(data: xr.Dataset) -> xr.Dataset:
@@ -250,20 +232,11 @@ def unknowns(data: xr.Dataset, labels: Sequence[str], at: float | None = None) -
             reach += [low[late], high[late]]
             if len(labels) <= style.MOST_LINES:
                 canvas.band(figure, t, low, high, colour, label, opacity)
-        std = np.zeros_like(value)
-        if f"{label}_std" in data:
-            std = np.nan_to_num(data[f"{label}_std"].values, nan=0.0)
-        figure.add_scatter(
-            x=t,
-            y=value,
-            mode="lines+markers" if len(t) == 1 else "lines",
-            line={"color": colour, "width": 2},
-            name=canvas.text(_short(label)),
-            legendgroup=label,
-            showlegend=len(labels) > 1,
-            customdata=std,
-            hovertemplate="%{y:.4g} ± %{customdata:.2g}" if std.any() else "%{y:.4g}",
-        )
+        std = np.nan_to_num(data[f"{label}_std"].values, nan=0.0)
+        about: dict[str, Any] = {"legendgroup": label, "showlegend": len(labels) > 1}
+        about |= {"name": canvas.text(_short(label)), "mode": _line_mode(t), "customdata": std}
+        hover = "%{y:.4g} ± %{customdata:.2g}" if std.any() else "%{y:.4g}"
+        canvas.line(figure, t, value, colour, 2, hovertemplate=hover, **about)
         reference = data[label].attrs.get("reference")
         if reference is not None:
             reach.append(np.array([float(reference)]))
@@ -326,7 +299,7 @@ def residuals(
     return figure
 
 
-def ratio(data: xr.Dataset, at: float | None = None) -> go.Figure:
+def ratio(data: xr.Dataset, at: float | None) -> go.Figure:
     """Draw the ratio of squared innovations to their expected square."""
     data = _bounded(data)
     figure, axis = canvas.over_time(data, "", at)
@@ -356,9 +329,9 @@ def open_shares(data: xr.Dataset, at: float | None) -> dict[str, float]:
     return found
 
 
-def told(data: xr.Dataset, at: float | None = None) -> go.Figure:
+def told(left: dict[str, float]) -> go.Figure:
     """Draw the remaining share of the prior standard deviation of each unknown."""
-    known = dict(reversed(open_shares(data, at).items()))
+    known = dict(reversed(left.items()))
     figure = canvas.empty(
         "share of the prior standard deviation [%]", height=max(170, 90 + 26 * len(known))
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
@@ -13,7 +13,7 @@ from scipy.sparse.linalg import eigs, eigsh, splu
 
 from livepde.errors import ConfigurationError, ModelError
 from livepde.fem import Inputs, Moment
-from livepde.linalg import Array, IntArray
+from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 
@@ -32,15 +32,8 @@ LIKELY = 0.95
 # Relative nonlinearity in the unknown numbers that is attributed to rounding.
 LINEAR = 1e-8
 
-
-@dataclass(frozen=True, eq=False)
-class Linear:
-    """Linear system M u' = -K u + E c + f for the channels c."""
-
-    # K, E, f: shapes (n, n), (n, channels) and (n,); rows of fixed coefficients are undefined
-    K: sp.csr_array
-    E: Array
-    f: Array
+Linear: TypeAlias = tuple[sp.csr_array, Array]
+"""K and [E, f] of M u' = -K u + E c + f for the channels c; fixed rows are undefined."""
 
 
 def _differ(one: Array, other: Array) -> bool:
@@ -92,45 +85,6 @@ class Discrete:
         return after
 
 
-def basis(
-    mass: sp.csr_array,
-    free: IntArray,
-    systems: Sequence[Linear],
-    drives: Array,
-    modes: int,
-    rates: Sequence[float] = (),
-) -> Array:
-    """Return an M-orthonormal basis V, V^T M V = I, zero on fixed coefficients, shape (n, r).
-
-    `mass`: mass matrix M, shape (n, n).
-    `free`: numbers of the coefficients that are not fixed.
-    `systems`: linear systems for several values of the unknowns, the first at the prior mean. The
-    basis contains the static responses of each.
-    `drives`: lifting of boundary channels and of known boundary values, shape (n, channels + 1).
-    `modes`: number of slowest eigenmodes of the first system to be added.
-    `rates`: rates of the exponential inputs exp(rate t) whose responses are added.
-    """
-    M = sp.csc_array(mass[free][:, free])
-    static, slowest = [], np.zeros((len(free), 0))
-    for system in systems:
-        K = sp.csc_array(system.K[free][:, free])
-        # A small multiple of M makes K + rate M regular: a process with insulated boundaries has no
-        # steady state, and its static response would be infinite.
-        shift = SHIFT * float(abs(K).sum(axis=1).max() / M.sum(axis=1).max())
-        loads = np.column_stack([system.E, system.f]) - system.K @ drives
-        for rate in (shift, *rates):
-            static.append(splu(sp.csc_array(K + rate * M)).solve(np.ascontiguousarray(loads[free])))
-        if system is systems[0] and modes:
-            slowest = _modes(K, M, modes, shift)
-    responses = np.hstack(static)
-    size = np.sqrt(np.maximum(np.einsum("ik,ik->k", responses, M @ responses), 0.0))
-    responses = responses[:, size > 0.0] / size[size > 0.0]
-    found = _orthonormal(np.hstack([_orthonormal(responses, M), slowest]), M)
-    V = np.zeros((mass.shape[0], found.shape[1]))
-    V[free] = found
-    return V
-
-
 def _modes(K: sp.csc_array, M: sp.csc_array, count: int, shift: float) -> Array:
     """Return the slowest eigenmodes; real and imaginary parts for a nonsymmetric K."""
     n = K.shape[0]
@@ -163,9 +117,8 @@ class GalerkinReduction:
     # outputs, sensors: controlled and measured quantities, as observations bound to the full model
     outputs: Observed
     sensors: Observed
-    # V, test: basis, shape (n, r), and V^T M, shape (r, n)
-    V: Array
-    test: Array
+    V: Array  # basis, shape (n, r)
+    test: Array  # V^T M, shape (r, n); of a basis that is not orthonormal its dual in M
     # u, q, inputs: linearisation point: state, parameter, and value of each channel
     u: Array
     q: Array
@@ -189,11 +142,37 @@ class GalerkinReduction:
             raise ConfigurationError(
                 "reduce: u is not finite; give the state where it is linearised."
             )
-        spaces, n = (model.state_space, model.X, model.parameter_space), model.X.dim
+        spaces = (model.state_space, model.X, model.parameter_space)
         seen = outputs.bind(*spaces)
         measured = seen if sensors is None else sensors.bind(*spaces)
-        empty, test = np.zeros((n, 0)), np.zeros((0, n))
-        return cls(model, seen, measured, empty, test, start, physical, given)
+        empty = np.zeros((model.X.dim, 0))
+        return cls(model, seen, measured, empty, empty.T, start, physical, given)
+
+    def with_basis(self, modes: int, rates: Sequence[float]) -> GalerkinReduction:
+        """Return the reduction on an M-orthonormal basis, zero on fixed coefficients.
+
+        It has the static responses at each of `extremes`, those to exponential inputs exp(rate t),
+        and the slowest eigenmodes at the linearisation point.
+        """
+        mass, free = self.model.mass, np.flatnonzero(self.model.X.free)
+        M = sp.csc_array(mass[free][:, free])
+        static, slowest = [], np.zeros((len(free), 0))
+        for k, (whole, loads) in enumerate(map(self.at, self.extremes())):
+            K = sp.csc_array(whole[free][:, free])
+            # A small multiple of M makes K + rate M regular: a process with insulated boundaries
+            # has no steady state, and its static response would be infinite.
+            shift = SHIFT * float(abs(K).sum(axis=1).max() / M.sum(axis=1).max())
+            driven = np.ascontiguousarray((loads - whole @ self.boundary)[free])
+            static += [splu(sp.csc_array(K + rate * M)).solve(driven) for rate in (shift, *rates)]
+            if k == 0 and modes:
+                slowest = _modes(K, M, modes, shift)
+        responses = np.hstack(static)
+        size = np.sqrt(np.maximum(np.einsum("ik,ik->k", responses, M @ responses), 0.0))
+        responses = responses[:, size > 0.0] / size[size > 0.0]
+        found = _orthonormal(np.hstack([_orthonormal(responses, M), slowest]), M)
+        V = np.zeros((mass.shape[0], found.shape[1]))
+        V[free] = found
+        return replace(self, V=V, test=V.T @ mass)
 
     @property
     def rows(self) -> list[int]:
@@ -230,54 +209,39 @@ class GalerkinReduction:
     def at(self, q: Array) -> Linear:
         """Return the system for physical coefficients q, shape (m,)."""
         K, known = self.slope(q, self.moment), self.residual(self.u, q, self.moment)
-        columns = [
-            # The model is affine in its channels (see `check`): one difference gives the exact
-            # column.
-            known - self.residual(self.u, q, self._moment(0.0, {name: 1.0}))
-            for name in self.model.channels
-        ]
-        E = np.column_stack(columns) if columns else np.zeros((len(known), 0))
+        # The model is affine in its channels (see `check_linear`): one difference gives the exact
+        # column.
+        moments = [self._moment(0.0, {name: 1.0}) for name in self.model.channels]
+        E = np.column_stack([known - self.residual(self.u, q, moment) for moment in moments])
         values = np.array([self.inputs[name] for name in self.model.channels])
-        return Linear(K, E, K @ self.u - known - E @ values)
+        return K, np.column_stack([E, K @ self.u - known - E @ values])
 
     def differ(self, one: Array, other: Array) -> bool:
         """Return True if the systems for two parameters differ."""
-        free = self.model.X.free
-        first, second = self.at(one), self.at(other)
-        rows = np.repeat(free, np.diff(first.K.indptr))
-        pairs = ((rows * first.K.data, rows * second.K.data), (first.E.T * free, second.E.T * free))
-        known = (first.f * free, second.f * free)
-        return any(_differ(*pair) for pair in (*pairs, known))
+        free, systems = self.model.X.free, (self.at(one), self.at(other))
+        rows = np.repeat(free, np.diff(systems[0][0].indptr))
+        parts = (
+            (rows * K.data, loads[:, :-1].T * free, loads[:, -1] * free) for K, loads in systems
+        )
+        return any(map(_differ, *parts))
 
     @cached_property
-    def boundary(self) -> tuple[Array, Array]:
-        """Lifting of boundary channels, (n, channels), and of known values, (n,)."""
+    def boundary(self) -> Array:
+        """Lifting of boundary channels and of known boundary values, shape (n, channels + 1)."""
         model, zero = self.model, np.zeros(self.model.X.dim)
-        off = Moment(0.0, Inputs(dict.fromkeys(model.channels, 0.0)))
-        known = model.impose(zero, off)
-        columns = []
-        for name in model.channels:
-            values = dict.fromkeys(model.channels, 0.0) | {name: 1.0}
-            columns.append(model.impose(zero, Moment(0.0, Inputs(values))) - known)
-        return np.column_stack(columns) if columns else np.zeros((len(zero), 0)), known
+        off = dict.fromkeys(model.channels, 0.0)
+        known = model.impose(zero, Moment(0.0, Inputs(off)))
+        columns = [
+            model.impose(zero, Moment(0.0, Inputs({**off, name: 1.0}))) - known
+            for name in model.channels
+        ]
+        return np.column_stack([*columns, known])
 
     def lift(self, x: Array, c: Array) -> Array:
         """Return the state of the full model for coordinates and channels."""
-        W, known = self.boundary
-        fixed = W @ c + known
+        fixed = self.boundary @ np.append(c, 1.0)
         u: Array = fixed + self.V @ (x - self.test @ fixed)
         return u
-
-    def moved(
-        self, u: Array | None, q: Array | None, inputs: Mapping[str, float] | None
-    ) -> GalerkinReduction:
-        """Return the reduction with another linearisation point."""
-        return replace(
-            self,
-            u=self.u if u is None else u,
-            q=self.q if q is None else q,
-            inputs={**self.inputs, **(inputs or {})},
-        )
 
     def extremes(self) -> list[Array]:
         """Return the reference parameter, and those with one number at an end of its interval."""
@@ -301,7 +265,7 @@ class GalerkinReduction:
         Shape (1 + m, r, r + channels + 1).
         """
         values = self.values()
-        systems = [self._projected(self.at(q)) for q in values]
+        systems = [self._projected(q) for q in values]
         slopes = [
             (systems[k + 1] - systems[0]) / (values[k + 1][row] - self.q[row])
             for k, row in enumerate(self.rows)
@@ -312,13 +276,12 @@ class GalerkinReduction:
         )
         return np.array([constant, *slopes])
 
-    def _projected(self, system: Linear) -> Array:
+    def _projected(self, q: Array) -> Array:
         """Return [K, E, f] projected on the basis, shape (r, r + channels + 1)."""
-        # K acts on u = fixed + V (x - V^T M fixed), where fixed = W c + known are boundary values.
-        W, known = self.boundary
-        fixed = np.column_stack([W, known])
-        K: Array = self.V.T @ (system.K @ self.V)
-        driven = self.V.T @ (np.column_stack([system.E, system.f]) - system.K @ fixed)
+        # K acts on u = fixed + V (x - V^T M fixed), where fixed are boundary values.
+        (whole, loads), fixed = self.at(q), self.boundary
+        K: Array = self.V.T @ (whole @ self.V)
+        driven = self.V.T @ (loads - whole @ fixed)
         return np.column_stack([K, driven + K @ (self.test @ fixed)])
 
     def check_linear(self) -> None:
@@ -343,9 +306,7 @@ class GalerkinReduction:
                 "reduce: a channel multiplies the state, so that the model is not linear in its "
                 "inputs. Let it be a known number in the form, or a source or boundary value."
             )
-        linear = self.at(q)
-        step = np.array([change[name] for name in model.channels])
-        expected = steady - linear.E @ step
+        expected = steady - self.at(q)[1][:, :-1] @ np.array([*change.values()])
         if _differ(self.residual(self.u, q, there) * free, expected * free):
             raise ModelError(
                 "reduce: the model is not linear in its input channels; let a channel be what "
@@ -358,7 +319,7 @@ class GalerkinReduction:
         # The parts, made at the ends of single numbers, must give the system where all are halfway.
         both = self.q + 0.5 * sum((q - self.q for q in self.values()[1:]), np.zeros_like(self.q))
         expected = np.tensordot(np.array([1.0, *both[self.rows]]), self.parts(), axes=1)
-        found = self._projected(self.at(both))
+        found = self._projected(both)
         if np.abs(found - expected).max() > LINEAR * np.abs(expected).max():
             raise ModelError(
                 "reduce: the model is not linear in its unknown numbers, so no reduced model has "
@@ -382,11 +343,10 @@ class GalerkinReduction:
 
     def output(self, observed: Observed) -> Output:
         """Return the output equation of an observation in reduced coordinates."""
-        moment, (W, known) = self.moment, self.boundary
-        y = observed.predict(self.u, self.q, moment)
-        H = np.asarray(observed.jacobian(self.u, self.q, moment)[0].toarray())
-        # The lifted state is W c + known + V (x - V^T M (W c + known)), which is affine in x and c.
+        y = observed.predict(self.u, self.q, self.moment)
+        H = np.asarray(observed.jacobian(self.u, self.q, self.moment)[0].toarray())
         C = H @ self.V
-        D = H @ W - C @ (self.test @ W)
-        d = y - H @ self.u + H @ known - C @ (self.test @ known)
-        return Output(tuple(observed.names), C, D, d, observed.noise)
+        # The lifted state, fixed + V (x - V^T M fixed), is affine in x and in the channels.
+        fixed = (H - C @ self.test) @ self.boundary
+        d = y - H @ self.u + fixed[:, -1]
+        return Output(tuple(observed.names), C, fixed[:, :-1], d, observed.noise)

@@ -6,7 +6,7 @@ Matrices that interpolate values at the vertices to the drawn points are cached.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Any
 
@@ -16,9 +16,11 @@ import scipy.sparse as sp
 import xarray as xr
 from scipy.spatial import Delaunay
 
-from livepde.dashboard import canvas
-from livepde.linalg import Array
-from livepde.plots import GREY, PALETTE, interval_95, labelled, sensor_places
+from livepde.dashboard.figures import canvas
+from livepde.linalg import Array, IntArray
+from livepde.plots import GREY, PALETTE, interval_95, sensor_places
+from livepde.plots.style import axis_label
+from livepde.runs.exported import kinds_of
 
 MOST_LINES = 120  # of a map in each direction
 OUTSIDE = 1e-9  # barycentric coordinates may be negative by so much
@@ -43,8 +45,7 @@ OUT = 4.0  # how many times larger a domain is than where its mesh is fine, to b
 class Map:
     """A plane domain on a grid that is as fine as its mesh."""
 
-    # x, y: lines of the grid
-    x: Array
+    x: Array  # lines of the grid
     y: Array
     # From vertices to the points of the grid, row by row; shape (len(y) * len(x), vertices)
     weights: sp.csr_array
@@ -70,15 +71,32 @@ class Surface:
         return found
 
 
+@dataclass(frozen=True)
+class _Mesh:
+    """Vertices and cells, equal by their content: a key for cached cuts."""
+
+    content: tuple[bytes, bytes]
+    points: Array = field(compare=False)
+    cells: IntArray = field(compare=False)
+
+    @classmethod
+    def of(cls, data: xr.Dataset) -> _Mesh:
+        """Return the mesh of a dataset; without cells those of Delaunay."""
+        points = np.column_stack([data[axis].values for axis in "xyz" if axis in data.coords])
+        kinds = kinds_of(data)
+        cells = data[kinds[0]].values if kinds else Delaunay(points).simplices
+        cells = cells.astype(np.intp)
+        return cls((points.tobytes(), cells.tobytes()), points, cells)
+
+
 def plane_map(data: xr.Dataset) -> Map:
     """Return the map of a run in two space dimensions."""
-    points = np.column_stack([data["x"].values, data["y"].values])
-    return _plane_map(_Mesh(points, _corners(data, ("triangle", "quad"))))
+    return _plane_map(_Mesh.of(data))
 
 
 def boundary(data: xr.Dataset) -> Surface:
     """Return the surface of a solid domain."""
-    return _boundary(_solid(data))
+    return _boundary(_Mesh.of(data))
 
 
 def slices(data: xr.Dataset, share: float = 0.5) -> list[Surface]:
@@ -86,36 +104,7 @@ def slices(data: xr.Dataset, share: float = 0.5) -> list[Surface]:
 
     `share`: position of each plane, as a share of the range of its coordinate.
     """
-    return _slices(_solid(data), share)
-
-
-class _Mesh:
-    """Vertices and cells, hashed by their content: a key for cached cuts."""
-
-    def __init__(self, points: Array, cells: Any) -> None:
-        self.points = points
-        self.cells = cells
-        self._key = (points.tobytes(), cells.tobytes())
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Mesh) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-
-def _corners(data: xr.Dataset, kinds: tuple[str, ...]) -> Any:
-    """Return the vertices of each cell; without cells in the dataset those of Delaunay."""
-    for kind in kinds:
-        if kind in data:
-            return data[kind].values.astype(np.intp)
-    axes = [data[axis].values for axis in "xyz" if axis in data.coords]
-    return Delaunay(np.column_stack(axes)).simplices.astype(np.intp)
-
-
-def _solid(data: xr.Dataset) -> _Mesh:
-    points = np.column_stack([data[axis].values for axis in "xyz"])
-    return _Mesh(points, _corners(data, ("tetra", "hexahedron")))
+    return _slices(_Mesh.of(data), share)
 
 
 def _lines(values: Array) -> Array:
@@ -227,21 +216,17 @@ def drawn_by(data: xr.Dataset, cut: float) -> tuple[Callable[..., go.Figure], st
         hint = f" Translucent surface, and three cuts at {cut:.0%} of its size: drag to rotate."
         return partial(field_solid, cut=cut), hint
     if "y" in data.coords:
-        return field_map, " The region of fine mesh is shown. Double-click to show all." * _zoomed(
-            data
-        )
+        drawn = plane_map(data)
+        zoomed = _fine(drawn.x) or _fine(drawn.y)
+        hint = " The region of fine mesh is shown. Double-click to show all."
+        return field_map, hint if zoomed else ""
     return field_profile, " Grey: initial state."
-
-
-def _zoomed(data: xr.Dataset) -> bool:
-    drawn = plane_map(data)
-    return _fine(drawn.x) is not None or _fine(drawn.y) is not None
 
 
 def field_profile(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure:
     """Draw a field along an interval: with its 95 % band, and as it was at the start."""
     k = canvas.at_time(data, "snapshot", at)
-    figure = canvas.empty(labelled("x", canvas.unit_of(data, "x")), canvas.unit_label(data, name))
+    figure = canvas.empty(axis_label(data, "x"), canvas.unit_label(data, name))
     x, values = data["x"].values, data[name].values
     reach = [values]
     if k > 0:
@@ -262,14 +247,12 @@ def field_map(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure
     """Draw a field on a plane domain, on lines as dense as its mesh."""
     drawn = plane_map(data)
     values = data[name].values[canvas.at_time(data, "snapshot", at)]
-    unit = labelled("", canvas.unit_of(data, "x")).strip()
-    figure = canvas.empty(f"x {unit}", f"y {unit}", height=380)
+    figure = canvas.empty(axis_label(data, "x"), axis_label(data, "x", "y"), height=380)
     figure.add_heatmap(
         x=drawn.x,
         y=drawn.y,
         z=drawn.of(values).astype(np.float32),
-        colorscale=_colours(name),
-        colorbar=_bar(data, name),
+        **_colours(data, name),
         zsmooth="best",
         hovertemplate="x %{x:.4g}, y %{y:.4g}: %{z:.4g}<extra></extra>",
     )
@@ -284,10 +267,10 @@ def field_map(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure
             showlegend=False,
             hovertemplate=f"{kind} %{{text}}<extra></extra>",
         )
-    figure.update_layout(hovermode="closest", yaxis={"scaleanchor": "x", "constrain": "domain"})
-    figure.update_xaxes(constrain="domain", showgrid=False, zeroline=False)
-    figure.update_yaxes(showgrid=False, zeroline=False)
-    figure.update_layout(xaxis_range=_fine(drawn.x), yaxis_range=_fine(drawn.y))
+    plain = {"constrain": "domain", "showgrid": False, "zeroline": False}
+    figure.update_xaxes(range=_fine(drawn.x), **plain)
+    figure.update_yaxes(range=_fine(drawn.y), scaleanchor="x", **plain)
+    figure.update_layout(hovermode="closest")
     return figure
 
 
@@ -318,17 +301,18 @@ def field_solid(
             intensity=surface.of(values),
             cmin=low,
             cmax=high if high > low else low + 1.0,
-            colorscale=_colours(name),
-            colorbar=_bar(data, name),
+            **_colours(data, name),
             showscale=k == 0,
             opacity=opacity,
             flatshading=True,
             lighting={"ambient": 1.0, "diffuse": 0.0, "specular": 0.0},
             hovertemplate="%{x:.4g}, %{y:.4g}, %{z:.4g}: %{intensity:.4g}<extra></extra>",
         )
-    unit = labelled("", canvas.unit_of(data, "x")).strip()
     axes = {
-        f"{axis}axis": {"title": {"text": canvas.text(f"{axis} {unit}")}, "gridcolor": canvas.GRID}
+        f"{axis}axis": {
+            "title": {"text": canvas.text(axis_label(data, "x", axis))},
+            "gridcolor": canvas.GRID,
+        }
         for axis in "xyz"
     }
     camera = {"eye": {"x": 1.5, "y": 1.5, "z": 1.1}, "center": {"x": 0, "y": 0, "z": -0.1}}
@@ -338,10 +322,8 @@ def field_solid(
     return figure
 
 
-def _colours(name: str) -> str:
-    return "Cividis" if name.endswith("_std") else "Viridis"
-
-
-def _bar(data: xr.Dataset, name: str) -> dict[str, Any]:
+def _colours(data: xr.Dataset, name: str) -> dict[str, Any]:
+    """Return the colours of a field and their bar."""
     title = {"text": canvas.text(canvas.unit_label(data, name)), "side": "right"}
-    return {"title": title, "thickness": 14, "outlinewidth": 0, "exponentformat": "power"}
+    bar = {"title": title, "thickness": 14, "outlinewidth": 0, "exponentformat": "power"}
+    return {"colorscale": "Cividis" if name.endswith("_std") else "Viridis", "colorbar": bar}
