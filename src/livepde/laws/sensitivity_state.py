@@ -276,6 +276,11 @@ class Scale:
         never = np.full((members, sensors), np.nan)
         return cls(never, never, never)
 
+    @property
+    def ranges(self) -> Array:
+        """Ranges of the readings so far, (members, sensors); zero before any."""
+        return np.nan_to_num(self.high - self.low)
+
     def add(self, z: Array, d: Array) -> Scale:
         """Return the value after a sample z with innovations d, NaN where missing."""
         first, unseen = self.first, np.isnan(self.first)
