@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 import livepde as lp
+from benchmarks.first_hour import TABLES, save
 from benchmarks.user_jobs.data import JOBS
 from livepde.cases.case import load
 from livepde.verdict import Cause, Finding, Verdict
@@ -287,3 +289,20 @@ def test_an_early_boundary_is_no_late_sensor_and_the_search_ends(tmp_path: Path)
     assert last.fit is not None
     assert last.fit.converged
     assert last.fit.passes < 50  # 205 where each of eleven searches is followed to its end
+
+
+@pytest.mark.slow
+def test_exchanged_sensors_that_contradict_all_are_found_from_the_start(tmp_path: Path):
+    """The gate takes such columns for a disturbance, after which the stored state is wrong."""
+    folder = Path(__file__).parents[1] / "examples" / "first_hour"
+    shutil.copy(folder / "heater.toml", tmp_path)
+    header, rows, _ = TABLES["heater"](1)
+    first, second = (header.index(name) for name in ("T_10mm", "T_60mm"))
+    rows[:, [first, second]] = rows[:, [second, first]]
+    save(tmp_path / "heater.csv", header, rows)
+    prepared = load(tmp_path / "heater.toml").prepare()
+    last = prepared.identifier.run(prepared.stream).last
+    assert prepared.identifier._state.trial.shape[1] > 0  # there was a disturbance
+    found = [finding.causes[0] for finding in last.verdict.findings if finding.causes]
+    assert found[0].kind == "exchange"
+    assert found[0].share > 0.95

@@ -270,16 +270,57 @@ def test_readings_that_no_model_explains_are_not_trusted():
     assert verdict.sentences[0].startswith("The fit failed.")
 
 
-@pytest.mark.slow
-def test_an_unknown_that_moves_has_no_such_interval_and_the_run_says_so():
-    walk = lp.Scalar(PRIOR, evolution=lp.RandomWalk(0.01))
-    identifier = lp.Identifier(
-        rod(walk), lp.Points(SENSORS, noise=0.01), lp.SensitivityLaw(), u0=0.0
-    )
-    samples = [(t, row, ends(t)) for t, row in zip(TIMES, truth(1), strict=True)]
-    verdict = identifier.run(samples).last.verdict
-    assert verdict.errors is None
-    assert any("unknowns move" in text for text in verdict.untested)
+WALK = lp.Scalar(PRIOR, evolution=lp.RandomWalk(0.05))
+
+
+def innovations_of(z: Any, prior: Any = PRIOR, **options: Any) -> Verdict:
+    """Return the verdict of a run whose samples cannot be fitted again."""
+    law = lp.SensitivityLaw(**options)
+    identifier = lp.Identifier(rod(prior), lp.Points(SENSORS, noise=0.01), law, u0=0.0)
+    samples = [(t, row, ends(t)) for t, row in zip(TIMES, z, strict=True)]
+    return identifier.run(samples).last.verdict
+
+
+UNFITTED = {
+    "moves": {"prior": WALK},
+    "not stored": {"refit": None},
+    "window": {"refit": lp.Refit(window=60)},
+    "fades": {"memory": 50.0},
+}
+
+
+OTHERS = [pytest.param(why, marks=pytest.mark.slow) for why in UNFITTED if why != "moves"]
+
+
+@pytest.mark.parametrize("why", ["moves", *OTHERS])
+def test_a_sound_run_without_a_fit_has_hardly_a_wider_interval(why):
+    verdict = innovations_of(truth(1), **UNFITTED[why])
+    assert verdict.level == "trusted"
+    assert verdict.errors is not None
+    assert verdict.errors.misfit == pytest.approx(1.0, abs=0.15)
+    (one,) = verdict.errors.unknowns
+    assert one.low < 0.12 < one.high
+    assert one.wider < 1.3
+
+
+@pytest.mark.parametrize("why", ["moves", *OTHERS])
+@pytest.mark.parametrize("wrong", ["source", "gain"])
+def test_an_interval_of_innovations_allows_for_errors_of_process_and_sensors(why, wrong):
+    z = truth(3, ("source", 0.06)) if wrong == "source" else truth(3).copy()
+    if wrong == "gain":
+        z[:, 1] *= 1.15
+    verdict = innovations_of(z, **UNFITTED[why])
+    assert verdict.level != "trusted"
+    assert verdict.errors is not None
+    (one,) = verdict.errors.unknowns
+    assert one.low < 0.12 < one.high
+    assert one.wider > 1.3
+    ends_away = abs(one.plain_low - 0.12), abs(one.plain_high - 0.12)
+    if not one.plain_low < 0.12 < one.plain_high:  # it reaches out to the side of the truth
+        nearer = (
+            one.plain_low - one.low if ends_away[0] < ends_away[1] else one.high - one.plain_high
+        )
+        assert nearer > 0.0
 
 
 def numbers(estimate: lp.Estimate) -> Any:
@@ -337,16 +378,6 @@ def test_what_is_uncertain_of_the_start_is_no_misfit():
     stated = ended_with(z).verdict.errors
     assert stated is not None
     assert stated.misfit > 1.5
-
-
-def test_samples_before_the_window_are_not_taken_as_exact_without_a_word():
-    sensors = lp.Points(SENSORS, noise=0.01)
-    law = lp.SensitivityLaw(refit=lp.Refit(window=60))
-    identifier = lp.Identifier(rod(), sensors, law, u0=0.0)
-    samples = [(t, row, ends(t)) for t, row in zip(TIMES, truth(1), strict=True)]
-    verdict = identifier.run(samples).last.verdict
-    assert verdict.errors is None
-    assert any("window of the refit" in text for text in verdict.untested)
 
 
 # --- levels --------------------------------------------------------------------------------------

@@ -17,12 +17,21 @@ import numpy as np
 
 from livepde.fem import Scalar
 from livepde.laws.error_columns import FULL, SMALL, ErrorColumns, beyond_rounding, hats
+from livepde.laws.filter import Filter
+from livepde.laws.filter_state import FilterState
 from livepde.laws.policies import Refit
 from livepde.laws.refit import plausible
 from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
 from livepde.verdict.directions import sensor_shifts, stated_positions
-from livepde.verdict.evidence import Causes, Family, LinearModel, Mixture, averaged
+from livepde.verdict.evidence import (
+    Causes,
+    Family,
+    LinearModel,
+    averaged,
+    averaged_causes,
+    levels,
+)
 from livepde.verdict.model_errors import Allowed, ModelErrors
 
 MANY = 150  # samples that tell apart what the full list has
@@ -42,6 +51,7 @@ FEWEST = 20  # readings
 NEAR = 0.03  # posterior standard deviations within which a trajectory is that of the best fit
 QUANTILE = 1.96  # standard deviations to the end of a 95 % interval
 SHRINK = 10.0  # pairs of readings that the stated noise counts
+OVERFLOW = "the answers of the process to errors overflow"
 LEAST_LEVEL = 0.01  # least variance of the noise over the stated one that is believed
 
 
@@ -150,10 +160,12 @@ def model_errors(
     T = reduction.Phi @ start.C[0].T
     model, causes, families = linear_model(samples, one, used, T)
     mixture = averaged(model, causes, families).widened(shift)
-    if not np.isfinite(mixture.interval).all():
-        return "the answers of the process to errors overflow"
+    low, high = mixture.interval
+    if not np.isfinite([low, high]).all():
+        return OVERFLOW
     level = _level(one.residuals, used)
-    variance = model.asked[1] + shift**2
+    narrow = np.sqrt(model.asked[1] + shift**2)
+    base = start.q[0]
     return ModelErrors(
         misfit=_rms(one.residuals[used]) / level,
         of_signal=_of_signal(samples.readings, one.residuals, used),
@@ -164,7 +176,49 @@ def model_errors(
             )
             if there.any()
         },
-        unknowns=tuple(_allowed(samples, mixture, variance, std)),
+        unknowns=tuple(
+            _allowed(samples.filter, samples.state.now, (base + low, base + high), narrow, std)
+        ),
+    )
+
+
+@nonfinite_allowed()
+def errors_of_innovations(
+    filter_: Filter, x: FilterState, ranges: Array, std: Array, shift: Array
+) -> ModelErrors | str:
+    """Return the same from the innovations of a run whose samples cannot be fitted again.
+
+    The average is over errors of single sensors and of the process that the verdict looks for, and
+    has no families. `ranges`: of the readings of each sensor, (sensors,).
+    """
+    judge, ledger = filter_.judge, x.ledger
+    if judge is None or not ledger.seen[0]:
+        return "the run is not judged"
+    w, settled = judge.summed_up(ledger, x.causes)
+    ledger, Phi = settled.of_member(0), filter_.reduction.Phi
+    count, squares = ledger.noise[0, 0], ledger.noise[2, 0]
+    if count.sum() < FEWEST:
+        return f"fewer than {FEWEST} readings are in use"
+    moved = Phi @ (x.C[0].T @ w[0])  # truth less estimate by each cause
+    most = judge.dictionary.plausible(MOST_GAIN, FARTHEST)
+    mixture = averaged_causes(ledger, moved, most, std).widened(shift)
+    low, high = mixture.interval
+    if not np.isfinite([low, high]).all():
+        return OVERFLOW
+    noise = np.sqrt(x.level[0]) * filter_.noise
+    size = np.sqrt(squares / np.maximum(count, 1.0))
+    level, there = np.sqrt(levels(ledger)[0]), count > 0.0
+    typical = float(np.median(level[there]))
+    known = filter_.estimate(x)[0]
+    # Noise that is larger than stated is no error of the model.
+    plain = np.hypot(max(typical, 1.0) * np.linalg.norm(Phi @ x.C[0].T, axis=1), shift)
+    signal = _rms(ranges[there] / math.sqrt(12.0))  # of readings that fill their range
+    names = filter_.problem.observed.names
+    return ModelErrors(
+        misfit=_rms(size[there]) / typical,
+        of_signal=_rms((size * noise)[there]) / signal if signal > 0.0 else math.inf,
+        sensors={names[k]: float(size[k] / level[k]) for k in np.flatnonzero(there)},
+        unknowns=tuple(_allowed(filter_, x, (known + low, known + high), plain, std)),
     )
 
 
@@ -205,24 +259,28 @@ def _columns(values: Array, used: Mask) -> Iterator[tuple[Array, Mask]]:
 
 
 def _allowed(
-    samples: StoredSamples, mixture: Mixture, variance: Array, std: Array
+    filter_: Filter, x: FilterState, ends: tuple[Array, Array], narrow: Array, std: Array
 ) -> Iterator[Allowed]:
-    problem, reduction = samples.filter.problem, samples.filter.reduction
-    latent, base = problem.model.latent, samples.start.q[0]
+    """Iterate over the unknowns, with intervals that allow for errors of the model.
+
+    `ends`: of these, of the latent unknowns. `narrow`, `std`: standard deviations by the noise
+    alone, and those that are reported.
+    """
+    problem, reduction = filter_.problem, filter_.reduction
+    latent = problem.model.latent
     own = set(problem.observed.observation.unknowns)
     for name, item in latent.parts.items():
         if isinstance(item.unknown, Scalar) and item.unknown.corrects:  # an input
             own.add(name)
-    low, high = mixture.interval
-    known = samples.filter.estimate(samples.state.now)[0]
-    both = (known, base + low, base + high, known - QUANTILE * std, known + QUANTILE * std)
+    known = filter_.estimate(x)[0]
+    both = (known, *ends, known - QUANTILE * std, known + QUANTILE * std)
     value, low_end, high_end, plain_low, plain_high = (
         latent.value(reduction.bounded(one)) for one in both
     )
     # The plain interval is wider where innovations follow each other: it is a part of this one.
-    ends = np.minimum(low_end, plain_low), np.maximum(high_end, plain_high), plain_low, plain_high
-    narrow = 2.0 * QUANTILE * np.sqrt(variance)
-    wider = (high - low) / np.where(narrow > 0.0, narrow, np.inf)
+    ends = np.minimum(low_end, plain_low), np.maximum(high_end, plain_high)
+    widths = 2.0 * QUANTILE * narrow
+    wider = (both[2] - both[1]) / np.where(widths > 0.0, widths, np.inf)
     for name, item in latent.parts.items():
         part = slice(item.part.start, item.part.start + item.size)
         labels = item.block.labels(name)
@@ -230,11 +288,12 @@ def _allowed(
         if len(labels) == item.size:
             rows = zip(labels, range(part.start, part.stop), strict=True)
             for label, k in rows:
-                numbers = [float(value[k]), *(float(end[k]) for end in ends), float(wider[k])]
+                numbers = [float(one[k]) for one in (value, *ends, plain_low, plain_high, wider)]
                 yield Allowed.of(label, unit, numbers, of_sensor=name in own)
             continue
         size = float(np.sqrt((value[part] ** 2).mean()))
-        off = [float(np.sqrt(((end[part] - value[part]) ** 2).mean())) for end in ends]
+        every = (*ends, plain_low, plain_high)
+        off = [float(np.sqrt(((end[part] - value[part]) ** 2).mean())) for end in every]
         numbers = [size, size - off[0], size + off[1], size - off[2], size + off[3]]
         numbers.append(float(np.sqrt((wider[part] ** 2).mean())))
         yield Allowed.of(name, unit, numbers, of_sensor=name in own)

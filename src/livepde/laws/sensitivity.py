@@ -309,7 +309,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             since_newer=zero,
             log=empty_log(1, sensors, len(problem.channels)),
             trial=empty_log(1, sensors, len(problem.channels)),
-            trial_start=x if work.tried else zeros(x),
+            trial_start=zeros(x) if work.fits else x,
             watch=(self.jumps or Jumps()).start(sensors),
             scale=Scale.start(sensors),
         )
@@ -570,6 +570,6 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
 
 def _started(work: SensitivityWork, state: SensitivityState, x: FilterState) -> SensitivityState:
-    start, trial = work.kept_start(x), x if work.tried else zeros(x)
+    start, trial = work.kept_start(x), zeros(x) if work.fits else x
     fit = FitState.none(start)
     return changed(state, start=start, trial_start=trial, fit=fit, now=x, older=x, newer=x)

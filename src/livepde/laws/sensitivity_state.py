@@ -96,6 +96,10 @@ class SensitivityWork:
         """True if the stored samples determine constant unknowns alone, so that they are fitted."""
         return not (self.fades or self.filter.moves or self.filter.problem.input_noise)
 
+    def trial_start(self, state: SensitivityState) -> FilterState:
+        """Return the filter before the samples that are kept for trials of columns at first."""
+        return state.start if self.fits else state.trial_start
+
     def tried_samples(self, state: SensitivityState) -> SensitivityState:
         """Return one member with its samples for trials of columns as those to be fitted."""
         start = state.trial_start
@@ -127,11 +131,11 @@ class SensitivityWork:
 
     @cached_property
     def tried(self) -> int:
-        """Samples that are kept for trials of columns where constant unknowns are not fitted."""
-        constant = self.filter.problem.input_noise and not (self.fades or self.filter.moves)
-        if self.refit is None or self.filter.judge is None or not constant:
+        """Samples that are kept for trials of columns, where these are not those of a fit; or 0."""
+        moving = self.fades or self.filter.moves
+        if self.refit is None or self.filter.judge is None or moving or not self.window:
             return 0
-        return self.refit.window if self.window else 0
+        return self.refit.window
 
     @cached_property
     def back(self) -> int:
@@ -276,6 +280,11 @@ class Scale:
         never = np.full((members, sensors), np.nan)
         return cls(never, never, never)
 
+    @property
+    def ranges(self) -> Array:
+        """Ranges of the readings so far, (members, sensors); zero before any."""
+        return np.nan_to_num(self.high - self.low)
+
     def add(self, z: Array, d: Array) -> Scale:
         """Return the value after a sample z with innovations d, NaN where missing."""
         first, unseen = self.first, np.isnan(self.first)
@@ -331,7 +340,8 @@ def stored(
             parts |= {"fork": Fork.none(now), "due": state.assimilated}
         log = kept
     parts["log"] = log
-    if work.tried and len(state) == 1:
+    disturbed = anchored is not None and bool((taken & anchored).any())
+    if len(state) == 1 and (not work.fits or disturbed or state.trial.shape[1]):
         parts |= _trial(work, state, now, span)
     if work.window:
         parts["assimilated"] = state.assimilated + (taken & span.present)
@@ -358,13 +368,23 @@ def stored(
 def _trial(
     work: SensitivityWork, state: SensitivityState, now: FilterState, span: Span
 ) -> dict[str, Any]:
-    """Return the fields of the samples for trials of columns of one member, after one more."""
-    before = state.trial if state.trial.shape[1] else state.log
+    """Return the fields of the samples for trials of columns of one member, after one more.
+
+    Where constant unknowns are fitted, trials need those before a disturbance: wrong columns are
+    one, and what begins after it is wrong as well.
+    """
+    if not work.tried:
+        return {}
+    before, start = state.trial, state.trial_start
+    if not before.shape[1]:
+        before, start = state.log[:, int(state.window[0]) :], work.trial_start(state)
     if before.shape[1] and not before[0, -1, 0] < span.t1:  # it is taken again
         return {}
     trial = added(before, span, np.ones(1, dtype=bool), now.parts)
     if not (now.driven.pause[0] or trial.shape[1] > work.tried):
-        return {"trial": trial}
+        return {"trial": trial, "trial_start": start}
+    if work.fits:  # the samples of the fit serve as well
+        return {"trial": trimmed(trial, trial.shape[1]), "trial_start": zeros(now)}
     return {"trial": trimmed(trial, trial.shape[1] - 1), "trial_start": now}
 
 

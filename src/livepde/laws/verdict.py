@@ -13,7 +13,7 @@ from livepde.laws.filter import Filter, reported_factors
 from livepde.laws.filter_state import PAUSE, SETTLED, FilterState, ShadowState
 from livepde.laws.law import Fit, Problem, Status
 from livepde.laws.member_arrays import changed
-from livepde.laws.model_errors import model_errors
+from livepde.laws.model_errors import errors_of_innovations, model_errors
 from livepde.laws.noise_rows import input_rank
 from livepde.laws.reduction import Reduction
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
@@ -194,18 +194,16 @@ def with_errors(verdict: Verdict, work: SensitivityWork, state: SensitivityState
 
 def _errors(work: SensitivityWork, state: SensitivityState) -> ModelErrors | str:
     """Return misfit and effects of one member, or why there are none."""
-    why, options = work.unstored(state), work.refit
-    if why or options is None:
-        return why
-    if state.window[0]:  # what earlier samples have told would be taken as exact
-        return "the samples before a pause, or before the window of the refit, are not fitted again"
-    filter_ = work.filter
-    Phi, (_, C) = filter_.reduction.Phi, reported_factors(filter_, state.now)
+    filter_, x = work.filter, state.now
+    Phi, (_, C) = filter_.reduction.Phi, reported_factors(filter_, x)
     shift = np.zeros(len(Phi))
     if filter_.shadows is not None:
-        shift = Phi @ filter_.shadows.widening(state.now)[1][0, 0]
+        shift = Phi @ filter_.shadows.widening(x)[1][0, 0]
     std = np.linalg.norm(Phi @ C[0].T, axis=1)
-    return model_errors(StoredSamples.of(work, state), options, std, shift)
+    # What samples before the window have told would be taken as exact.
+    if work.refit is None or work.unstored(state) or state.window[0]:
+        return errors_of_innovations(filter_, x, state.scale.ranges[0], std, shift)
+    return model_errors(StoredSamples.of(work, state), work.refit, std, shift)
 
 
 def _position(filter_: Filter, x: FilterState) -> Position:
@@ -214,7 +212,7 @@ def _position(filter_: Filter, x: FilterState) -> Position:
     _, C = reported_factors(filter_, x)
     std = np.linalg.norm(reduction.Phi @ C[0].T, axis=1)
     std = np.where(std > 0.0, std, np.inf)
-    # C^T w is the bias of the estimate for a cause of amplitude one: see `livepde.verdict.judge`.
+    # C^T w is truth less estimate for a cause of amplitude one: see `livepde.verdict.judge`.
     moved = (reduction.Phi @ (x.C[0].T @ x.causes[0])) / std[:, None]  # (m, columns)
     shape = (len(x.ledger.age[0]), -1)
     found: dict[str, Array] = {}

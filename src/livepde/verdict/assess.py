@@ -78,8 +78,8 @@ class Position:
     """Data on the estimates of one member, for its verdict."""
 
     ledger: Ledger  # the ledger of the member: see `Ledger.of_member`
-    # Shift of the estimate from the truth by each direction of each window, in reported standard
-    # deviations: unknown -> (windows, directions)
+    # Truth less estimate by each direction of each window, in reported standard deviations:
+    # unknown -> (windows, directions)
     moved: dict[str, Array]
     # Squared distance of the estimate from the prior mean, chi-square under the model, and its
     # degrees of freedom

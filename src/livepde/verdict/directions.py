@@ -335,6 +335,17 @@ class Dictionary:
     def __len__(self) -> int:
         return len(self.directions)
 
+    def plausible(self, gain: float, reach: float) -> Array:
+        """Return the largest plausible amplitude of each direction, (directions,).
+
+        `gain`: of the scale of a sensor. `reach`: of its place, over the length of the domain. A
+        jump is at most a prior standard deviation.
+        """
+        found = np.full(len(self), np.inf)
+        for kind, most in (("gain", gain / GAIN), ("position", reach / SHIFT), ("jump", 1 / JUMP)):
+            found[self.parts.get(kind, slice(0, 0))] = most
+        return found
+
     def effects(
         self, noise: Array, change: Array, late: Array, moved: Array, answers: Array
     ) -> Array:

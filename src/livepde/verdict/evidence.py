@@ -30,6 +30,7 @@ from livepde.verdict.ledger import BLOCKS, Ledger, chance
 
 NU = 10.0  # degrees of freedom of the prior of the noise level
 TEMPER = 5.0  # logarithm of the largest ratio of evidences: 3 to 8 do much the same
+AMPLITUDES = (1.0 / 3.0, 4.0 / 3.0, 16.0 / 3.0, 64.0 / 3.0)  # prior sizes of a direction
 NOTHING = 0.5  # prior mass on "nothing is wrong"; the rest on single causes and on families alike
 LEVEL = 0.95
 ALPHA = 0.01  # probability of a false alarm in a run, shared by the tests
@@ -243,17 +244,52 @@ def averaged(model: LinearModel, causes: Causes, families: Sequence[Family]) -> 
     squares = np.maximum(squares, 0.0)
     told = -0.5 * (NU + n) * np.log((NU + squares) / (NU + total)) - volume
     shares = (NOTHING, 0.5 * (1.0 - NOTHING), 0.5 * (1.0 - NOTHING))
-    masses = []
-    for share, group in zip(shares, (nothing, single, several), strict=True):
-        count = sum(len(one.squares) for one in group)
-        masses.append(np.full(count, math.log(share / max(count, 1))))
-    prior = np.concatenate(masses)
-    excess = float((told + prior).max() - told[0] - prior[0])
-    eta = 1.0 if excess <= TEMPER else TEMPER / excess
-    tempered = prior + eta * told
-    weights = np.exp(tempered - scipy.special.logsumexp(tempered))
+    counts = [sum(len(one.squares) for one in group) for group in (nothing, single, several)]
+    weights = _tempered(told, shares, counts)
     level = np.maximum(1.0, (NU + squares) / (NU + n))
     return Mixture(weights, mean + shift, np.sqrt((variance + more) * level[:, None]))
+
+
+def _tempered(told: Array, shares: Sequence[float], counts: Sequence[int]) -> Array:
+    """Return the weights of hypotheses with logarithms of their evidence; the first is "nothing".
+
+    They come in groups of some counts, each with a share of the prior mass.
+    """
+    masses = zip(shares, counts, strict=True)
+    prior = np.concatenate(
+        [np.full(count, math.log(share / max(count, 1))) for share, count in masses]
+    )
+    excess = float((told + prior).max() - told[0] - prior[0])
+    eta = 1.0 if excess <= TEMPER else TEMPER / excess
+    weights = prior + eta * told
+    found: Array = np.exp(weights - scipy.special.logsumexp(weights))
+    return found
+
+
+def averaged_causes(ledger: Ledger, moved: Array, most: Array, std: Array) -> Mixture:
+    """Return the tempered average over "nothing is wrong" and the directions of a ledger.
+
+    The numbers are truth less estimate. `moved`: that by each direction of each window, (numbers,
+    windows * directions). `most`: largest amplitude of each direction that is plausible,
+    (directions,). `std`: standard deviations of the numbers if nothing is wrong, (numbers,).
+    """
+    sums, noise, spread = ledger.sums, ledger.noise, levels(ledger)
+    log_e, size, _ = _tested(sums, noise, spread, np.zeros_like(spread))
+    # Slow errors explain what they can: a cause has the rest.
+    rho, left = _left(sums, noise, log_e, size)
+    score, information = _regression(sums, left, rho)
+    none = np.zeros((1, len(std)))
+    told, means, variances = [np.zeros(1)], [none], [none]
+    for asked in AMPLITUDES:
+        prior = np.minimum(asked, most)
+        variance = 1.0 / (information + prior**-2.0)
+        told.append(_tested(sums, noise, left, rho, prior)[0].ravel())
+        means.append((moved * (score * variance).ravel()).T)
+        variances.append((moved**2 * variance.ravel()).T)
+    evidence = np.concatenate(told)
+    weights = _tempered(evidence, (NOTHING, 1.0 - NOTHING), (1, len(evidence) - 1))
+    deviations = np.sqrt(std**2 + np.concatenate(variances))
+    return Mixture(weights, np.concatenate(means), deviations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,25 +385,22 @@ def unsuspicious(log_e: Array) -> bool:
     return bool((each < -np.log(CAUSES)).all())
 
 
-def _tested(sums: Array, noise: Array, spread: Array, rho: Array) -> tuple[Array, Array, Array]:
+def _tested(
+    sums: Array, noise: Array, spread: Array, rho: Array, prior: Array | float = 1.0
+) -> tuple[Array, Array, Array]:
     """Return log e-values, sizes and shares of misfit of all directions.
 
     `spread`, `rho`: variance and correlation of successive errors, (windows, sensors).
+    `prior`: standard deviation of the amplitude of each direction, (directions,).
     """
-    num, den, cross, lagged = sums
     count, _, squares, products, _ = noise
-    now = ((1.0 + rho**2) / spread)[:, None]
-    before = (rho / spread)[:, None]
-    # Generalised least squares for the AR(1) errors e_k - rho e_(k-1), from the sums of both
-    # products.
-    num = (num * now - cross * before).sum(axis=2)
-    den = np.maximum((den * now - 2.0 * lagged * before).sum(axis=2), 0.0)
+    num, den = _regression(sums, spread, rho)
     rss = ((squares * (1.0 + rho**2) - 2.0 * rho * products) / spread).sum(axis=1)
     rss = np.maximum(rss, 0.0)[:, None]
     total = count.sum(axis=1)[:, None]
-    # Bayes factor of theta ~ N(0, 1) under Student's t: the noise level is integrated out.
-    k = 1.0 / (1.0 + den)
-    gained = np.minimum(num**2 * k / (NU + rss), 1.0 - 1e-12)
+    # Bayes factor of theta ~ N(0, s^2) under Student's t: the noise level is integrated out.
+    k = 1.0 / (1.0 + prior**2 * den)
+    gained = np.minimum(prior**2 * num**2 * k / (NU + rss), 1.0 - 1e-12)
     log_e = 0.5 * np.log(k) - 0.5 * (NU + total) * np.log1p(-gained)
     log_e = np.where(np.isfinite(log_e), log_e, 0.0)
     size = num / np.where(den > 0.0, den, np.inf)
@@ -375,6 +408,18 @@ def _tested(sums: Array, noise: Array, spread: Array, rho: Array) -> tuple[Array
     excess = np.maximum(rss - total, num * size)
     share = num * size / np.where(excess > 0.0, excess, np.inf)
     return log_e, size, share
+
+
+def _regression(sums: Array, spread: Array, rho: Array) -> tuple[Array, Array]:
+    """Return score and information of the amplitude of each direction, (windows, directions).
+
+    Generalised least squares for the AR(1) errors e_k - rho e_(k-1), from the sums of both
+    products.
+    """
+    num, den, cross, lagged = sums
+    now, before = ((1.0 + rho**2) / spread)[:, None], (rho / spread)[:, None]
+    score = (num * now - cross * before).sum(axis=2)
+    return score, np.maximum((den * now - 2.0 * lagged * before).sum(axis=2), 0.0)
 
 
 def _left(sums: Array, noise: Array, log_e: Array, size: Array) -> tuple[Array, Array]:

@@ -19,8 +19,8 @@ that the batch has
 
     w_k = M_k (w_(k-1) - Y_(k-1) f_(k-1)),    g_k = f_k + Y_k^T w_k.
 
-So w costs no solve: it is exact for a linear filter, whatever moves, and C^T w is the bias of the
-estimate of the unknowns for each unit of the cause.
+So w costs no solve: it is exact for a linear filter, whatever moves, and C^T w is the truth less
+the estimate of the unknowns for each unit of the cause.
 """
 
 from __future__ import annotations
