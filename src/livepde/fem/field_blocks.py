@@ -60,11 +60,6 @@ class Local:
             self._known[name] = self._evaluate(name)
         return self._known[name]
 
-    @property
-    def phi(self) -> Array:
-        """Components of all parts, shape (components, local, elements, points)."""
-        return np.concatenate([self.part(name) for name, _ in self.parts])
-
 
 class Block(ABC):
     """One unknown of a function space."""
@@ -221,14 +216,6 @@ class FieldBlock(Block):
         return found
 
     @cached_property
-    def _spread(self) -> sp.csr_array:
-        """Matrix from coefficients to scikit-fem's degrees of freedom, before periodic ties."""
-        n = int(self.dofs.N)
-        if self._tie is None:
-            return sp.csr_array(sp.eye_array(n))
-        return sp.csr_array((np.ones(n), (np.arange(n), self._tie)), shape=(n, self.size))
-
-    @cached_property
     def basis(self) -> Any:
         """Basis of scikit-fem with shape functions at all quadrature points of `measure`."""
         return Basis(self.field.mesh, self.element, dofs=self.dofs)
@@ -332,15 +319,10 @@ class FieldBlock(Block):
         return self._projected(lambda at, piece: grid[:, at])
 
     def _projected(self, values: Callable[[slice, Measure], Array]) -> Array:
-        functional = np.zeros(self.size)
-        for at, piece in self.measure.pieces():
-            local = self.local(piece)
-            density = (values(at, piece) * piece.weights).reshape(-1, *piece.shape)
-            tested = np.einsum("kep,kiep->ie", density, local.part("value"))
-            np.add.at(functional, local.dofs.ravel(), tested.ravel())
+        functional = self._tested(self.measure, values)
         if self.measure.kept:
             return self._mass_factor.solve(functional)
-        mass = self._mass()
+        mass = self._mass(self.measure)
         scale = mass.diagonal()
         found, _ = conjugate_gradients(
             mass.__matmul__, lambda r: r / scale, functional, PROJECTED, ITERATIONS, FINER
@@ -369,50 +351,41 @@ class FieldBlock(Block):
                 return coefficients
 
             return self.doflocs[:, used], at_nodes
-        pieces = [(self.local(piece), piece) for _, piece in self.measure.on(cells).pieces()]
-        places = np.zeros(self.size, dtype=np.int64)
-        places[used] = np.arange(len(used))
-        dofs = [places[local.dofs] for local, _ in pieces]
-        grams = [
-            np.einsum("kiep,kjep->ije", local.part("value") * piece.weights, local.part("value"))
-            for local, piece in pieces
-        ]
-        shape = len(used), len(used)
-        mass = sp.csr_array(shape)
-        for rows, gram in zip(dofs, grams, strict=True):
-            i, j = (np.broadcast_to(axis, gram.shape) for axis in (rows[:, None], rows[None]))
-            mass = mass + sp.csr_array((gram.ravel(), (i.ravel(), j.ravel())), shape=shape)
-        factor = analyse(Pattern.of(mass), symmetric=True).factorise(mass.data)
+        measure = self.measure.on(cells)
+        factor = _factor(sp.csr_array(self._mass(measure)[used][:, used]))
 
         def projected(values: Array) -> Array:
-            functional, start = np.zeros(len(used)), 0
-            for (local, piece), rows in zip(pieces, dofs, strict=True):
-                stop = start + piece.weights.size
-                density = values[:, start:stop].reshape(-1, *piece.shape) * piece.weights
-                tested = np.einsum("kep,kiep->ie", density, local.part("value"))
-                np.add.at(functional, rows.ravel(), tested.ravel())
-                start = stop
+            grid = values.reshape(-1, *measure.shape)
+            functional = self._tested(measure, lambda at, piece: grid[:, at])
             coefficients = found.copy()
-            coefficients[used] = factor.solve(functional)
+            coefficients[used] = factor.solve(functional[used])
             return coefficients
 
-        points = [piece.points.reshape(len(piece.points), -1) for _, piece in pieces]
-        return np.concatenate(points, axis=1), projected
+        return measure.points.reshape(len(measure.points), -1), projected
 
-    def _mass(self) -> sp.csr_array:
-        """Return the mass matrix, shape (size, size)."""
-        places = scatter([(self.element_dofs, self.element_dofs)], (self.size, self.size))
+    def _tested(self, measure: Measure, values: Callable[[slice, Measure], Array]) -> Array:
+        """Return the integrals of a function on a measure against all shape functions, (size,)."""
+        functional = np.zeros(self.size)
+        for at, piece in measure.pieces():
+            local = self.local(piece)
+            density = (values(at, piece) * piece.weights).reshape(-1, *piece.shape)
+            tested = np.einsum("kep,kiep->ie", density, local.part("value"))
+            np.add.at(functional, local.dofs.ravel(), tested.ravel())
+        return functional
+
+    def _mass(self, measure: Measure) -> sp.csr_array:
+        """Return the mass matrix on a measure, shape (size, size)."""
+        dofs = self.dofs_on(measure)
+        places = scatter([(dofs, dofs)], (self.size, self.size))
         data = np.zeros(places.pattern.nnz)
-        for at, piece in self.measure.pieces():
+        for at, piece in measure.pieces():
             phi = self.local(piece).part("value")
-            local = np.einsum("kiep,kjep->ije", phi * piece.weights, phi)
-            places.add(data, 0, at, local)
+            places.add(data, 0, at, np.einsum("kiep,kjep->ije", phi * piece.weights, phi))
         return places.pattern.matrix(data)
 
     @cached_property
     def _mass_factor(self) -> Factor:
-        mass = self._mass()
-        return analyse(Pattern.of(mass), symmetric=True).factorise(mass.data)
+        return _factor(self._mass(self.measure))
 
     def _dofs_on(self, name: str, names: list[str] | None) -> IntArray:
         """Return the coefficients on a boundary; names None: also those of derivatives."""
@@ -613,10 +586,9 @@ class FieldBlock(Block):
         element, mesh = self.field.element, self.field.mesh
         names = element.dofnames or []
         if element.nodal_dofs and names and names[0] == "u":  # a coefficient is the value there
-            dofs = self.dofs.nodal_dofs[0]
+            dofs = self._tied(self.dofs.nodal_dofs[0])
             entries = (np.ones(len(dofs)), (np.arange(len(dofs)), dofs))
-            values = sp.csr_array(entries, shape=(len(dofs), int(self.dofs.N)))
-            return sp.csr_array(values @ self._spread)
+            return sp.csr_array(entries, shape=(len(dofs), self.size))
         return self.probe(mesh.p, "vertex")
 
 
@@ -639,6 +611,10 @@ class _Component:
                 "lambda x, t: (t * x[1], 0.0)."
             )
         return values[self.axis]
+
+
+def _factor(mass: sp.csr_array) -> Factor:
+    return analyse(Pattern.of(mass), symmetric=True).factorise(mass.sorted_indices().data)
 
 
 def _jet(function: DiscreteField, name: str) -> Any:

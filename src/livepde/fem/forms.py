@@ -19,7 +19,7 @@ the derivative from the user, and `check_model` tells when one is missing.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -91,6 +91,12 @@ class _Term:
             key: rng.standard_normal((local.components, *local.shape))
             for key, local in self.spaces.items()
         }
+
+    def along(
+        self, slot: str, values: Mapping[str, Array], moment: Moment
+    ) -> Callable[[Array], Array]:
+        """Return the integrand as a function of component values of one argument."""
+        return lambda x: np.asarray(self.evaluate({**values, slot: x}, moment)[0])
 
     def evaluate(self, values: Mapping[str, Array], moment: Moment) -> tuple[Any, Place]:
         place = self.measure.place(moment)
@@ -190,7 +196,7 @@ class Form(FormMatrices):
         self._constants: dict[tuple[str, str], Array] = {}
         self._offsets: dict[str, Array] = {}
         self._slopes: dict[str, sp.csr_array] = {}
-        self._tensors: dict[tuple[str, str], Tensor | None] = {}
+        self._tensors: dict[tuple[str, str], Tensor] = {}
         self._scatters: dict[tuple[str, str], Scatter] = {}
         self._products: ElementProducts | None = None
 
@@ -249,16 +255,7 @@ class Form(FormMatrices):
         for number, whole in enumerate(self.terms):
             for term in whole.samples():
                 values = term.drawn(rng)
-                place, one = Moment(0.3, self._inputs), values[slot]
-
-                def at(
-                    v: Array,
-                    term: _Term = term,
-                    values: dict[str, Array] = values,
-                    place: Moment = place,
-                ) -> Array:
-                    return np.asarray(term.evaluate({**values, slot: v}, place)[0])
-
+                at, one = term.along(slot, values, Moment(0.3, self._inputs)), values[slot]
                 other = rng.standard_normal(one.shape)
                 with np.errstate(all="ignore"):  # roots and logarithms of random numbers
                     parts = at(one), at(other), at(one + other)
@@ -332,14 +329,9 @@ class Form(FormMatrices):
         # Probing has a fixed seed: whether a form counts as affine must not differ between two
         # runs.
         rng = np.random.default_rng(1)
-        probe = Moment(0.3, self._inputs)
         for term in (piece for whole in self.terms for piece in whole.samples()):
             values = term.drawn(rng)
-
-            def at(x: Array, term: _Term = term, values: dict[str, Array] = values) -> Array:
-                density, _ = term.evaluate({**values, slot: x}, probe)
-                return np.asarray(density)
-
+            at = term.along(slot, values, Moment(0.3, self._inputs))
             for scale in MAGNITUDES:
                 a, b = scale * rng.standard_normal((2, *values[slot].shape))
                 with np.errstate(all="ignore"):
@@ -463,12 +455,10 @@ class Form(FormMatrices):
             if len(others) == 1:
                 # A constant trilinear form needs no quadrature in a step: its matrix is linear in
                 # the third coefficients.
-                tensor = self._tensor(rows, cols, others[0])
-                if tensor is not None:
-                    product: Array = tensor @ coefficients[others[0]]
-                    if others[0] == self.nonlinear:
-                        product += self._constant(rows, cols)
-                    return product
+                product: Array = self._tensor(rows, cols, others[0]) @ coefficients[others[0]]
+                if others[0] == self.nonlinear:
+                    product += self._constant(rows, cols)
+                return product
         return self._quadrature(rows, cols, moment, coefficients)
 
     def product(
@@ -605,7 +595,7 @@ class Form(FormMatrices):
             return None
         return self._tensor(rows, cols, third)
 
-    def _tensor(self, rows: str, cols: str, third: str) -> Tensor | None:
+    def _tensor(self, rows: str, cols: str, third: str) -> Tensor:
         if (rows, cols) not in self._tensors:
             sizes = [
                 int(np.prod([len(space.dofs_on(term.measure)) for space in term.over.values()]))
@@ -630,7 +620,7 @@ class Form(FormMatrices):
         total.eliminate_zeros()
         return total
 
-    def _elementwise(self, rows: str, cols: str, third: str) -> ElementTensor | None:
+    def _elementwise(self, rows: str, cols: str, third: str) -> ElementTensor:
         if self._products is None:
             order = tuple(self.spaces)
             terms = (

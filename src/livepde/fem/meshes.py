@@ -34,7 +34,7 @@ from skfem.element import (
 from skfem.element.element_global import ElementGlobal
 
 from livepde.errors import SpaceError, optional
-from livepde.fem.fields import Field, Predicate, at_end
+from livepde.fem.fields import Field, Predicate, with_sides
 from livepde.linalg import Array, IntArray
 
 LINEAR: dict[Any, Any] = {
@@ -134,15 +134,7 @@ def grid(
     """
     if not all(len(side) > 1 and (np.diff(side) > 0).all() for side in (x, y)):
         raise SpaceError("grid: needs at least two increasing nodes in x and in y.")
-    mesh = MeshQuad.init_tensor(np.array(x), np.array(y)).with_boundaries(
-        {
-            "left": at_end(0, x[0], (x[0], x[-1])),
-            "right": at_end(0, x[-1], (x[0], x[-1])),
-            "bottom": at_end(1, y[0], (y[0], y[-1])),
-            "top": at_end(1, y[-1], (y[0], y[-1])),
-        }
-    )
-    return mesh.with_subdomains(dict(regions)) if regions else mesh
+    return with_sides(MeshQuad.init_tensor(np.array(x), np.array(y)), regions)
 
 
 def box(
@@ -163,18 +155,8 @@ def box(
         raise SpaceError(
             f"box({x}, {y}, {z}, {cells}): needs increasing coordinates and cells >= 1."
         )
-    mesh = MeshTet.init_tensor(
-        *(np.linspace(*side, n + 1) for side, n in zip(sides, cells, strict=True))
-    )
-    names = (("left", "right"), ("front", "back"), ("bottom", "top"))
-    mesh = mesh.with_boundaries(
-        {
-            name: at_end(axis, end, sides[axis])
-            for axis in range(3)
-            for name, end in zip(names[axis], sides[axis], strict=True)
-        }
-    )
-    return mesh.with_subdomains(dict(regions)) if regions else mesh
+    nodes = [np.linspace(*side, n + 1) for side, n in zip(sides, cells, strict=True)]
+    return with_sides(MeshTet.init_tensor(*nodes), regions)
 
 
 def halved(mesh: Mesh) -> Mesh:

@@ -229,6 +229,12 @@ class _Kernel:
         found: Array = solve_triangular(root, self.covariance(self.places, at), lower=True)
         return found[self.known :]
 
+    def mixed(self, mix: Array, x: Any) -> Array:
+        """Return a mix of the functions at x, shape (d, ...)."""
+        x = np.asarray(x, dtype=float)
+        found: Array = mix @ self.features(x.reshape(len(x), -1).T)
+        return found.reshape(x.shape[1:])
+
 
 def random_field(
     mesh: Any,
@@ -308,7 +314,7 @@ def random_field(
             )
         scale = std / float(np.sqrt(((mixes @ features) ** 2).sum(axis=0).max()))
     mixes = scale * mixes
-    functions = [_Function(kernel, mix) for mix in mixes]
+    functions = [partial(kernel.mixed, mix) for mix in mixes]
     if vertices.shape[1] > 1:
         return tuple(functions)
     nodes = np.sort(vertices[:, 0])
@@ -341,16 +347,3 @@ def _spread(kernel: _Kernel, values: Array) -> float:
     weights = np.linalg.inv(kernel.covariance(places, places) + NUGGET * np.eye(len(values)))
     off = values - (weights @ values).sum() / weights.sum()
     return float(np.sqrt(max(off @ weights @ off, 0.0) / (len(values) - 1)))
-
-
-@dataclass(frozen=True, eq=False)
-class _Function:
-    """A function of the field, as a mix of its features."""
-
-    kernel: _Kernel
-    mix: Array
-
-    def __call__(self, x: Any) -> Array:
-        x = np.asarray(x, dtype=float)
-        found: Array = self.mix @ self.kernel.features(x.reshape(len(x), -1).T)
-        return found.reshape(x.shape[1:])

@@ -330,11 +330,7 @@ class FunctionSpace:
     @cached_property
     def fixed(self) -> IntArray:
         """Coefficients fixed by Dirichlet conditions."""
-        parts = [
-            block.fixed + start
-            for block, start in zip(self.blocks.values(), self.starts, strict=True)
-            if isinstance(block, FieldBlock)
-        ]
+        parts = [block.fixed + self.part(name).start for name, block in self.fields.items()]
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
     @cached_property
@@ -347,8 +343,7 @@ class FunctionSpace:
         """Coefficient number of each scalar unknown, by label."""
         found: dict[str, int] = {}
         for (name, block), start in zip(self.blocks.items(), self.starts, strict=True):
-            for k, label in enumerate(block.labels(name)):
-                found[label] = start + k
+            found |= {label: start + k for k, label in enumerate(block.labels(name))}
         return found
 
     @cached_property
@@ -359,9 +354,7 @@ class FunctionSpace:
             parts=self.parts,
             fields=dict.fromkeys(self.fields),
             unknowns={
-                name: Scalar(
-                    each.prior, evolution=each.evolution, unit=each.unit, within=each.within
-                )
+                name: Scalar(each.prior, each.unit, each.evolution, each.within)
                 for name, each in self.unknowns.items()
             },
         )
