@@ -28,7 +28,6 @@ from livepde.models.description import (
     Variable,
     autonomous,
     by_name,
-    closed,
     state,
 )
 
@@ -334,7 +333,7 @@ KDV = Equation(
         "dispersion": Variable("", "coefficient b of u_xxx", transform=""),
         "u0": INITIAL,
     },
-    build=closed(kdv, "is periodic"),
+    build=by_name(kdv, "is periodic"),
     element=smooth,
     length_unit="",
     time_unit="",
@@ -383,7 +382,7 @@ KURAMOTO_SIVASHINSKY = Equation(
         "damping": Variable("", "coefficient c of u_xxxx", transform=""),
         "u0": INITIAL,
     },
-    build=closed(kuramoto_sivashinsky, "is periodic"),
+    build=by_name(kuramoto_sivashinsky, "is periodic"),
     element=smooth,
     length_unit="",
     time_unit="",
