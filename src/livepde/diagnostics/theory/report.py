@@ -338,6 +338,8 @@ def _constants(tracker: OnlineTracker, tables: list[Table], notes: list[str]) ->
 
 
 def _how(name: str, c: Constants) -> str:
+    if name in ("c_M", "C_M", "c_N", "C_N"):
+        return "1 in these norms"
     if name in c.sampled:
         return "estimated from below, by sampling"
     return "a bound" if name in ("C_A", "observed_ratio", "hidden_ratio") else "an eigenvalue"
