@@ -98,38 +98,35 @@ class ScalarBlock(Block):
 
     def __init__(self, unknown: Scalar | Piecewise) -> None:
         self.unknown = unknown
-        self.size = 1 if isinstance(unknown, Scalar) else len(unknown.regions)
-
-    def _indicators(self, measure: Measure) -> Array:
-        masks = np.zeros((self.size, *measure.shape))
-        if isinstance(self.unknown, Scalar):
-            return masks + 1.0
-        cells = np.arange(measure.mesh.nelements) if measure.cells is None else measure.cells
-        for mask, region in zip(masks, self.unknown.regions.values(), strict=True):
-            if callable(region):
-                mask[:] = region(measure.points)
-            else:
-                mask[np.isin(cells, measure.mesh.subdomains[region])] = 1.0
-        return masks
+        self.regions = unknown.regions if isinstance(unknown, Piecewise) else {}
+        self.size = len(self.regions) or 1
 
     def local(self, measure: Measure) -> Local:
-        regions = {} if isinstance(self.unknown, Scalar) else self.unknown.regions
-        for name, region in regions.items():
+        for name, region in self.regions.items():
             if not callable(region) and region not in (measure.mesh.subdomains or {}):
                 raise SpaceError(
                     f"Region '{name}': the mesh has no subdomain '{region}'; give a predicate on x."
                 )
-        return Local(
-            self.dofs_on(measure), (("value", ()),), lambda _: self._indicators(measure)[None]
-        )
+
+        def indicators(_: str) -> Array:
+            masks = np.zeros((1, self.size, *measure.shape))
+            if not self.regions:
+                return masks + 1.0
+            cells = np.arange(measure.mesh.nelements) if measure.cells is None else measure.cells
+            for mask, region in zip(masks[0], self.regions.values(), strict=True):
+                if callable(region):
+                    mask[:] = region(measure.points)
+                else:
+                    mask[np.isin(cells, measure.mesh.subdomains[region])] = 1.0
+            return masks
+
+        return Local(self.dofs_on(measure), [("value", ())], indicators)
 
     def jet(self, parts: Local, values: Array) -> Any:
         return values[0]
 
     def labels(self, name: str) -> tuple[str, ...]:
-        if isinstance(self.unknown, Scalar):
-            return (name,)
-        return tuple(f"{base_name(name)}[{region}]" for region in self.unknown.regions)
+        return tuple(f"{base_name(name)}[{region}]" for region in self.regions) or (name,)
 
 
 class NamesBlock(Block):
@@ -393,12 +390,6 @@ class FieldBlock(Block):
         found: IntArray = np.unique(self._tied(dofs))
         return found
 
-    def _value_dofs(self, name: str) -> IntArray:
-        # Essential conditions fix values only; derivative degrees of freedom (u_x, u_n, ...) stay
-        # free unless the field is clamped.
-        values = [n for n in (self.field.element.dofnames or []) if "_" not in n]
-        return self._dofs_on(name, None if self.field.clamped else values)
-
     def _axes(self, where: str) -> list[int]:
         """Return the axes whose component of a vector is a coefficient."""
         names = self.field.element.dofnames or []
@@ -413,7 +404,10 @@ class FieldBlock(Block):
     def _valued(self, name: str, value: Any) -> list[tuple[IntArray, Any]]:
         """Return the Dirichlet conditions of a boundary, one per component of a vector."""
         if not (isinstance(value, tuple) or (callable(value) and self.vector)):
-            return [(self._value_dofs(name), value)]
+            # Essential conditions fix values only; derivative degrees of freedom (u_x, u_n, ...)
+            # stay free unless the field is clamped.
+            values = [n for n in (self.field.element.dofnames or []) if "_" not in n]
+            return [(self._dofs_on(name, None if self.field.clamped else values), value)]
         where = f"dirichlet: '{name}'"
         axes = self._axes(where)
         if callable(value):

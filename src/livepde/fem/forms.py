@@ -29,7 +29,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import LivepdeError, ModelError
-from livepde.fem.elementwise import ElementProducts, ElementTensor, Scatter, scatter
+from livepde.fem.elementwise import ElementTensor, Scatter, TensorTerm, scatter
 from livepde.fem.fields import Integrand, On, ignores
 from livepde.fem.measure import START, Inputs, Measure, Moment, Place
 from livepde.fem.space import FunctionSpace, LocalSpace
@@ -198,7 +198,7 @@ class Form(FormMatrices):
         self._slopes: dict[str, sp.csr_array] = {}
         self._tensors: dict[tuple[str, str], Tensor] = {}
         self._scatters: dict[tuple[str, str], Scatter] = {}
-        self._products: ElementProducts | None = None
+        self._products: list[TensorTerm] | None = None
 
     def on(self, cells: IntArray) -> Form:
         """Return the form integrated over some cells of the mesh, and over their facets.
@@ -622,16 +622,16 @@ class Form(FormMatrices):
 
     def _elementwise(self, rows: str, cols: str, third: str) -> ElementTensor:
         if self._products is None:
-            order = tuple(self.spaces)
-            terms = (
-                (
-                    {key: space.dofs_on(term.measure) for key, space in term.over.items()},
-                    self._trilinear_parts(term, *order),
+            self._products = [
+                TensorTerm.of(
+                    [space.dofs_on(term.measure) for space in term.over.values()],
+                    self._trilinear_parts(term, *self.spaces),
                 )
                 for term in self.terms
-            )
-            self._products = ElementProducts.of(order, terms)
-        return self._products.tensor(rows, cols, third, self._scatter(rows, cols))
+            ]
+        order = list(self.spaces)
+        slots = order.index(rows), order.index(cols), order.index(third)
+        return ElementTensor(self._products, slots, self._scatter(rows, cols))
 
     def _trilinear_parts(
         self, whole: _Term, first: str, second: str, third: str

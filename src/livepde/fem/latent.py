@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import SpaceError
-from livepde.fem.fields import Integrand, On, Scalars
+from livepde.fem.fields import Declaration, Integrand, On, Scalars
 from livepde.fem.forms import STEP, Form, FormMatrices
 from livepde.fem.measure import START, Moment
 from livepde.fem.priors import Evolution, Identity, Normal, Transform
@@ -120,21 +120,19 @@ class LatentPart:
     """
 
     name: str
-    unknown: Any
+    unknown: Declaration
     block: Any
     part: slice
 
     @cached_property
     def transform(self) -> Transform:
         """Transform T of this unknown."""
-        transform: Transform = self.unknown.prior.transform
-        return transform
+        return self.unknown.prior.transform
 
     @property
     def evolution(self) -> Evolution:
         """Evolution model of the unknown."""
-        evolution: Evolution = self.unknown.evolution
-        return evolution
+        return self.unknown.evolution
 
     @property
     def size(self) -> int:
@@ -183,9 +181,8 @@ class Latent:
     @cached_property
     def V(self) -> sp.csr_array:
         """Summation matrix of the visible components, shape (m, dim)."""
-        blocks = [
-            sp.kron(p.evolution.visible[None], sp.eye_array(p.size)) for p in self.parts.values()
-        ]
+        parts = self.parts.values()
+        blocks = [sp.kron(p.evolution.visible[None], sp.eye_array(p.size)) for p in parts]
         return sp.csr_array(sp.block_diag(blocks, format="csr"))
 
     def visible(self, each: Array) -> Array:

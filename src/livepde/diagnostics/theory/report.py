@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,10 +18,8 @@ from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier
 from livepde.laws.damping import Constants, Damping, Norms
 from livepde.linalg import Array
-from livepde.model import Model
-from livepde.observation import Observed
 from livepde.result import Estimate
-from livepde.samples import Sample, sample_of
+from livepde.samples import Channels, Sample, sample_of
 from livepde.streams import Twin
 
 DEFINITIONS = {
@@ -117,11 +115,12 @@ class OnlineTracker:
     def __init__(self, identifier: Identifier, window: float, noise: Any = None) -> None:
         self.identifier = identifier
         self.window = window
-        law = identifier.law
+        law, model = identifier.law, identifier.model
+        self.channels = Channels(model.channels, identifier.observed, identifier.validation)
         self.gain = float(getattr(law, "gain", 1.0))
         damping = getattr(law, "damping", None)
         self.damping: Damping | None = damping if isinstance(damping, Damping) else None
-        self.spaces = Spaces.of(identifier.model, identifier.observed, law)
+        self.spaces = Spaces.of(model, identifier.observed, law)
         self.excitation = Excitation(self.spaces, window, self.gain)
         self.excited = self.excitation.init()
         self.moments: list[_Moment] = []
@@ -136,8 +135,8 @@ class OnlineTracker:
     def add(self, estimate: Estimate, sample: Sample) -> None:
         """Record one estimate; failed steps and samples without measurements are ignored."""
         model, observed = self.identifier.model, self.identifier.observed
-        self.inputs |= _inputs_of(sample, model)
-        z = _measured(sample, observed)
+        z, _, _, named = self.channels.parse(sample.z, sample.inputs or {})
+        self.inputs |= {name: named[name] for name in model.channels if name in named}
         z[~np.isfinite(estimate.innovation)] = np.nan
         if not estimate.status.ok or not np.isfinite(z).any():
             return
@@ -238,21 +237,6 @@ class OnlineTracker:
         return np.array([getattr(item, get) for item in self.moments])
 
 
-def _measured(sample: Sample, observed: Observed) -> Array:
-    """Return a sample's measurements as an array, NaN where missing."""
-    if not isinstance(sample.z, Mapping):
-        return np.array(sample.z, dtype=float).reshape(observed.size)
-    values = [sample.z.get(name) for name in observed.names]
-    return np.array([np.nan if value is None else value for value in values], dtype=float)
-
-
-def _inputs_of(sample: Sample, model: Model) -> dict[str, float]:
-    named = dict(sample.z) if isinstance(sample.z, Mapping) else {}
-    named |= dict(sample.inputs or {})
-    found = {name: named[name] for name in model.channels if name in named}
-    return {name: float(value) for name, value in found.items()}
-
-
 def theory_report(
     identifier: Identifier,
     samples: Iterable[Any],
@@ -328,21 +312,17 @@ def _constants(tracker: OnlineTracker, tables: list[Table], notes: list[str]) ->
     except LivepdeError as error:
         notes.append(f"The constants cannot be computed: {error}")
         return None
+    how = dict.fromkeys(DEFINITIONS, "an eigenvalue")
+    how |= dict.fromkeys(("C_A", "observed_ratio", "hidden_ratio"), "a bound")
+    how |= dict.fromkeys(("c_M", "C_M", "c_N", "C_N"), "1 in these norms")
+    how |= dict.fromkeys(c.sampled, "estimated from below, by sampling")
     rows = [
-        (name, float(getattr(c, name)), text, label, _how(name, c))
+        (name, float(getattr(c, name)), text, label, how[name])
         for name, (label, text) in DEFINITIONS.items()
     ]
     columns = ("constant", "value", "definition", "in the paper", "is")
     tables.append(Table("Constants of the discretised model", columns, rows))
     return c
-
-
-def _how(name: str, c: Constants) -> str:
-    if name in ("c_M", "C_M", "c_N", "C_N"):
-        return "1 in these norms"
-    if name in c.sampled:
-        return "estimated from below, by sampling"
-    return "a bound" if name in ("C_A", "observed_ratio", "hidden_ratio") else "an eigenvalue"
 
 
 def _residual_tables(tracker: OnlineTracker, notes: list[str]) -> list[Table]:
