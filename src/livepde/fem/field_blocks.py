@@ -193,8 +193,7 @@ class FieldBlock(Block):
         if self._tie is None:
             return self.places
         _, first = np.unique(self._tie, return_index=True)
-        found: Array = self.places[:, first]
-        return found
+        return self.places[:, first]
 
     def at(self, facets: Any = None, names: Sequence[str] | None = None) -> IntArray:
         """Return scikit-fem's degrees of freedom on facets, by default on the whole boundary."""
@@ -209,8 +208,7 @@ class FieldBlock(Block):
         free = mesh.boundary_facets()
         for name in chain(*self.field.periodic):
             free = np.setdiff1d(free, mesh.boundaries[name])
-        found: IntArray = np.unique(self._tied(self.at(free)))
-        return found
+        return np.unique(self._tied(self.at(free)))
 
     @cached_property
     def basis(self) -> Any:
@@ -387,8 +385,7 @@ class FieldBlock(Block):
     def _dofs_on(self, name: str, names: list[str] | None) -> IntArray:
         """Return the coefficients on a boundary; names None: also those of derivatives."""
         dofs = self.at(None if name == "boundary" else name, names)
-        found: IntArray = np.unique(self._tied(dofs))
-        return found
+        return np.unique(self._tied(dofs))
 
     def _axes(self, where: str) -> list[int]:
         """Return the axes whose component of a vector is a coefficient."""
@@ -434,8 +431,7 @@ class FieldBlock(Block):
         along = np.abs(ends[axis, 1] - ends[axis, 0])
         sides = np.asarray(sides)[across <= 1e-9 * along]
         names = [("u_x", "u_y")[axis]]
-        found: IntArray = np.unique(self._tied(self.at(sides, names)))
-        return found
+        return np.unique(self._tied(self.at(sides, names)))
 
     @cached_property
     def conditions(self) -> tuple[tuple[IntArray, Any], ...]:

@@ -530,8 +530,7 @@ class Form(FormMatrices):
                 if given is not None and key == self.nonlinear:
                     jets.append(local.unit_jets(axes[0], 2))
             density = (term.integrand if given is None else given)(*jets, place)
-            slope: Array = np.asarray(density) if stepped is None else np.imag(density) / STEP
-            return slope
+            return np.asarray(density) if stepped is None else np.imag(density) / STEP
 
         if shifted is None:
             return evaluate(0.0)
@@ -543,8 +542,7 @@ class Form(FormMatrices):
         near = evaluate(SHIFT) - evaluate(-SHIFT)
         far = evaluate(2.0 * SHIFT) - evaluate(-2.0 * SHIFT)
         difference = (8.0 * near - far) / (12.0 * SHIFT)
-        scaled: Array = difference / np.swapaxes(self._scale(key, local, here)[:, 0], 0, shifted)
-        return scaled
+        return difference / np.swapaxes(self._scale(key, local, here)[:, 0], 0, shifted)
 
     def _differenced(
         self, rows: str, cols: str, given: Integrand | None

@@ -190,25 +190,23 @@ class Latent:
         return each if self.dim == self.space.dim else self.V @ each  # the same but for harmonics
 
     def _each(self, a: Array, function: str) -> Array:
-        pieces = [getattr(p.transform, function)(a[p.part]) for p in self.parts.values()]
+        with np.errstate(over="ignore"):
+            pieces = [getattr(p.transform, function)(a[p.part]) for p in self.parts.values()]
         return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
 
     def value(self, a: Array) -> Array:
         """Return the coefficients of q, shape (m,), from latent ones of shape (dim,)."""
         if self.plain:
             return a
-        with np.errstate(over="ignore"):
-            return self.visible(self._each(a, "value"))
+        return self.visible(self._each(a, "value"))
 
     def slopes(self, a: Array) -> Array:
         """Return T' of each latent coefficient, shape (dim,)."""
-        with np.errstate(over="ignore"):
-            return self._each(a, "slope")
+        return self._each(a, "slope")
 
     def curvatures(self, a: Array) -> Array:
         """Return T'' of each latent coefficient, shape (dim,)."""
-        with np.errstate(over="ignore"):
-            return self._each(a, "curvature")
+        return self._each(a, "curvature")
 
     def tangent(self, a: Array, directions: Array) -> Array:
         """Return dq/da applied to columns of shape (dim, k): shape (m, k)."""

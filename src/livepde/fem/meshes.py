@@ -325,8 +325,7 @@ def tied(field: Field, block: Any) -> IntArray | None:
     # Coefficients are numbered by first occurrence, which keeps the bandwidth of the mesh.
     _, first, renumbered = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))
-    tie: IntArray = rank[renumbered]
-    return tie
+    return rank[renumbered]
 
 
 def _matched(field: Field, block: Any, one: str, other: str) -> tuple[IntArray, IntArray]:

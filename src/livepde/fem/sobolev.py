@@ -109,18 +109,14 @@ class Sobolev:
 
     def form(self, element: Any) -> Any:
         """Return the inner product as a weak form; None if the element admits none."""
-        form, factor = self._plain_form(element), self.factor
-        return form and (lambda u, v, x: factor * form(u, v, x))
-
-    def _plain_form(self, element: Any) -> Any:
-        l2 = self.length**2
+        c, l2 = self.factor, self.length**2
         if self.s == 0:
-            return lambda u, v, x: u * v
+            return lambda u, v, x: c * (u * v)
         if self.s == 1:
-            return lambda u, v, x: u * v + l2 * dot(grad(u), grad(v))
+            return lambda u, v, x: c * (u * v + l2 * dot(grad(u), grad(v)))
         if self.s == 2 and isinstance(element, SMOOTH):
             return lambda u, v, x: (
-                u * v + 2 * l2 * dot(grad(u), grad(v)) + l2**2 * ddot(hess(u), hess(v))
+                c * (u * v + 2 * l2 * dot(grad(u), grad(v)) + l2**2 * ddot(hess(u), hess(v)))
             )
         return None
 

@@ -105,8 +105,7 @@ class LocalSpace:
     def values(self, coefficients: Array) -> Array:
         """Return the components of a function, shape (components, elements, points)."""
         if self.kept:
-            values: Array = (self.evaluation @ coefficients).reshape(self.components, *self.shape)
-            return values
+            return (self.evaluation @ coefficients).reshape(self.components, *self.shape)
         local = coefficients[self.dofs]
         values = np.empty((self.components, *self.shape))
         for k in range(self.components):
@@ -119,8 +118,7 @@ class LocalSpace:
         if self.kept:
             weighted = np.empty((self.components, *self.shape))
             np.multiply(density, weights, out=weighted)
-            whole: Array = self._evaluation_transposed @ weighted.ravel()
-            return whole
+            return self._evaluation_transposed @ weighted.ravel()
         local = np.zeros(self.dofs.shape)
         for (k,), part in _parts(density, (self.components,)):
             columns, phi = self.component(k)

@@ -159,7 +159,14 @@ def _model(
     if "loss" in given:
         terms += _exchange("loss", part)
     if "transfer" in given:
-        terms += _transfer(equation.name, mesh, held, part)
+        sides = [] if "boundary" in held else [*(mesh.boundaries or {})]
+        free = [side for side in sides if side not in held]
+        if not free:
+            raise ModelError(
+                f"{equation.name}: transfer acts at named boundaries without a value, and there is "
+                "none: leave it out, or leave one out of dirichlet."
+            )
+        terms += [fem.On(side, term) for side in free for term in _exchange("transfer", part)]
     if "source" in given:
         terms.append(lambda q, _, v, x: -part(q, "source") * v)
     return Model(
@@ -179,21 +186,6 @@ def _exchange(coefficient: str, part: Callable[[Any, str], Any]) -> list[Any]:
         lambda q, u, v, x: part(q, coefficient) * u * v,
         lambda q, _, v, x: -part(q, coefficient) * x.inputs[AMBIENT] * v,
     ]
-
-
-def _transfer(
-    name: str, mesh: Any, held: Mapping[str, Any], part: Callable[[Any, str], Any]
-) -> list[fem.On]:
-    """Return the Robin terms at the named boundaries without a value."""
-    free = (
-        [] if "boundary" in held else [side for side in mesh.boundaries or {} if side not in held]
-    )
-    if not free:
-        raise ModelError(
-            f"{name}: transfer acts at named boundaries without a value, and there is none: leave "
-            "it out, or leave one out of dirichlet."
-        )
-    return [fem.On(side, term) for side in free for term in _exchange("transfer", part)]
 
 
 SURROUNDINGS = {

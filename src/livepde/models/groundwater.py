@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from livepde.errors import ModelError
-from livepde.fem import Channel, Field, On, Place, Unknown, dot, grad, linear
+from livepde.fem import Channel, Field, On, Piecewise, Place, Unknown, dot, grad, linear
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.models.description import Equation, Option, Variable, by_name
@@ -111,7 +111,7 @@ def groundwater(
     """
     sources = {name: _place(mesh, name, at, radius) for name, at in (wells or {}).items()}
     # The term grad(1/S) would be a delta function at the jumps of S.
-    if not hasattr(S, "mesh") and hasattr(S, "regions"):
+    if isinstance(S, Piecewise):
         raise ModelError("groundwater: S by region is not possible; take a number or a Field.")
     varies = isinstance(S, Field)
 

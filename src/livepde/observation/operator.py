@@ -84,8 +84,7 @@ class Split:
 
     def project(self, u: Array) -> Array:
         """Return R u."""
-        projected: Array = self.R @ u if self._diagonal is None else self._diagonal * u
-        return projected
+        return self.R @ u if self._diagonal is None else self._diagonal * u
 
     def reconstruct(self, z: Array, boundary: Array | None) -> Array:
         """Return the observed part R u* = G^+ z of the state in X, shape (n,).
@@ -97,8 +96,7 @@ class Split:
         if boundary is not None and boundary.any():
             known = known - self.G @ boundary
         if self._selected is None:
-            part: Array = self.inverse @ known
-            return part
+            return self.inverse @ known
         part = np.zeros(self.R.shape[0])
         part[self._selected] = known
         return part

@@ -326,6 +326,6 @@ def penalty_matrix(norm: str | Integrand, observed: Observed, basis: Array) -> s
 
 def _inside(block: FieldBlock, basis: Array) -> Mask:
     """Return the mask of elements of which all coefficients are observed or known."""
-    known: Mask = np.abs(basis).any(axis=1)
+    known = np.asarray(np.abs(basis).any(axis=1))
     known[block.fixed] = True
     return np.asarray(known[block.element_dofs].all(axis=0))

@@ -284,8 +284,7 @@ def _norm_of_A(model: Model, u: Array, moment: Moment) -> tuple[float, Array]:
     def image(x: Array) -> Array:
         full = np.zeros((Q.dim, *x.shape[1:]))
         full[free] = x
-        result: Array = A.transposed(model.X.riesz(A(full)))[free]
-        return result
+        return A.transposed(model.X.riesz(A(full)))[free]
 
     gram = Q.tangent_gram[free][:, free]
     if len(free) <= DENSE:

@@ -196,24 +196,12 @@ def _values(errors: Sequence[Errors], get: Callable[[Errors], float]) -> Array:
     return np.array([get(item) for item in errors])
 
 
-def _asked(
-    data: Data, c: Constants, sigma: float
-) -> tuple[Callable[[Errors, float], float], Callable[[Errors], float]]:
-    """Return the least theta, for a constant c_1, and the least nu required by a section."""
-
-    def theta(item: Errors, c1: float) -> float:
-        if data == "exact":
-            return theta_exact(c, item.p.V, item.r, c1)
-        if data == "noisy":
-            return theta_noisy(c, item.e, item.p.V, item.r, item.d, sigma, c1)
-        return theta_smoothed(c, item.p.V, item.r_alpha, item.d.V, item.rate, c1)
-
-    def nu(item: Errors) -> float:
-        if data == "exact":
-            return nu_exact(c, item.e, item.p)
-        return nu_noisy(c, item.e, item.p, item.d.V)
-
-    return theta, nu
+def _least_theta(data: Data, c: Constants, sigma: float, item: Errors, c1: float) -> float:
+    if data == "exact":
+        return theta_exact(c, item.p.V, item.r, c1)
+    if data == "noisy":
+        return theta_noisy(c, item.e, item.p.V, item.r, item.d, sigma, c1)
+    return theta_smoothed(c, item.p.V, item.r_alpha, item.d.V, item.rate, c1)
 
 
 def conditions(
@@ -253,7 +241,6 @@ def conditions(
     if not n:
         raise ConfigurationError("conditions: the tracker has not seen any estimate.")
     first, second, third = CONDITIONS[data]
-    asked_theta, asked_nu = _asked(data, c, sigma)
 
     def line(name: str, holds: Any, remedy: str) -> Check:
         return Check.at_least(f"{name} (share of samples)", np.mean(holds), 1.0, remedy)
@@ -261,7 +248,7 @@ def conditions(
     theta = _values(errors, lambda item: item.theta) * (1 + ROUNDING)
     lines = []
     for name, level in [(first, 0.0), *([(second, c1)] if c1 > 0 else [])]:
-        asked = np.array([asked_theta(item, level) for item in errors])
+        asked = np.array([_least_theta(data, c, sigma, item, level) for item in errors])
         zero = _values(errors, lambda item: item.r_alpha.X - floor * item.u_alpha) <= 0.0
         asked[zero] = 0.0
         lines.append(
@@ -273,7 +260,13 @@ def conditions(
                 "`SmoothedBound`, or go on: the bound is sufficient, not necessary.",
             )
         )
-    asked = _values(errors, asked_nu)
+    exact = data == "exact"
+    asked = np.array(
+        [
+            nu_exact(c, item.e, item.p) if exact else nu_noisy(c, item.e, item.p, item.d.V)
+            for item in errors
+        ]
+    )
     lines.append(
         line(
             third,
@@ -437,8 +430,7 @@ def reconstruction_matrix(observed: Observed, alpha: float | None = None) -> Arr
                 f"reconstruction_matrix: {inverse.shape[1]} sensors, up to {MOST_COLUMNS} are "
                 "possible; G^+ as a sparse matrix is observed.split().inverse."
             )
-        matrix: Array = inverse.toarray()
-        return matrix
+        return inverse.toarray()
     if alpha is not None and isinstance(rule, Tikhonov):
         rule = replace(rule, alpha=float(alpha))
     apply = rule.prepare(observed, np.ones(observed.size, dtype=bool))

@@ -168,8 +168,7 @@ class Excitation:
         if x.ndim == 2 and x.shape[1] > width:
             starts = range(0, x.shape[1], width)
             return np.hstack([self._gramian(integral, x[:, k : k + width]) for k in starts])
-        back: Array = integral.T @ self.spaces.observed_part.projected(integral @ x)
-        return back
+        return integral.T @ self.spaces.observed_part.projected(integral @ x)
 
     def spectrum(self, state: ExcitationState) -> Spectrum:
         """Return the spectrum of all whole windows so far.
@@ -200,8 +199,7 @@ class Excitation:
             def apply(x: Array) -> Array:
                 full = np.zeros(Q.dim)
                 full[free] = x
-                result: Array = self._gramian(integral, full)[free]
-                return result
+                return self._gramian(integral, full)[free]
 
             space = HilbertSpace(gram)
             values, vectors = lanczos(apply, space.dual, space.riesz, len(free), STRONGEST)

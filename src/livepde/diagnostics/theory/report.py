@@ -181,19 +181,6 @@ class OnlineTracker:
         if self.noise is None:
             return None
         observed, part = self.identifier.observed, self.spaces.observed_part
-        given = self.noise(z) if callable(self.noise) else self.noise
-        std = np.broadcast_to(np.asarray(given, dtype=float), (observed.size,))
-        key, matrix = self._matrix(alpha)
-        noise = None if callable(self.noise) else self._sizes.get(key)
-        if noise is None:
-            noise = self._sizes[key] = error_bounds.noise_size(self.spaces, std, matrix)
-        if alpha == 0:
-            return noise
-        lost = part.norms(matrix @ (observed.G @ u_alpha) - u_alpha)
-        return Norms(*(float(np.hypot(getattr(noise, n), getattr(lost, n))) for n in NORMS))
-
-    def _matrix(self, alpha: float) -> tuple[int, Array | sp.csr_array]:
-        """Return the matrix of G_alpha, and the key under which it is kept."""
         # One matrix for each octave of alpha: the discrepancy principle gives another alpha for
         # every sample, and each matrix is dense.
         key = round(float(np.log2(alpha))) if alpha > 0 else 0
@@ -201,13 +188,21 @@ class OnlineTracker:
             if len(self._matrices) >= MATRICES:
                 self._matrices.clear()
                 self._sizes.clear()
-            observed = self.identifier.observed
             self._matrices[key] = (
                 error_bounds.reconstruction_matrix(observed, alpha)
                 if alpha > 0
                 else observed.split().inverse
             )
-        return key, self._matrices[key]
+        matrix = self._matrices[key]
+        if callable(self.noise) or key not in self._sizes:
+            given = self.noise(z) if callable(self.noise) else self.noise
+            std = np.broadcast_to(np.asarray(given, dtype=float), (observed.size,))
+            self._sizes[key] = error_bounds.noise_size(self.spaces, std, matrix)
+        noise = self._sizes[key]
+        if alpha == 0:
+            return noise
+        lost = part.norms(matrix @ (observed.G @ u_alpha) - u_alpha)
+        return Norms(*(float(np.hypot(getattr(noise, n), getattr(lost, n))) for n in NORMS))
 
     @property
     def moment(self) -> Moment:

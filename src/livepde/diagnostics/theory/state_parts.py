@@ -157,8 +157,7 @@ class Part:
         return self.space.riesz(self._projection.T @ (self.space.gram @ image))
 
     def _own(self, v: Array) -> Array:
-        own: Array = v if self._projection is None else self._projection @ v
-        return own
+        return v if self._projection is None else self._projection @ v
 
     def _represented(self, dual: Array) -> Array:
         """Return the Riesz representative of a functional on the part, without the flux."""
@@ -221,8 +220,7 @@ class Part:
             total = np.zeros(v.shape)
             for space, jacobian in images:
                 total += jacobian.T @ space.riesz(jacobian @ v)
-            result: Array = self.basis.T @ total
-            return result
+            return self.basis.T @ total
 
         return self._in_V(image)
 
@@ -237,8 +235,7 @@ class Part:
             return 1.0
 
         def inverse_schur(x: Array) -> Array:
-            result: Array = self.basis.T @ self.space.riesz(self.basis @ x)
-            return result
+            return self.basis.T @ self.space.riesz(self.basis @ x)
 
         M = self.gram_VX.__matmul__
         top = self._largest(M, self.schur, inverse_schur)
