@@ -557,9 +557,7 @@ class FieldBlock(Block):
                 f"{what} {lost} at {points[:, lost].tolist()} lies outside the mesh, which "
                 f"spans {low.tolist()} to {high.tolist()}: check its coordinates and their unit."
             )
-        return self._evaluated(np.clip(points.T, low, high).T)
-
-    def _evaluated(self, points: Array) -> sp.csr_array:
+        points = np.clip(points.T, low, high).T
         cells = self._cells(points)
         mapping = Measure(self.field.mesh, 1, members=cells).mapping
         X = mapping.invF(points[:, :, None], tind=cells)

@@ -194,8 +194,7 @@ class Form(FormMatrices):
 
     def _forget(self) -> None:
         self._constants: dict[tuple[str, str], Array] = {}
-        self._offsets: dict[str, Array] = {}
-        self._slopes: dict[str, sp.csr_array] = {}
+        self._affine_parts: dict[str, tuple[sp.csr_array, Array]] = {}
         self._tensors: dict[tuple[str, str], Tensor] = {}
         self._scatters: dict[tuple[str, str], Scatter] = {}
         self._products: list[TensorTerm] | None = None
@@ -392,19 +391,15 @@ class Form(FormMatrices):
         if self._trilinear and others:
             linear = [key for key in others if key != self.nonlinear]
             if not linear:  # B(u) = B(0) + B' u
-                if slot not in self._slopes:
-                    self._slopes[slot] = self.matrix(slot, others[0], moment)
-                return self._slopes[slot] @ coefficients[others[0]] + self._offset(slot)
+                if slot not in self._affine_parts:
+                    zero = {key: np.zeros(space.dim) for key, space in self.spaces.items()}
+                    slope = self.matrix(slot, others[0], moment)
+                    self._affine_parts[slot] = slope, self.traced(slot, START, **zero)[0]
+                slope, offset = self._affine_parts[slot]
+                return slope @ coefficients[others[0]] + offset
             rest = {key: coefficients[key] for key in others if key != linear[0]}
             return self.product(slot, linear[0], coefficients[linear[0]], moment, **rest)
         return self.traced(slot, moment, **coefficients)[0]
-
-    def _offset(self, slot: str) -> Array:
-        """Return the vector of an affine form at zero, cached."""
-        if slot not in self._offsets:
-            zero = {key: np.zeros(space.dim) for key, space in self.spaces.items()}
-            self._offsets[slot] = self.traced(slot, START, **zero)[0]
-        return self._offsets[slot]
 
     def traced(
         self, slot: str, moment: Moment = START, **coefficients: Array

@@ -72,11 +72,6 @@ class Split:
         return self.R.diagonal() if alone else None
 
     @cached_property
-    def _complete(self) -> bool:
-        """True if all sensors are present."""
-        return bool(self.present.all())
-
-    @cached_property
     def _selected(self) -> IntArray | None:
         """Coefficient read by each present sensor, if each reads a single one; else None."""
         selects = self.vectors is None and is_selection(sp.csr_array(self.inverse.T))
@@ -92,7 +87,7 @@ class Split:
         Missing measurements (NaN) are ignored. `boundary` is a coefficient vector with the
         Dirichlet values, zero elsewhere; None: zero.
         """
-        known = z if self._complete else z[self.present]
+        known = z[self.present]
         if boundary is not None and boundary.any():
             known = known - self.G @ boundary
         if self._selected is None:

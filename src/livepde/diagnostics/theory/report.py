@@ -146,7 +146,11 @@ class OnlineTracker:
         if direct is not None:
             z = z - direct @ estimate.q
         z = observed.linearised(z, estimate.u)
-        u_alpha, alpha = self._reconstruct(z, boundary)
+        if self.damping is None:  # a law without a damping rule uses no G_alpha
+            u_alpha, alpha = observed.split(np.isfinite(z)).reconstruct(z, boundary), 0.0
+        else:
+            found = observed.reconstruct(z, boundary=boundary)
+            u_alpha, alpha = found.u, found.alpha
         r = observed.split(np.isfinite(z)).R @ (estimate.u - boundary) - u_alpha
         part = self.spaces.observed_part
         norms = part.norms(r)
@@ -167,14 +171,6 @@ class OnlineTracker:
                 # whenever there are too many, so that they always cover the whole run.
                 self.states = self.states[::2]
                 self._every *= 2
-
-    def _reconstruct(self, z: Array, boundary: Array) -> tuple[Array, float]:
-        """Return u_alpha and alpha as used by a law with a damping rule; else G^+ z."""
-        observed = self.identifier.observed
-        if self.damping is None:
-            return observed.split(np.isfinite(z)).reconstruct(z, boundary), 0.0
-        found = observed.reconstruct(z, boundary=boundary)
-        return found.u, found.alpha
 
     def _noise_size(self, z: Array, u_alpha: Array, alpha: float) -> Norms | None:
         """Return the size of d, with G_alpha linearised at an alpha within a factor of 1.5."""
@@ -269,7 +265,12 @@ def theory_report(
         window = max((items[-1].t - items[0].t) / 20.0, 1e-12)
     tracker = OnlineTracker(identifier, window, noise)
     notes: list[str] = []
-    followed = _followed(twin, tracker, notes)
+    followed = None
+    if twin is not None:
+        try:
+            followed = error_bounds.TwinTracker(twin, tracker.spaces, tracker.gain, tracker.damping)
+        except ConfigurationError as error:
+            notes.append(str(error))
     for sample in items:
         estimate = identifier.step(sample.t, sample.z, sample.inputs)
         tracker.add(estimate, sample)
@@ -287,18 +288,6 @@ def theory_report(
         reports = _with_truth(followed, found, identifier.law, tables)
         notes.append(LINKED)
     return TheoryReport(tuple(tables), tuple(reports), tuple(notes), found, spectrum, stopping)
-
-
-def _followed(
-    twin: Twin | None, tracker: OnlineTracker, notes: list[str]
-) -> error_bounds.TwinTracker | None:
-    if twin is None:
-        return None
-    try:
-        return error_bounds.TwinTracker(twin, tracker.spaces, tracker.gain, tracker.damping)
-    except ConfigurationError as error:
-        notes.append(str(error))
-        return None
 
 
 def _constants(tracker: OnlineTracker, tables: list[Table], notes: list[str]) -> Constants | None:
