@@ -37,20 +37,13 @@ from livepde.errors import SpaceError, optional
 from livepde.fem.fields import Field, Predicate, with_sides
 from livepde.linalg import Array, IntArray
 
-LINEAR: dict[Any, Any] = {
-    MeshLine: ElementLineP1,
-    MeshTri: ElementTriP1,
-    MeshQuad: ElementQuad1,
-    MeshTet: ElementTetP1,
-    MeshHex: ElementHex1,
-}
-
-QUADRATIC: dict[Any, Any] = {
-    MeshLine: ElementLineP2,
-    MeshTri: ElementTriP2,
-    MeshQuad: ElementQuad2,
-    MeshTet: ElementTetP2,
-    MeshHex: ElementHex2,
+# Continuous elements of first and second order.
+ELEMENTS: dict[Any, tuple[Any, Any]] = {
+    MeshLine: (ElementLineP1, ElementLineP2),
+    MeshTri: (ElementTriP1, ElementTriP2),
+    MeshQuad: (ElementQuad1, ElementQuad2),
+    MeshTet: (ElementTetP1, ElementTetP2),
+    MeshHex: (ElementHex1, ElementHex2),
 }
 
 
@@ -63,18 +56,19 @@ def linear(mesh: Mesh) -> Element:
     >>> type(lp.linear(lp.interval(0.0, 1.0, 8))).__name__
     'ElementLineP1'
     """
-    return _of(LINEAR, mesh, "first")
+    return _continuous(mesh, 0)
 
 
 def quadratic(mesh: Mesh) -> Element:
     """Return the continuous element of second order for a mesh of any dimension."""
-    return _of(QUADRATIC, mesh, "second")
+    return _continuous(mesh, 1)
 
 
-def _of(elements: dict[Any, Any], mesh: Mesh, order: str) -> Element:
-    for kind, element in elements.items():
+def _continuous(mesh: Mesh, which: int) -> Element:
+    for kind, elements in ELEMENTS.items():
         if isinstance(mesh, kind):
-            return element()
+            return elements[which]()
+    order = ("first", "second")[which]
     raise SpaceError(f"no element of {order} order for a mesh of type {type(mesh).__name__}.")
 
 
@@ -214,7 +208,7 @@ def read_mesh(path: str | Path, scale: float = 1.0) -> Mesh:
         from skfem.io.meshio import from_meshio
     with _quiet():
         mesh = _loaded(path, meshio, from_meshio)
-    if type(mesh) in LINEAR:  # centres of arcs and the like belong to no cell
+    if type(mesh) in ELEMENTS:  # centres of arcs and the like belong to no cell
         mesh = mesh.remove_unused_nodes()
     if scale != 1.0:
         mesh = mesh.scaled(float(scale))

@@ -87,7 +87,7 @@ class Split:
         Missing measurements (NaN) are ignored. `boundary` is a coefficient vector with the
         Dirichlet values, zero elsewhere; None: zero.
         """
-        known = z[self.present]
+        known: Array = z[self.present]
         if boundary is not None and boundary.any():
             known = known - self.G @ boundary
         if self._selected is None:
