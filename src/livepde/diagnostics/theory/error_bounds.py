@@ -383,9 +383,7 @@ def stopping_time(errors: Sequence[Errors], c: Constants) -> float:
 
 
 def noise_size(
-    spaces: Spaces,
-    std: Array,
-    reconstruction: Array | sp.csr_array | None = None,
+    spaces: Spaces, std: Array, reconstruction: Array | sp.csr_array | None = None
 ) -> Norms:
     """Return the root mean square of the propagated noise G_alpha eta in X, VX~ and V~.
 
