@@ -41,8 +41,7 @@ from livepde.laws import (
 from livepde.laws.damping import ExactBound
 from livepde.linalg import Array, Mask
 from livepde.model import Model
-from livepde.observation import Full, Observation, Subdomain
-from livepde.observation.reconstruction import Pseudoinverse, Tikhonov
+from livepde.observation import Full, Observation, Pseudoinverse, Subdomain, Tikhonov
 from livepde.progress import watched
 from livepde.runs import Outcome
 from livepde.stepping import Advance, Newton

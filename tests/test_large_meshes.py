@@ -186,9 +186,9 @@ def test_straight_triangles_share_one_tensor(monkeypatch):
     mesh = MeshTri(mesh.p + 0.01 * np.sin(9.0 * mesh.p[::-1]), mesh.t)
     field = lp.Field(mesh, ElementTriP1())
     form = lp.Model(field, field, A=lambda q, u, v, x: q * u * v).form_A
-    (term,) = form.tensor("v", "q").products.terms
+    (term,) = form.tensor("v", "q").terms
     assert term.tensors.shape == (3, 3, 3, 1)
-    assert form.tensor("q", "u").products is form.tensor("v", "q").products
+    assert form.tensor("q", "u").terms is form.tensor("v", "q").terms
 
 
 def test_patterns_of_equal_spaces_are_one_object():

@@ -275,7 +275,7 @@ def check_law(
         ),
         _count(
             "all sensors missing (failures)",
-            lambda: sum(map(_unusable, run(_without(items, middle, names)))),
+            lambda: sum(map(_unusable, run(_without(items, middle, names, names)))),
             "with no sensor present a step must predict and not update.",
         ),
         _count(
@@ -342,10 +342,10 @@ def _restarted(
 
 
 def _without(
-    items: list[Sample], at: int, names: tuple[str, ...], gone: tuple[str, ...] | None = None
+    items: list[Sample], at: int, names: tuple[str, ...], gone: tuple[str, ...]
 ) -> list[Sample]:
     """Return the samples with the first or all of the sensors missing in two of them."""
-    gone, changed = names if gone is None else gone, list(items)
+    changed = list(items)
     for k in (at, at + 1):
         z = items[k].z
         if isinstance(z, Mapping):

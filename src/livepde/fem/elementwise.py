@@ -9,7 +9,7 @@ functions in the plane about 200 bytes per node, for all three matrices of a for
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
 from typing import Any
@@ -119,87 +119,65 @@ BLOCK = 8_000
 
 
 @dataclass(frozen=True, eq=False)
-class _TensorTerm:
-    """Basis tensors, shape (i, j, n, r), and coefficients of each element, shape (r, elements)."""
+class TensorTerm:
+    """Basis tensors, shape (i, j, n, r), and coefficients of each element, shape (r, elements).
+
+    `dofs` are the coefficient numbers of the three arguments, shape (local, elements) each.
+    """
 
     tensors: Array
     shares: Array
-    dofs: Mapping[str, IntArray]
-
-
-@dataclass(frozen=True, eq=False)
-class ElementProducts:
-    """Integrals over each element of all products of local functions of three arguments."""
-
-    order: tuple[str, ...]
-    terms: tuple[_TensorTerm, ...]
+    dofs: Sequence[IntArray]
 
     @classmethod
-    def of(
-        cls,
-        order: tuple[str, ...],
-        terms: Iterable[tuple[Mapping[str, IntArray], Iterable[tuple[slice, Array]]]],
-    ) -> ElementProducts:
-        """Collect the element tensors from parts of the mesh.
-
-        `order` names the three arguments. Each term has the coefficient numbers of each argument,
-        shape (local, elements), and parts: slice of the elements, and their tensors, shape (i, j,
-        n, elements).
-        """
-        return cls(order, tuple(_TensorTerm(*_combined(parts), dofs) for dofs, parts in terms))
-
-    def tensor(self, rows: str, cols: str, third: str, places: Scatter) -> ElementTensor:
-        """Return the tensor of the matrices in two of the arguments."""
-        return ElementTensor(self, (rows, cols, third), places)
-
-
-def _combined(parts: Iterable[tuple[slice, Array]]) -> tuple[Array, Array]:
-    """Return a basis of the tensors, and the coefficients of each element in it."""
-    shape: tuple[int, ...] = ()
-    basis = np.zeros((0, 0))
-    shares: list[Array] = []
-    for _, local in parts:
-        shape, flat = local.shape[:-1], local.reshape(-1, local.shape[-1])
-        basis = basis if basis.size else np.zeros((len(flat), 0))
-        # Only tensors outside of the present span extend the basis. Their leading singular vectors
-        # are added, so the basis stays as small as possible.
-        left = flat - basis @ (basis.T @ flat)
-        size = np.linalg.norm(flat, axis=0)
-        missed = np.linalg.norm(left, axis=0) > EXACT * size
-        if missed.any():
-            vectors, values, _ = np.linalg.svd(left[:, missed] / size[missed], full_matrices=False)
-            known = basis.shape[1]
-            more = np.hstack([basis, vectors[:, values > EXACT * values.max()]])
-            # QR keeps the span of the known vectors but may flip their signs, and shares of earlier
-            # parts refer to them: the signs are restored.
-            basis = np.linalg.qr(more)[0]
-            basis[:, :known] *= np.sign((basis[:, :known] * more[:, :known]).sum(axis=0))
-        shares.append(basis.T @ flat)
-    whole = np.zeros((basis.shape[1], sum(part.shape[1] for part in shares)))
-    stop = 0
-    for part in shares:
-        start, stop = stop, stop + part.shape[1]
-        whole[: len(part), start:stop] = part
-    return basis.reshape(*shape, -1), whole
+    def of(cls, dofs: Sequence[IntArray], parts: Iterable[tuple[slice, Array]]) -> TensorTerm:
+        """Collect the tensors of slices of elements, shape (i, j, n, elements) each."""
+        shape: tuple[int, ...] = ()
+        basis = np.zeros((0, 0))
+        shares: list[Array] = []
+        for _, local in parts:
+            shape, flat = local.shape[:-1], local.reshape(-1, local.shape[-1])
+            basis = basis if basis.size else np.zeros((len(flat), 0))
+            # Only tensors outside of the present span extend the basis, by their leading singular
+            # vectors, so that it stays as small as possible.
+            left = flat - basis @ (basis.T @ flat)
+            size = np.linalg.norm(flat, axis=0)
+            missed = np.linalg.norm(left, axis=0) > EXACT * size
+            if missed.any():
+                vectors, values, _ = np.linalg.svd(
+                    left[:, missed] / size[missed], full_matrices=False
+                )
+                known = basis.shape[1]
+                more = np.hstack([basis, vectors[:, values > EXACT * values.max()]])
+                # QR keeps the span of the known vectors but may flip their signs, to which shares
+                # of earlier parts refer: the signs are restored.
+                basis = np.linalg.qr(more)[0]
+                basis[:, :known] *= np.sign((basis[:, :known] * more[:, :known]).sum(axis=0))
+            shares.append(basis.T @ flat)
+        whole = np.zeros((basis.shape[1], sum(part.shape[1] for part in shares)))
+        stop = 0
+        for part in shares:
+            start, stop = stop, stop + part.shape[1]
+            whole[: len(part), start:stop] = part
+        return cls(basis.reshape(*shape, -1), whole, dofs)
 
 
 @dataclass(frozen=True, eq=False)
 class ElementTensor:
     """Matrix-free T such that T @ w is the data of a matrix linear in the coefficients w.
 
-    `slots` are the arguments of the rows, of the columns, and of w; `places` are the positions of
-    the entries of element matrices in the data.
+    `slots` are the numbers of the arguments of the rows, of the columns, and of w; `places` are the
+    positions of the entries of element matrices in the data.
     """
 
-    products: ElementProducts
-    slots: tuple[str, str, str]
+    terms: Sequence[TensorTerm]
+    slots: tuple[int, int, int]
     places: Scatter
 
     def _blocks(self) -> Iterator[tuple[int, slice, Array, list[IntArray], Array]]:
         """Yield term, elements, tensors with axes in order of `slots`, coefficients, shares."""
-        axes = [self.products.order.index(slot) for slot in self.slots]
-        for number, term in enumerate(self.products.terms):
-            tensors = np.ascontiguousarray(term.tensors.transpose(*axes, 3))
+        for number, term in enumerate(self.terms):
+            tensors = np.ascontiguousarray(term.tensors.transpose(*self.slots, 3))
             for start in range(0, term.shares.shape[1], BLOCK):
                 at = slice(start, start + BLOCK)
                 dofs = [term.dofs[slot][:, at] for slot in self.slots]

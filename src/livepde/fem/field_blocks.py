@@ -60,11 +60,6 @@ class Local:
             self._known[name] = self._evaluate(name)
         return self._known[name]
 
-    @property
-    def phi(self) -> Array:
-        """Components of all parts, shape (components, local, elements, points)."""
-        return np.concatenate([self.part(name) for name, _ in self.parts])
-
 
 class Block(ABC):
     """One unknown of a function space."""
@@ -103,38 +98,35 @@ class ScalarBlock(Block):
 
     def __init__(self, unknown: Scalar | Piecewise) -> None:
         self.unknown = unknown
-        self.size = 1 if isinstance(unknown, Scalar) else len(unknown.regions)
-
-    def _indicators(self, measure: Measure) -> Array:
-        masks = np.zeros((self.size, *measure.shape))
-        if isinstance(self.unknown, Scalar):
-            return masks + 1.0
-        cells = np.arange(measure.mesh.nelements) if measure.cells is None else measure.cells
-        for mask, region in zip(masks, self.unknown.regions.values(), strict=True):
-            if callable(region):
-                mask[:] = region(measure.points)
-            else:
-                mask[np.isin(cells, measure.mesh.subdomains[region])] = 1.0
-        return masks
+        self.regions = unknown.regions if isinstance(unknown, Piecewise) else {}
+        self.size = len(self.regions) or 1
 
     def local(self, measure: Measure) -> Local:
-        regions = {} if isinstance(self.unknown, Scalar) else self.unknown.regions
-        for name, region in regions.items():
+        for name, region in self.regions.items():
             if not callable(region) and region not in (measure.mesh.subdomains or {}):
                 raise SpaceError(
                     f"Region '{name}': the mesh has no subdomain '{region}'; give a predicate on x."
                 )
-        return Local(
-            self.dofs_on(measure), (("value", ()),), lambda _: self._indicators(measure)[None]
-        )
+
+        def indicators(_: str) -> Array:
+            masks = np.zeros((1, self.size, *measure.shape))
+            if not self.regions:
+                return masks + 1.0
+            cells = np.arange(measure.mesh.nelements) if measure.cells is None else measure.cells
+            for mask, region in zip(masks[0], self.regions.values(), strict=True):
+                if callable(region):
+                    mask[:] = region(measure.points)
+                else:
+                    mask[np.isin(cells, measure.mesh.subdomains[region])] = 1.0
+            return masks
+
+        return Local(self.dofs_on(measure), [("value", ())], indicators)
 
     def jet(self, parts: Local, values: Array) -> Any:
         return values[0]
 
     def labels(self, name: str) -> tuple[str, ...]:
-        if isinstance(self.unknown, Scalar):
-            return (name,)
-        return tuple(f"{base_name(name)}[{region}]" for region in self.unknown.regions)
+        return tuple(f"{base_name(name)}[{region}]" for region in self.regions) or (name,)
 
 
 class NamesBlock(Block):
@@ -201,8 +193,7 @@ class FieldBlock(Block):
         if self._tie is None:
             return self.places
         _, first = np.unique(self._tie, return_index=True)
-        found: Array = self.places[:, first]
-        return found
+        return self.places[:, first]
 
     def at(self, facets: Any = None, names: Sequence[str] | None = None) -> IntArray:
         """Return scikit-fem's degrees of freedom on facets, by default on the whole boundary."""
@@ -217,16 +208,7 @@ class FieldBlock(Block):
         free = mesh.boundary_facets()
         for name in chain(*self.field.periodic):
             free = np.setdiff1d(free, mesh.boundaries[name])
-        found: IntArray = np.unique(self._tied(self.at(free)))
-        return found
-
-    @cached_property
-    def _spread(self) -> sp.csr_array:
-        """Matrix from coefficients to scikit-fem's degrees of freedom, before periodic ties."""
-        n = int(self.dofs.N)
-        if self._tie is None:
-            return sp.csr_array(sp.eye_array(n))
-        return sp.csr_array((np.ones(n), (np.arange(n), self._tie)), shape=(n, self.size))
+        return np.unique(self._tied(self.at(free)))
 
     @cached_property
     def basis(self) -> Any:
@@ -332,15 +314,10 @@ class FieldBlock(Block):
         return self._projected(lambda at, piece: grid[:, at])
 
     def _projected(self, values: Callable[[slice, Measure], Array]) -> Array:
-        functional = np.zeros(self.size)
-        for at, piece in self.measure.pieces():
-            local = self.local(piece)
-            density = (values(at, piece) * piece.weights).reshape(-1, *piece.shape)
-            tested = np.einsum("kep,kiep->ie", density, local.part("value"))
-            np.add.at(functional, local.dofs.ravel(), tested.ravel())
+        functional = self._tested(self.measure, values)
         if self.measure.kept:
             return self._mass_factor.solve(functional)
-        mass = self._mass()
+        mass = self._mass(self.measure)
         scale = mass.diagonal()
         found, _ = conjugate_gradients(
             mass.__matmul__, lambda r: r / scale, functional, PROJECTED, ITERATIONS, FINER
@@ -369,62 +346,46 @@ class FieldBlock(Block):
                 return coefficients
 
             return self.doflocs[:, used], at_nodes
-        pieces = [(self.local(piece), piece) for _, piece in self.measure.on(cells).pieces()]
-        places = np.zeros(self.size, dtype=np.int64)
-        places[used] = np.arange(len(used))
-        dofs = [places[local.dofs] for local, _ in pieces]
-        grams = [
-            np.einsum("kiep,kjep->ije", local.part("value") * piece.weights, local.part("value"))
-            for local, piece in pieces
-        ]
-        shape = len(used), len(used)
-        mass = sp.csr_array(shape)
-        for rows, gram in zip(dofs, grams, strict=True):
-            i, j = (np.broadcast_to(axis, gram.shape) for axis in (rows[:, None], rows[None]))
-            mass = mass + sp.csr_array((gram.ravel(), (i.ravel(), j.ravel())), shape=shape)
-        factor = analyse(Pattern.of(mass), symmetric=True).factorise(mass.data)
+        measure = self.measure.on(cells)
+        factor = _factor(sp.csr_array(self._mass(measure)[used][:, used]))
 
         def projected(values: Array) -> Array:
-            functional, start = np.zeros(len(used)), 0
-            for (local, piece), rows in zip(pieces, dofs, strict=True):
-                stop = start + piece.weights.size
-                density = values[:, start:stop].reshape(-1, *piece.shape) * piece.weights
-                tested = np.einsum("kep,kiep->ie", density, local.part("value"))
-                np.add.at(functional, rows.ravel(), tested.ravel())
-                start = stop
+            grid = values.reshape(-1, *measure.shape)
+            functional = self._tested(measure, lambda at, piece: grid[:, at])
             coefficients = found.copy()
-            coefficients[used] = factor.solve(functional)
+            coefficients[used] = factor.solve(functional[used])
             return coefficients
 
-        points = [piece.points.reshape(len(piece.points), -1) for _, piece in pieces]
-        return np.concatenate(points, axis=1), projected
+        return measure.points.reshape(len(measure.points), -1), projected
 
-    def _mass(self) -> sp.csr_array:
-        """Return the mass matrix, shape (size, size)."""
-        places = scatter([(self.element_dofs, self.element_dofs)], (self.size, self.size))
+    def _tested(self, measure: Measure, values: Callable[[slice, Measure], Array]) -> Array:
+        """Return the integrals of a function on a measure against all shape functions, (size,)."""
+        functional = np.zeros(self.size)
+        for at, piece in measure.pieces():
+            local = self.local(piece)
+            density = (values(at, piece) * piece.weights).reshape(-1, *piece.shape)
+            tested = np.einsum("kep,kiep->ie", density, local.part("value"))
+            np.add.at(functional, local.dofs.ravel(), tested.ravel())
+        return functional
+
+    def _mass(self, measure: Measure) -> sp.csr_array:
+        """Return the mass matrix on a measure, shape (size, size)."""
+        dofs = self.dofs_on(measure)
+        places = scatter([(dofs, dofs)], (self.size, self.size))
         data = np.zeros(places.pattern.nnz)
-        for at, piece in self.measure.pieces():
+        for at, piece in measure.pieces():
             phi = self.local(piece).part("value")
-            local = np.einsum("kiep,kjep->ije", phi * piece.weights, phi)
-            places.add(data, 0, at, local)
+            places.add(data, 0, at, np.einsum("kiep,kjep->ije", phi * piece.weights, phi))
         return places.pattern.matrix(data)
 
     @cached_property
     def _mass_factor(self) -> Factor:
-        mass = self._mass()
-        return analyse(Pattern.of(mass), symmetric=True).factorise(mass.data)
+        return _factor(self._mass(self.measure))
 
     def _dofs_on(self, name: str, names: list[str] | None) -> IntArray:
         """Return the coefficients on a boundary; names None: also those of derivatives."""
         dofs = self.at(None if name == "boundary" else name, names)
-        found: IntArray = np.unique(self._tied(dofs))
-        return found
-
-    def _value_dofs(self, name: str) -> IntArray:
-        # Essential conditions fix values only; derivative degrees of freedom (u_x, u_n, ...) stay
-        # free unless the field is clamped.
-        values = [n for n in (self.field.element.dofnames or []) if "_" not in n]
-        return self._dofs_on(name, None if self.field.clamped else values)
+        return np.unique(self._tied(dofs))
 
     def _axes(self, where: str) -> list[int]:
         """Return the axes whose component of a vector is a coefficient."""
@@ -440,7 +401,10 @@ class FieldBlock(Block):
     def _valued(self, name: str, value: Any) -> list[tuple[IntArray, Any]]:
         """Return the Dirichlet conditions of a boundary, one per component of a vector."""
         if not (isinstance(value, tuple) or (callable(value) and self.vector)):
-            return [(self._value_dofs(name), value)]
+            # Essential conditions fix values only; derivative degrees of freedom (u_x, u_n, ...)
+            # stay free unless the field is clamped.
+            values = [n for n in (self.field.element.dofnames or []) if "_" not in n]
+            return [(self._dofs_on(name, None if self.field.clamped else values), value)]
         where = f"dirichlet: '{name}'"
         axes = self._axes(where)
         if callable(value):
@@ -467,8 +431,7 @@ class FieldBlock(Block):
         along = np.abs(ends[axis, 1] - ends[axis, 0])
         sides = np.asarray(sides)[across <= 1e-9 * along]
         names = [("u_x", "u_y")[axis]]
-        found: IntArray = np.unique(self._tied(self.at(sides, names)))
-        return found
+        return np.unique(self._tied(self.at(sides, names)))
 
     @cached_property
     def conditions(self) -> tuple[tuple[IntArray, Any], ...]:
@@ -594,9 +557,7 @@ class FieldBlock(Block):
                 f"{what} {lost} at {points[:, lost].tolist()} lies outside the mesh, which "
                 f"spans {low.tolist()} to {high.tolist()}: check its coordinates and their unit."
             )
-        return self._evaluated(np.clip(points.T, low, high).T)
-
-    def _evaluated(self, points: Array) -> sp.csr_array:
+        points = np.clip(points.T, low, high).T
         cells = self._cells(points)
         mapping = Measure(self.field.mesh, 1, members=cells).mapping
         X = mapping.invF(points[:, :, None], tind=cells)
@@ -613,10 +574,9 @@ class FieldBlock(Block):
         element, mesh = self.field.element, self.field.mesh
         names = element.dofnames or []
         if element.nodal_dofs and names and names[0] == "u":  # a coefficient is the value there
-            dofs = self.dofs.nodal_dofs[0]
+            dofs = self._tied(self.dofs.nodal_dofs[0])
             entries = (np.ones(len(dofs)), (np.arange(len(dofs)), dofs))
-            values = sp.csr_array(entries, shape=(len(dofs), int(self.dofs.N)))
-            return sp.csr_array(values @ self._spread)
+            return sp.csr_array(entries, shape=(len(dofs), self.size))
         return self.probe(mesh.p, "vertex")
 
 
@@ -639,6 +599,10 @@ class _Component:
                 "lambda x, t: (t * x[1], 0.0)."
             )
         return values[self.axis]
+
+
+def _factor(mass: sp.csr_array) -> Factor:
+    return analyse(Pattern.of(mass), symmetric=True).factorise(mass.sorted_indices().data)
 
 
 def _jet(function: DiscreteField, name: str) -> Any:

@@ -86,15 +86,32 @@ def ignores(function: Any, position: int) -> bool:
     return position < len(names) and names[position] == "_"
 
 
-def at_end(axis: int, end: float, ends: Sequence[float]) -> Predicate:
-    """Return the predicate of points at one of the ends of a mesh along an axis.
+SIDES = (
+    (("left", "right"),),
+    (("left", "right"), ("bottom", "top")),
+    (("left", "right"), ("front", "back"), ("bottom", "top")),
+)
 
-    The slack is that of rounding: a share of the coordinate would take cells next to the end as
-    well, where coordinates are large, as those of a map, or the mesh is small.
-    """
-    extent, size = abs(ends[1] - ends[0]), max(map(abs, ends))
-    slack = 1e-9 * extent + 8 * float(np.finfo(float).eps) * size
-    return lambda p: np.abs(p[axis] - end) <= slack
+
+def with_sides(mesh: Any, regions: Mapping[str, Predicate] | None = None) -> Any:
+    """Return a mesh of an interval, rectangle or box with names for its sides, and of regions."""
+    ends = list(zip(mesh.p.min(axis=1), mesh.p.max(axis=1), strict=True))
+
+    def at(axis: int, end: float) -> Predicate:
+        # The slack is that of rounding: a share of the coordinate would take cells next to the end
+        # as well, where coordinates are large, as those of a map, or the mesh is small.
+        low, high = ends[axis]
+        slack = 1e-9 * (high - low) + 8 * float(np.finfo(float).eps) * max(abs(low), abs(high))
+        return lambda p: np.abs(p[axis] - end) <= slack
+
+    named = mesh.with_boundaries(
+        {
+            name: at(axis, end)
+            for axis, names in enumerate(SIDES[len(ends) - 1])
+            for name, end in zip(names, ends[axis], strict=True)
+        }
+    )
+    return named.with_subdomains(dict(regions)) if regions else named
 
 
 def interval(
@@ -132,11 +149,7 @@ def interval(
     if geometric and not start > 0:
         raise SpaceError(f"interval({start}, {stop}, geometric=True): needs start > 0.")
     spaced = np.geomspace if geometric else np.linspace
-    mesh = MeshLine(_moved(spaced(start, stop, int(cells) + 1), through))
-    mesh = mesh.with_boundaries(
-        {"left": at_end(0, start, (start, stop)), "right": at_end(0, stop, (start, stop))}
-    )
-    return mesh.with_subdomains(dict(regions)) if regions else mesh
+    return with_sides(MeshLine(_moved(spaced(start, stop, int(cells) + 1), through)), regions)
 
 
 def _moved(nodes: Array, through: Sequence[float]) -> Array:
@@ -158,9 +171,7 @@ def line(nodes: Sequence[float]) -> MeshLine:
     x = np.asarray(nodes, dtype=float)
     if x.ndim != 1 or len(x) < 2 or not (np.diff(x) > 0).all():
         raise SpaceError(f"line: needs at least two increasing nodes; got {x.tolist()}.")
-    return MeshLine(x).with_boundaries(
-        {"left": at_end(0, x[0], (x[0], x[-1])), "right": at_end(0, x[-1], (x[0], x[-1]))}
-    )
+    return with_sides(MeshLine(x))
 
 
 def is_nodal(element: Element) -> bool:

@@ -19,7 +19,7 @@ the derivative from the user, and `check_model` tells when one is missing.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -29,7 +29,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import LivepdeError, ModelError
-from livepde.fem.elementwise import ElementProducts, ElementTensor, Scatter, scatter
+from livepde.fem.elementwise import ElementTensor, Scatter, TensorTerm, scatter
 from livepde.fem.fields import Integrand, On, ignores
 from livepde.fem.measure import START, Inputs, Measure, Moment, Place
 from livepde.fem.space import FunctionSpace, LocalSpace
@@ -91,6 +91,12 @@ class _Term:
             key: rng.standard_normal((local.components, *local.shape))
             for key, local in self.spaces.items()
         }
+
+    def along(
+        self, slot: str, values: Mapping[str, Array], moment: Moment
+    ) -> Callable[[Array], Array]:
+        """Return the integrand as a function of component values of one argument."""
+        return lambda x: np.asarray(self.evaluate({**values, slot: x}, moment)[0])
 
     def evaluate(self, values: Mapping[str, Array], moment: Moment) -> tuple[Any, Place]:
         place = self.measure.place(moment)
@@ -188,11 +194,10 @@ class Form(FormMatrices):
 
     def _forget(self) -> None:
         self._constants: dict[tuple[str, str], Array] = {}
-        self._offsets: dict[str, Array] = {}
-        self._slopes: dict[str, sp.csr_array] = {}
-        self._tensors: dict[tuple[str, str], Tensor | None] = {}
+        self._affine_parts: dict[str, tuple[sp.csr_array, Array]] = {}
+        self._tensors: dict[tuple[str, str], Tensor] = {}
         self._scatters: dict[tuple[str, str], Scatter] = {}
-        self._products: ElementProducts | None = None
+        self._products: list[TensorTerm] | None = None
 
     def on(self, cells: IntArray) -> Form:
         """Return the form integrated over some cells of the mesh, and over their facets.
@@ -249,16 +254,7 @@ class Form(FormMatrices):
         for number, whole in enumerate(self.terms):
             for term in whole.samples():
                 values = term.drawn(rng)
-                place, one = Moment(0.3, self._inputs), values[slot]
-
-                def at(
-                    v: Array,
-                    term: _Term = term,
-                    values: dict[str, Array] = values,
-                    place: Moment = place,
-                ) -> Array:
-                    return np.asarray(term.evaluate({**values, slot: v}, place)[0])
-
+                at, one = term.along(slot, values, Moment(0.3, self._inputs)), values[slot]
                 other = rng.standard_normal(one.shape)
                 with np.errstate(all="ignore"):  # roots and logarithms of random numbers
                     parts = at(one), at(other), at(one + other)
@@ -332,14 +328,9 @@ class Form(FormMatrices):
         # Probing has a fixed seed: whether a form counts as affine must not differ between two
         # runs.
         rng = np.random.default_rng(1)
-        probe = Moment(0.3, self._inputs)
         for term in (piece for whole in self.terms for piece in whole.samples()):
             values = term.drawn(rng)
-
-            def at(x: Array, term: _Term = term, values: dict[str, Array] = values) -> Array:
-                density, _ = term.evaluate({**values, slot: x}, probe)
-                return np.asarray(density)
-
+            at = term.along(slot, values, Moment(0.3, self._inputs))
             for scale in MAGNITUDES:
                 a, b = scale * rng.standard_normal((2, *values[slot].shape))
                 with np.errstate(all="ignore"):
@@ -400,19 +391,15 @@ class Form(FormMatrices):
         if self._trilinear and others:
             linear = [key for key in others if key != self.nonlinear]
             if not linear:  # B(u) = B(0) + B' u
-                if slot not in self._slopes:
-                    self._slopes[slot] = self.matrix(slot, others[0], moment)
-                return self._slopes[slot] @ coefficients[others[0]] + self._offset(slot)
+                if slot not in self._affine_parts:
+                    zero = {key: np.zeros(space.dim) for key, space in self.spaces.items()}
+                    slope = self.matrix(slot, others[0], moment)
+                    self._affine_parts[slot] = slope, self.traced(slot, START, **zero)[0]
+                slope, offset = self._affine_parts[slot]
+                return slope @ coefficients[others[0]] + offset
             rest = {key: coefficients[key] for key in others if key != linear[0]}
             return self.product(slot, linear[0], coefficients[linear[0]], moment, **rest)
         return self.traced(slot, moment, **coefficients)[0]
-
-    def _offset(self, slot: str) -> Array:
-        """Return the vector of an affine form at zero, cached."""
-        if slot not in self._offsets:
-            zero = {key: np.zeros(space.dim) for key, space in self.spaces.items()}
-            self._offsets[slot] = self.traced(slot, START, **zero)[0]
-        return self._offsets[slot]
 
     def traced(
         self, slot: str, moment: Moment = START, **coefficients: Array
@@ -463,12 +450,10 @@ class Form(FormMatrices):
             if len(others) == 1:
                 # A constant trilinear form needs no quadrature in a step: its matrix is linear in
                 # the third coefficients.
-                tensor = self._tensor(rows, cols, others[0])
-                if tensor is not None:
-                    product: Array = tensor @ coefficients[others[0]]
-                    if others[0] == self.nonlinear:
-                        product += self._constant(rows, cols)
-                    return product
+                product: Array = self._tensor(rows, cols, others[0]) @ coefficients[others[0]]
+                if others[0] == self.nonlinear:
+                    product += self._constant(rows, cols)
+                return product
         return self._quadrature(rows, cols, moment, coefficients)
 
     def product(
@@ -540,8 +525,7 @@ class Form(FormMatrices):
                 if given is not None and key == self.nonlinear:
                     jets.append(local.unit_jets(axes[0], 2))
             density = (term.integrand if given is None else given)(*jets, place)
-            slope: Array = np.asarray(density) if stepped is None else np.imag(density) / STEP
-            return slope
+            return np.asarray(density) if stepped is None else np.imag(density) / STEP
 
         if shifted is None:
             return evaluate(0.0)
@@ -553,8 +537,7 @@ class Form(FormMatrices):
         near = evaluate(SHIFT) - evaluate(-SHIFT)
         far = evaluate(2.0 * SHIFT) - evaluate(-2.0 * SHIFT)
         difference = (8.0 * near - far) / (12.0 * SHIFT)
-        scaled: Array = difference / np.swapaxes(self._scale(key, local, here)[:, 0], 0, shifted)
-        return scaled
+        return difference / np.swapaxes(self._scale(key, local, here)[:, 0], 0, shifted)
 
     def _differenced(
         self, rows: str, cols: str, given: Integrand | None
@@ -605,7 +588,7 @@ class Form(FormMatrices):
             return None
         return self._tensor(rows, cols, third)
 
-    def _tensor(self, rows: str, cols: str, third: str) -> Tensor | None:
+    def _tensor(self, rows: str, cols: str, third: str) -> Tensor:
         if (rows, cols) not in self._tensors:
             sizes = [
                 int(np.prod([len(space.dofs_on(term.measure)) for space in term.over.values()]))
@@ -630,18 +613,18 @@ class Form(FormMatrices):
         total.eliminate_zeros()
         return total
 
-    def _elementwise(self, rows: str, cols: str, third: str) -> ElementTensor | None:
+    def _elementwise(self, rows: str, cols: str, third: str) -> ElementTensor:
         if self._products is None:
-            order = tuple(self.spaces)
-            terms = (
-                (
-                    {key: space.dofs_on(term.measure) for key, space in term.over.items()},
-                    self._trilinear_parts(term, *order),
+            self._products = [
+                TensorTerm.of(
+                    [space.dofs_on(term.measure) for space in term.over.values()],
+                    self._trilinear_parts(term, *self.spaces),
                 )
                 for term in self.terms
-            )
-            self._products = ElementProducts.of(order, terms)
-        return self._products.tensor(rows, cols, third, self._scatter(rows, cols))
+            ]
+        order = list(self.spaces)
+        slots = order.index(rows), order.index(cols), order.index(third)
+        return ElementTensor(self._products, slots, self._scatter(rows, cols))
 
     def _trilinear_parts(
         self, whole: _Term, first: str, second: str, third: str

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import SpaceError
-from livepde.fem.fields import Integrand, On, Scalars
+from livepde.fem.fields import Declaration, Integrand, On, Scalars
 from livepde.fem.forms import STEP, Form, FormMatrices
 from livepde.fem.measure import START, Moment
 from livepde.fem.priors import Evolution, Identity, Normal, Transform
@@ -120,21 +120,19 @@ class LatentPart:
     """
 
     name: str
-    unknown: Any
+    unknown: Declaration
     block: Any
     part: slice
 
     @cached_property
     def transform(self) -> Transform:
         """Transform T of this unknown."""
-        transform: Transform = self.unknown.prior.transform
-        return transform
+        return self.unknown.prior.transform
 
     @property
     def evolution(self) -> Evolution:
         """Evolution model of the unknown."""
-        evolution: Evolution = self.unknown.evolution
-        return evolution
+        return self.unknown.evolution
 
     @property
     def size(self) -> int:
@@ -183,9 +181,8 @@ class Latent:
     @cached_property
     def V(self) -> sp.csr_array:
         """Summation matrix of the visible components, shape (m, dim)."""
-        blocks = [
-            sp.kron(p.evolution.visible[None], sp.eye_array(p.size)) for p in self.parts.values()
-        ]
+        parts = self.parts.values()
+        blocks = [sp.kron(p.evolution.visible[None], sp.eye_array(p.size)) for p in parts]
         return sp.csr_array(sp.block_diag(blocks, format="csr"))
 
     def visible(self, each: Array) -> Array:
@@ -193,25 +190,23 @@ class Latent:
         return each if self.dim == self.space.dim else self.V @ each  # the same but for harmonics
 
     def _each(self, a: Array, function: str) -> Array:
-        pieces = [getattr(p.transform, function)(a[p.part]) for p in self.parts.values()]
+        with np.errstate(over="ignore"):
+            pieces = [getattr(p.transform, function)(a[p.part]) for p in self.parts.values()]
         return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
 
     def value(self, a: Array) -> Array:
         """Return the coefficients of q, shape (m,), from latent ones of shape (dim,)."""
         if self.plain:
             return a
-        with np.errstate(over="ignore"):
-            return self.visible(self._each(a, "value"))
+        return self.visible(self._each(a, "value"))
 
     def slopes(self, a: Array) -> Array:
         """Return T' of each latent coefficient, shape (dim,)."""
-        with np.errstate(over="ignore"):
-            return self._each(a, "slope")
+        return self._each(a, "slope")
 
     def curvatures(self, a: Array) -> Array:
         """Return T'' of each latent coefficient, shape (dim,)."""
-        with np.errstate(over="ignore"):
-            return self._each(a, "curvature")
+        return self._each(a, "curvature")
 
     def tangent(self, a: Array, directions: Array) -> Array:
         """Return dq/da applied to columns of shape (dim, k): shape (m, k)."""

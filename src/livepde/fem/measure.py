@@ -345,8 +345,7 @@ class Measure:
 
     def gbasis(self, element: Any, i: int) -> DiscreteField:
         """Return a shape function of an element at the quadrature points of cells."""
-        field: DiscreteField = element.gbasis(self.mapping, self._rule[0], i, tind=self._where)[0]
-        return field
+        return element.gbasis(self.mapping, self._rule[0], i, tind=self._where)[0]
 
     def lbasis(self, element: Any, count: int) -> Array | None:
         """Return the values of shape functions, (local, points), if identical in all cells."""

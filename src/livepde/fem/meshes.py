@@ -34,23 +34,16 @@ from skfem.element import (
 from skfem.element.element_global import ElementGlobal
 
 from livepde.errors import SpaceError, optional
-from livepde.fem.fields import Field, Predicate, at_end
+from livepde.fem.fields import Field, Predicate, with_sides
 from livepde.linalg import Array, IntArray
 
-LINEAR: dict[Any, Any] = {
-    MeshLine: ElementLineP1,
-    MeshTri: ElementTriP1,
-    MeshQuad: ElementQuad1,
-    MeshTet: ElementTetP1,
-    MeshHex: ElementHex1,
-}
-
-QUADRATIC: dict[Any, Any] = {
-    MeshLine: ElementLineP2,
-    MeshTri: ElementTriP2,
-    MeshQuad: ElementQuad2,
-    MeshTet: ElementTetP2,
-    MeshHex: ElementHex2,
+# Continuous elements of first and second order.
+ELEMENTS: dict[Any, tuple[Any, Any]] = {
+    MeshLine: (ElementLineP1, ElementLineP2),
+    MeshTri: (ElementTriP1, ElementTriP2),
+    MeshQuad: (ElementQuad1, ElementQuad2),
+    MeshTet: (ElementTetP1, ElementTetP2),
+    MeshHex: (ElementHex1, ElementHex2),
 }
 
 
@@ -63,18 +56,19 @@ def linear(mesh: Mesh) -> Element:
     >>> type(lp.linear(lp.interval(0.0, 1.0, 8))).__name__
     'ElementLineP1'
     """
-    return _of(LINEAR, mesh, "first")
+    return _continuous(mesh, 0)
 
 
 def quadratic(mesh: Mesh) -> Element:
     """Return the continuous element of second order for a mesh of any dimension."""
-    return _of(QUADRATIC, mesh, "second")
+    return _continuous(mesh, 1)
 
 
-def _of(elements: dict[Any, Any], mesh: Mesh, order: str) -> Element:
-    for kind, element in elements.items():
+def _continuous(mesh: Mesh, which: int) -> Element:
+    for kind, elements in ELEMENTS.items():
         if isinstance(mesh, kind):
-            return element()
+            return elements[which]()
+    order = ("first", "second")[which]
     raise SpaceError(f"no element of {order} order for a mesh of type {type(mesh).__name__}.")
 
 
@@ -134,15 +128,7 @@ def grid(
     """
     if not all(len(side) > 1 and (np.diff(side) > 0).all() for side in (x, y)):
         raise SpaceError("grid: needs at least two increasing nodes in x and in y.")
-    mesh = MeshQuad.init_tensor(np.array(x), np.array(y)).with_boundaries(
-        {
-            "left": at_end(0, x[0], (x[0], x[-1])),
-            "right": at_end(0, x[-1], (x[0], x[-1])),
-            "bottom": at_end(1, y[0], (y[0], y[-1])),
-            "top": at_end(1, y[-1], (y[0], y[-1])),
-        }
-    )
-    return mesh.with_subdomains(dict(regions)) if regions else mesh
+    return with_sides(MeshQuad.init_tensor(np.array(x), np.array(y)), regions)
 
 
 def box(
@@ -163,18 +149,8 @@ def box(
         raise SpaceError(
             f"box({x}, {y}, {z}, {cells}): needs increasing coordinates and cells >= 1."
         )
-    mesh = MeshTet.init_tensor(
-        *(np.linspace(*side, n + 1) for side, n in zip(sides, cells, strict=True))
-    )
-    names = (("left", "right"), ("front", "back"), ("bottom", "top"))
-    mesh = mesh.with_boundaries(
-        {
-            name: at_end(axis, end, sides[axis])
-            for axis in range(3)
-            for name, end in zip(names[axis], sides[axis], strict=True)
-        }
-    )
-    return mesh.with_subdomains(dict(regions)) if regions else mesh
+    nodes = [np.linspace(*side, n + 1) for side, n in zip(sides, cells, strict=True)]
+    return with_sides(MeshTet.init_tensor(*nodes), regions)
 
 
 def halved(mesh: Mesh) -> Mesh:
@@ -232,7 +208,7 @@ def read_mesh(path: str | Path, scale: float = 1.0) -> Mesh:
         from skfem.io.meshio import from_meshio
     with _quiet():
         mesh = _loaded(path, meshio, from_meshio)
-    if type(mesh) in LINEAR:  # centres of arcs and the like belong to no cell
+    if type(mesh) in ELEMENTS:  # centres of arcs and the like belong to no cell
         mesh = mesh.remove_unused_nodes()
     if scale != 1.0:
         mesh = mesh.scaled(float(scale))
@@ -343,8 +319,7 @@ def tied(field: Field, block: Any) -> IntArray | None:
     # Coefficients are numbered by first occurrence, which keeps the bandwidth of the mesh.
     _, first, renumbered = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))
-    tie: IntArray = rank[renumbered]
-    return tie
+    return rank[renumbered]
 
 
 def _matched(field: Field, block: Any, one: str, other: str) -> tuple[IntArray, IntArray]:

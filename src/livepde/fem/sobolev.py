@@ -109,18 +109,14 @@ class Sobolev:
 
     def form(self, element: Any) -> Any:
         """Return the inner product as a weak form; None if the element admits none."""
-        form, factor = self._plain_form(element), self.factor
-        return form and (lambda u, v, x: factor * form(u, v, x))
-
-    def _plain_form(self, element: Any) -> Any:
-        l2 = self.length**2
+        c, l2 = self.factor, self.length**2
         if self.s == 0:
-            return lambda u, v, x: u * v
+            return lambda u, v, x: c * (u * v)
         if self.s == 1:
-            return lambda u, v, x: u * v + l2 * dot(grad(u), grad(v))
+            return lambda u, v, x: c * (u * v + l2 * dot(grad(u), grad(v)))
         if self.s == 2 and isinstance(element, SMOOTH):
             return lambda u, v, x: (
-                u * v + 2 * l2 * dot(grad(u), grad(v)) + l2**2 * ddot(hess(u), hess(v))
+                c * (u * v + 2 * l2 * dot(grad(u), grad(v)) + l2**2 * ddot(hess(u), hess(v)))
             )
         return None
 
@@ -229,6 +225,12 @@ class _Kernel:
         found: Array = solve_triangular(root, self.covariance(self.places, at), lower=True)
         return found[self.known :]
 
+    def mixed(self, mix: Array, x: Any) -> Array:
+        """Return a mix of the functions at x, shape (d, ...)."""
+        x = np.asarray(x, dtype=float)
+        found: Array = mix @ self.features(x.reshape(len(x), -1).T)
+        return found.reshape(x.shape[1:])
+
 
 def random_field(
     mesh: Any,
@@ -308,7 +310,7 @@ def random_field(
             )
         scale = std / float(np.sqrt(((mixes @ features) ** 2).sum(axis=0).max()))
     mixes = scale * mixes
-    functions = [_Function(kernel, mix) for mix in mixes]
+    functions = [partial(kernel.mixed, mix) for mix in mixes]
     if vertices.shape[1] > 1:
         return tuple(functions)
     nodes = np.sort(vertices[:, 0])
@@ -341,16 +343,3 @@ def _spread(kernel: _Kernel, values: Array) -> float:
     weights = np.linalg.inv(kernel.covariance(places, places) + NUGGET * np.eye(len(values)))
     off = values - (weights @ values).sum() / weights.sum()
     return float(np.sqrt(max(off @ weights @ off, 0.0) / (len(values) - 1)))
-
-
-@dataclass(frozen=True, eq=False)
-class _Function:
-    """A function of the field, as a mix of its features."""
-
-    kernel: _Kernel
-    mix: Array
-
-    def __call__(self, x: Any) -> Array:
-        x = np.asarray(x, dtype=float)
-        found: Array = self.mix @ self.kernel.features(x.reshape(len(x), -1).T)
-        return found.reshape(x.shape[1:])

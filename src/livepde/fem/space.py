@@ -105,8 +105,7 @@ class LocalSpace:
     def values(self, coefficients: Array) -> Array:
         """Return the components of a function, shape (components, elements, points)."""
         if self.kept:
-            values: Array = (self.evaluation @ coefficients).reshape(self.components, *self.shape)
-            return values
+            return (self.evaluation @ coefficients).reshape(self.components, *self.shape)
         local = coefficients[self.dofs]
         values = np.empty((self.components, *self.shape))
         for k in range(self.components):
@@ -119,8 +118,7 @@ class LocalSpace:
         if self.kept:
             weighted = np.empty((self.components, *self.shape))
             np.multiply(density, weights, out=weighted)
-            whole: Array = self._evaluation_transposed @ weighted.ravel()
-            return whole
+            return self._evaluation_transposed @ weighted.ravel()
         local = np.zeros(self.dofs.shape)
         for (k,), part in _parts(density, (self.components,)):
             columns, phi = self.component(k)
@@ -330,11 +328,7 @@ class FunctionSpace:
     @cached_property
     def fixed(self) -> IntArray:
         """Coefficients fixed by Dirichlet conditions."""
-        parts = [
-            block.fixed + start
-            for block, start in zip(self.blocks.values(), self.starts, strict=True)
-            if isinstance(block, FieldBlock)
-        ]
+        parts = [block.fixed + self.part(name).start for name, block in self.fields.items()]
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
     @cached_property
@@ -347,8 +341,7 @@ class FunctionSpace:
         """Coefficient number of each scalar unknown, by label."""
         found: dict[str, int] = {}
         for (name, block), start in zip(self.blocks.items(), self.starts, strict=True):
-            for k, label in enumerate(block.labels(name)):
-                found[label] = start + k
+            found |= {label: start + k for k, label in enumerate(block.labels(name))}
         return found
 
     @cached_property
@@ -359,9 +352,7 @@ class FunctionSpace:
             parts=self.parts,
             fields=dict.fromkeys(self.fields),
             unknowns={
-                name: Scalar(
-                    each.prior, evolution=each.evolution, unit=each.unit, within=each.within
-                )
+                name: Scalar(each.prior, each.unit, each.evolution, each.within)
                 for name, each in self.unknowns.items()
             },
         )

@@ -9,7 +9,7 @@ from numpy import exp
 from livepde.errors import ModelError
 from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
 from livepde.model import Model
-from livepde.models.description import Equation, Option, Variable, closed
+from livepde.models.description import Equation, Option, Variable, by_name
 
 FARADAY = 96485.33212  # C/mol
 
@@ -106,6 +106,6 @@ BATTERY_PARTICLE = Equation(
         "area": Option("m^2", "surface of all particles"),
         "c_max": Option("mol/m^3", "concentration of the full particle"),
     },
-    build=closed(battery_particle, "is fed by the input I"),
+    build=by_name(battery_particle, "is fed by the input I"),
     element=linear,
 )

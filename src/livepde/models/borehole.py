@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from math import log, pi
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from livepde.errors import ModelError
 from livepde.fem import Field, On, Place, Scalar, Unknown, declared, dot, grad, linear
 from livepde.model import Model
-from livepde.models.description import Equation, Number, Option, Quantity, Variable, closed
+from livepde.models.description import Equation, Number, Option, Quantity, Variable, by_name
 
 
 def borehole(
@@ -72,15 +72,7 @@ def fluid(H: float) -> Callable[[Any, Place], Any]:
     return lambda q, x: q.R_b * x.inputs["Q"] / H
 
 
-def _build(
-    mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], **options: Any
-) -> Model:
-    """Return the process of a case; an unknown heat capacity replaces the option."""
-    known = {name: value for name, value in options.items() if name not in unknowns}
-    return closed(borehole, "is heated by the input Q, with T0 far away")(
-        mesh, unknowns, dirichlet, **known
-    )
-
+HEATED = "is heated by the input Q, with T0 far away"
 
 BOREHOLE = Equation(
     name="borehole",
@@ -105,7 +97,7 @@ BOREHOLE = Equation(
             direct=lambda options: fluid(options["H"]),
         )
     },
-    build=_build,
+    build=by_name(borehole, HEATED),
     element=linear,
     spacing="geometric",
 )
@@ -280,7 +272,7 @@ GROUTED_BOREHOLE = Equation(
         "C_g": Option("J/(m^3 K)", "volumetric heat capacity of the grout"),
         "T0": Option("degC", "undisturbed temperature of the ground"),
     },
-    build=closed(grouted_borehole, "is heated by the input Q, with T0 far away"),
+    build=by_name(grouted_borehole, HEATED),
     element=linear,
     spacing="geometric",
 )

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 from livepde.errors import ModelError
 from livepde.fem import Field, Integrand, Place, Unknown
+from livepde.fem.fields import SIDES
 from livepde.model import Model
 
 
@@ -150,26 +151,19 @@ class Equation:
     @property
     def takes_values(self) -> bool:
         """Whether a case may give values of the state on boundaries."""
-        return not isinstance(self.build, closed)
-
-
-def by_name(function: Callable[..., Model]) -> Callable[..., Model]:
-    """Return the `build` of a function with unknowns, `dirichlet` and options as keywords."""
-
-    def build(
-        mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], **options: Any
-    ) -> Model:
-        return function(mesh, dirichlet=dirichlet or None, **unknowns, **options)
-
-    return build
+        return not getattr(self.build, "closed", "")
 
 
 @dataclass(frozen=True)
-class closed:
-    """The `build` of a function without boundary values; raises `ModelError` with the reason."""
+class by_name:
+    """The `build` of a function with unknowns, `dirichlet` and options as keywords.
+
+    An unknown replaces the option of its name. `closed` is the reason why a function has no
+    `dirichlet`, for the error if a case gives values.
+    """
 
     function: Callable[..., Model]
-    why: str
+    closed: str = ""
 
     def __call__(
         self,
@@ -178,25 +172,26 @@ class closed:
         dirichlet: Mapping[str, Any],
         **options: Any,
     ) -> Model:
+        given = {**options, **unknowns}
+        if not self.closed:
+            return self.function(mesh, dirichlet=dirichlet or None, **given)
         if dirichlet:
-            raise ModelError(
-                f"{self.function.__name__} {self.why}: leave out the values on {sorted(dirichlet)}."
-            )
-        return self.function(mesh, **unknowns, **options)
+            name, places = self.function.__name__, sorted(dirichlet)
+            raise ModelError(f"{name} {self.closed}: leave out the values on {places}.")
+        return self.function(mesh, **given)
 
 
 Number: TypeAlias = Unknown | float
 """A coefficient of an equation: unknown, or a known number."""
 
 INITIAL = Variable("", "initial state, a field; else the case's `initial`", optional=True)
-SIDES = (("left", "right"), ("bottom", "top"), ("front", "back"))
 
 
 def state(mesh: Any, element: Any, dirichlet: Mapping[str, Any] | None, unit: str = "") -> Field:
     """Return the field of the state: periodic, or with Dirichlet values."""
     if dirichlet is not None:
         return Field(mesh, element, dirichlet=dict(dirichlet), unit=unit)
-    pairs = [pair for pair in SIDES if set(pair) <= set(mesh.boundaries or {})]
+    pairs = [pair for pair in SIDES[-1] if set(pair) <= set(mesh.boundaries or {})]
     return Field(mesh, element, periodic=pairs, unit=unit)
 
 

@@ -66,7 +66,7 @@ def heat(
     ('T0',)
     """
     unknowns = {"alpha": alpha, "loss": loss, "transfer": transfer, "source": source}
-    return _model("heat", mesh, "alpha", unknowns, dirichlet, lambda x: 1.0, element, unit)
+    return _model(HEAT, mesh, unknowns, dirichlet, lambda x: 1.0, element, unit)
 
 
 def conduction(
@@ -123,17 +123,16 @@ def conduction(
         raise ModelError("conduction: an unknown C must be one number; give a Scalar or a prior.")
     if isinstance(C, fem.Scalar | fem.Prior):
         unknowns["C"] = C
-        return _model("conduction", mesh, "k", unknowns, dirichlet, lambda x: 1.0, element, unit)
+        return _model(CONDUCTION, mesh, unknowns, dirichlet, lambda x: 1.0, element, unit)
     if not callable(C) and not C > 0:
         raise ModelError(f"conduction: the heat capacity C must be positive; got {C}.")
     capacity = C if callable(C) else lambda x: C
-    return _model("conduction", mesh, "k", unknowns, dirichlet, capacity, element, unit)
+    return _model(CONDUCTION, mesh, unknowns, dirichlet, capacity, element, unit)
 
 
 def _model(
-    name: str,
+    equation: Equation,
     mesh: Any,
-    conductivity: str,
     unknowns: Mapping[str, fem.Unknown | None],
     dirichlet: Mapping[str, Any] | None,
     capacity: Callable[[fem.Place], Any],
@@ -155,12 +154,19 @@ def _model(
         return getattr(q, f"{key}_per_C" if divided else key)
 
     terms: list[Any] = [
-        lambda q, u, v, x: part(q, conductivity) * fem.dot(fem.grad(u), fem.grad(v))
+        lambda q, u, v, x: part(q, equation.conductivity) * fem.dot(fem.grad(u), fem.grad(v))
     ]
     if "loss" in given:
         terms += _exchange("loss", part)
     if "transfer" in given:
-        terms += _transfer(name, mesh, held, part)
+        sides = [] if "boundary" in held else [*(mesh.boundaries or {})]
+        free = [side for side in sides if side not in held]
+        if not free:
+            raise ModelError(
+                f"{equation.name}: transfer acts at named boundaries without a value, and there is "
+                "none: leave it out, or leave one out of dirichlet."
+            )
+        terms += [fem.On(side, term) for side in free for term in _exchange("transfer", part)]
     if "source" in given:
         terms.append(lambda q, _, v, x: -part(q, "source") * v)
     return Model(
@@ -170,7 +176,7 @@ def _model(
         M=lambda u, v, x: capacity(x) * u * v,
         inputs=[AMBIENT] if {"loss", "transfer"} & set(given) else [],
         coefficients=ratios if divided else None,
-        **(HEAT if name == "heat" else CONDUCTION).about(given),
+        **equation.about(given),
     )
 
 
@@ -180,21 +186,6 @@ def _exchange(coefficient: str, part: Callable[[Any, str], Any]) -> list[Any]:
         lambda q, u, v, x: part(q, coefficient) * u * v,
         lambda q, _, v, x: -part(q, coefficient) * x.inputs[AMBIENT] * v,
     ]
-
-
-def _transfer(
-    name: str, mesh: Any, held: Mapping[str, Any], part: Callable[[Any, str], Any]
-) -> list[fem.On]:
-    """Return the Robin terms at the named boundaries without a value."""
-    free = (
-        [] if "boundary" in held else [side for side in mesh.boundaries or {} if side not in held]
-    )
-    if not free:
-        raise ModelError(
-            f"{name}: transfer acts at named boundaries without a value, and there is none: leave "
-            "it out, or leave one out of dirichlet."
-        )
-    return [fem.On(side, term) for side in free for term in _exchange("transfer", part)]
 
 
 SURROUNDINGS = {

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from livepde.errors import ModelError
-from livepde.fem import Channel, Field, On, Place, Unknown, dot, grad, linear
+from livepde.fem import Channel, Field, On, Piecewise, Place, Unknown, dot, grad, linear
 from livepde.linalg import Array
 from livepde.model import Model
-from livepde.models.description import Equation, Option, Variable, closed
+from livepde.models.description import Equation, Option, Variable, by_name
 
 
 def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any = None) -> Model:
@@ -111,7 +111,7 @@ def groundwater(
     """
     sources = {name: _place(mesh, name, at, radius) for name, at in (wells or {}).items()}
     # The term grad(1/S) would be a delta function at the jumps of S.
-    if not hasattr(S, "mesh") and hasattr(S, "regions"):
+    if isinstance(S, Piecewise):
         raise ModelError("groundwater: S by region is not possible; take a number or a Field.")
     varies = isinstance(S, Field)
 
@@ -189,7 +189,7 @@ PUMPING_TEST = Equation(
     },
     inputs={"Q": Variable("m^3/s", "rate of the well, positive when water is taken out")},
     options={"b": Option("m", "thickness of the aquifer; with 1 m k is T and Ss is S")},
-    build=closed(pumping_test, "is pumped by the input Q, with 0 far away"),
+    build=by_name(pumping_test, "is pumped by the input Q, with 0 far away"),
     element=linear,
     spacing="geometric",
 )
@@ -380,7 +380,7 @@ ADVECTION_DISPERSION = Equation(
         "decay": Option("1/h", "rate of decay", 0.0),
         "inlet": INLET,
     },
-    build=closed(advection_dispersion, FED),
+    build=by_name(advection_dispersion, FED),
     element=linear,
     length_unit="cm",
     time_unit="h",
@@ -398,7 +398,7 @@ MOBILE_IMMOBILE = Equation(
     },
     inputs=INFLOW,
     options={"inlet": INLET},
-    build=closed(mobile_immobile, FED),
+    build=by_name(mobile_immobile, FED),
     element=linear,
     components=("c", "s"),
     length_unit="cm",

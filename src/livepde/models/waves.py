@@ -28,7 +28,6 @@ from livepde.models.description import (
     Variable,
     autonomous,
     by_name,
-    closed,
     state,
 )
 
@@ -208,11 +207,12 @@ def wave(
                 )
             moved[name] = 0.0
     element = element or linear(mesh)
-    known = isinstance(d, int | float)
+    unknown = {} if isinstance(d, int | float) else {"d": d}
     level = float(d) if isinstance(d, int | float) else 0.0
 
-    def stiffness(q: Any, u: Any, v: Any, x: Any) -> Any:
-        return q.c2 * dot(grad(u.w), grad(v.p))
+    def A(q: Any, u: Any, v: Any, x: Any) -> Any:
+        stiffness = q.c2 * dot(grad(u.w), grad(v.p))
+        return stiffness + q.d * u.p * v.p if unknown else stiffness
 
     # First-order form: implicit one-step schemes and the laws need a single time derivative.
     return Model(
@@ -220,8 +220,8 @@ def wave(
             "w": Field(mesh, element, dirichlet=held, unit="m"),
             "p": Field(mesh, element, dirichlet=moved, unit="m/s"),
         },
-        {"c2": c2} if isinstance(d, int | float) else {"c2": c2, "d": d},
-        A=stiffness if known else lambda q, u, v, x: stiffness(q, u, v, x) + q.d * u.p * v.p,
+        {"c2": c2, **unknown},
+        A=A,
         B=lambda u, v, x: -u.p * v.w + level * u.p * v.p,
         f={"p": f},
         **WAVE.about(),
@@ -334,7 +334,7 @@ KDV = Equation(
         "dispersion": Variable("", "coefficient b of u_xxx", transform=""),
         "u0": INITIAL,
     },
-    build=closed(kdv, "is periodic"),
+    build=by_name(kdv, "is periodic"),
     element=smooth,
     length_unit="",
     time_unit="",
@@ -383,7 +383,7 @@ KURAMOTO_SIVASHINSKY = Equation(
         "damping": Variable("", "coefficient c of u_xxxx", transform=""),
         "u0": INITIAL,
     },
-    build=closed(kuramoto_sivashinsky, "is periodic"),
+    build=by_name(kuramoto_sivashinsky, "is periodic"),
     element=smooth,
     length_unit="",
     time_unit="",

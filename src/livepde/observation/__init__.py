@@ -10,18 +10,16 @@ from livepde.observation.combined import (
     TransformedObserved,
 )
 from livepde.observation.functionals import FluxPlates, Functionals
-from livepde.observation.operator import Observation, Observed
-from livepde.observation.reconstruction import (
-    Alpha,
-    Apriori,
-    Discrepancy,
+from livepde.observation.operator import (
+    Observation,
+    Observed,
     Pseudoinverse,
     Reconstructed,
     Reconstruction,
     Reconstructor,
     Split,
-    Tikhonov,
 )
+from livepde.observation.reconstruction import Alpha, Apriori, Discrepancy, Tikhonov
 from livepde.observation.sensors import Averages, LineIntegrals, Matrix, Moving, Points
 from livepde.observation.subdomain import Full, Subdomain
 

@@ -87,9 +87,7 @@ class Combined(Observation):
     def portable(self) -> bool:
         return all(part.portable for part in self.parts)
 
-    def bind(
-        self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace
-    ) -> CombinedObserved:
+    def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
         return CombinedObserved(self, state, X, parameter)
 
 
@@ -207,9 +205,7 @@ class Calibrated(Observation):
     def portable(self) -> bool:
         return self.base.portable
 
-    def bind(
-        self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace
-    ) -> CalibratedObserved:
+    def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
         return CalibratedObserved(self, state, X, parameter)
 
 
@@ -217,6 +213,7 @@ class CalibratedObserved(Observed):
     """Bound `Calibrated` observation: derivatives by the chain rule."""
 
     observation: Calibrated
+    linear = False
 
     def _prepare(self) -> None:
         self.base = self.observation.base.bind(self.state, self.X, self.parameter)
@@ -231,10 +228,6 @@ class CalibratedObserved(Observed):
     @property
     def places(self) -> Mapping[str, Array]:
         return self.base.places
-
-    @property
-    def linear(self) -> bool:
-        return False
 
     def _read(self, y: Any, q: Any, moment: Moment) -> Any:
         # A calibration sees time and inputs, and no coordinates.
@@ -379,9 +372,7 @@ class Transformed(Observation):
     def portable(self) -> bool:
         return self.base.portable
 
-    def bind(
-        self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace
-    ) -> TransformedObserved:
+    def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
         return TransformedObserved(self, state, X, parameter)
 
     def read(self, y: Array) -> Array:

@@ -46,6 +46,7 @@ class Functionals(Observation):
 
     integrands: Mapping[str, Integrand | On]
     order: int | None = None
+    portable = True
 
     def __post_init__(self) -> None:
         self._sees_all("an integrand names its component, as u.c.")
@@ -55,13 +56,7 @@ class Functionals(Observation):
     def names(self, count: int) -> tuple[str, ...]:
         return tuple(self.integrands)
 
-    @property
-    def portable(self) -> bool:
-        return True
-
-    def bind(
-        self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace
-    ) -> FunctionalsObserved:
+    def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
         return FunctionalsObserved(self, state, X, parameter)
 
 
@@ -69,6 +64,7 @@ class FunctionalsObserved(Observed):
     """Bound `Functionals`: each is a form in (u, q) jointly, tested with w = 1."""
 
     observation: Functionals
+    linear = False
 
     def _prepare(self) -> None:
         # State and parameter form one nonlinear argument, so that one complex step differentiates
@@ -106,10 +102,6 @@ class FunctionalsObserved(Observed):
         ]
         degrees = [int(block.field.element.maxdeg) for block in self.parameter.fields.values()]
         return max(orders) + max(degrees, default=0)
-
-    @property
-    def linear(self) -> bool:
-        return False
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
         uq = np.concatenate([u, q])
@@ -181,6 +173,7 @@ class FluxPlates(Observation):
 
     points: Mapping[str, float | str]
     conductivity: str = "k"
+    portable = True
 
     def __post_init__(self) -> None:
         if not self.points:
@@ -189,13 +182,7 @@ class FluxPlates(Observation):
     def names(self, count: int) -> tuple[str, ...]:
         return tuple(self.points)
 
-    @property
-    def portable(self) -> bool:
-        return True
-
-    def bind(
-        self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace
-    ) -> FluxPlatesObserved:
+    def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
         return FluxPlatesObserved(self, state, X, parameter)
 
 
@@ -203,6 +190,7 @@ class FluxPlatesObserved(Observed):
     """Bound `FluxPlates`: z = W (D q * S u), with means D q and slopes S u of the cells."""
 
     observation: FluxPlates
+    linear = False
 
     def _prepare(self) -> None:
         observation, state, parameter = self.observation, self.state, self.parameter
@@ -259,10 +247,6 @@ class FluxPlatesObserved(Observed):
         row = np.zeros(len(middles))
         row[k], row[k + 1] = sign * (1.0 - share), sign * share
         return row
-
-    @property
-    def linear(self) -> bool:
-        return False
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
         return np.asarray(self._weights @ ((self._D @ q) * (self._slopes @ u)))

@@ -1,7 +1,8 @@
-"""Observation operators G: X -> Z, and sensors bound to a state space."""
+"""Observation operators G: X -> Z, sensors bound to a state space, and their G^+ (section 3.2)."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,14 +15,6 @@ from numpy.typing import ArrayLike
 from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, FunctionSpace, Moment, Place, Unknown, numbers
 from livepde.linalg import Array, IntArray, Mask, Memo
-from livepde.observation.reconstruction import (
-    Pseudoinverse,
-    Reconstructed,
-    Reconstruction,
-    Reconstructor,
-    Split,
-    is_selection,
-)
 from livepde.spaces import HilbertSpace
 
 Direct = Callable[[Any, Place], Any]
@@ -35,6 +28,162 @@ ROUNDING = 1e-14
 LARGEST_PROJECTION = 100_000_000
 # Number of cached splits, one for each pattern of missing sensors.
 LARGEST_MEMO = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Projections R = G^+ G on N(G)^perp and P = I - R on N(G), and G^+ itself.
+
+    Attributes
+    ----------
+    R, P
+        Sparse, shape (n, n); idempotent to rounding. Fixed (Dirichlet) coefficients are known, and
+        belong to P.
+    inverse, G
+        G^+ on the present sensors, shape (n, present), and their rows of G, shape (present, n).
+    present
+        Mask of the sensors used, shape (sensors,).
+    vectors
+        Basis of N(G)^perp, shape (n, k); None if the columns of `inverse` are one.
+    omega
+        Elements on which the data determine the state, for sensors on a subdomain: there the
+        paper's chi_omega is one, and integrals over Omega are split into those over `omega`, with
+        the data, and those over the other elements, with the estimate. None: all elements, with the
+        state split by R and P alone.
+    """
+
+    R: sp.csr_array
+    P: sp.csr_array
+    inverse: sp.csr_array
+    present: Array
+    G: sp.csr_array
+    vectors: Array | None = None
+    omega: IntArray | None = None
+
+    @property
+    def basis(self) -> Array:
+        """Basis of N(G)^perp, shape (n, k)."""
+        return self.inverse.toarray() if self.vectors is None else self.vectors
+
+    @cached_property
+    def _diagonal(self) -> Array | None:
+        """Diagonal of R if R is diagonal, else None."""
+        alone = bool(np.array_equal(self.R.indices, np.flatnonzero(np.diff(self.R.indptr))))
+        return self.R.diagonal() if alone else None
+
+    @cached_property
+    def _selected(self) -> IntArray | None:
+        """Coefficient read by each present sensor, if each reads a single one; else None."""
+        selects = self.vectors is None and is_selection(sp.csr_array(self.inverse.T))
+        return sp.csr_array(self.inverse.T).indices if selects else None
+
+    def project(self, u: Array) -> Array:
+        """Return R u."""
+        return self.R @ u if self._diagonal is None else self._diagonal * u
+
+    def reconstruct(self, z: Array, boundary: Array | None) -> Array:
+        """Return the observed part R u* = G^+ z of the state in X, shape (n,).
+
+        Missing measurements (NaN) are ignored. `boundary` is a coefficient vector with the
+        Dirichlet values, zero elsewhere; None: zero.
+        """
+        known: Array = z[self.present]
+        if boundary is not None and boundary.any():
+            known = known - self.G @ boundary
+        if self._selected is None:
+            return self.inverse @ known
+        part = np.zeros(self.R.shape[0])
+        part[self._selected] = known
+        return part
+
+
+def is_selection(G: sp.csr_array) -> bool:
+    """Return True if every row selects one coefficient, and no two rows the same."""
+    one_each = bool(np.all(np.diff(G.indptr) == 1) and np.all(G.data == 1.0))
+    return one_each and len(np.unique(G.indices)) == len(G.indices)
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstructed:
+    """Reconstruction u = u_alpha = G_alpha z of the observed part of the state, shape (n,).
+
+    Attributes
+    ----------
+    alpha
+        Regularisation parameter; 0 for G^+.
+    misfit
+        ||G u_alpha - z||_Z.
+    delta
+        Noise level ||z^delta - z||_Z used, or None if unknown.
+    """
+
+    u: Array
+    alpha: float
+    misfit: float
+    delta: float | None
+
+
+class Reconstructor(ABC):
+    """Factorised G_alpha for one set of present sensors."""
+
+    @abstractmethod
+    def __call__(self, z: Array, boundary: Array, delta: float | None = None) -> Reconstructed:
+        """Return the reconstruction u_alpha from measurements of shape (sensors,).
+
+        `boundary` is a coefficient vector with the Dirichlet values, zero elsewhere; `delta` the
+        noise level ||z^delta - z||_Z, default that of the rule or the observation.
+        """
+
+
+class Reconstruction(ABC):
+    """Abstract method to reconstruct the observed part of the state from measurements."""
+
+    @property
+    def regularises(self) -> bool:
+        """False for G^+ itself."""
+        return True
+
+    @abstractmethod
+    def prepare(self, observed: Observed, present: Array) -> Reconstructor:
+        """Return the reconstructor of a set of present sensors."""
+
+
+@dataclass(frozen=True)
+class Pseudoinverse(Reconstruction):
+    """Moore-Penrose inverse G^+: for exact data, and where averaging over time is enough."""
+
+    @property
+    def regularises(self) -> bool:
+        return False
+
+    def prepare(self, observed: Observed, present: Array) -> Reconstructor:
+        return _Inverse(observed, present)
+
+
+class _Inverse(Reconstructor):
+    def __init__(self, observed: Observed, present: Array) -> None:
+        self.split = observed.split(present)
+        self.weights = weights(observed, present)
+
+    def __call__(self, z: Array, boundary: Array, delta: float | None = None) -> Reconstructed:
+        u = self.split.reconstruct(z, boundary)
+        rest = self.split.G @ (u + boundary) - z[self.split.present]
+        return Reconstructed(u, 0.0, data_norm(rest, self.weights), delta)
+
+
+def weights(observed: Observed, present: Array) -> sp.csr_array:
+    """Return the Gram matrix of Z for the sensors present (see `Tikhonov`)."""
+    if observed.observation.nodal:
+        inverse = observed.split(present).inverse
+        return sp.csr_array(inverse.T @ observed.X.gram @ inverse)
+    if observed.noise is None:
+        return sp.csr_array(sp.eye_array(int(present.sum())))
+    return sp.csr_array(sp.diags_array(observed.noise[present] ** -2.0))
+
+
+def data_norm(z: Array, gram: sp.csr_array) -> float:
+    """Return the norm of measurements in Z, of a Gram matrix."""
+    return float(np.sqrt(max(float(z @ (gram @ z)), 0.0)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -196,10 +345,6 @@ class Observed:
         """Common unit of the sensors; empty if they differ."""
         first, *others = self.units
         return first if all(other == first for other in others) else ""
-
-    @property
-    def nodal(self) -> bool:
-        return self.observation.nodal
 
     @cached_property
     def noise(self) -> Array | None:

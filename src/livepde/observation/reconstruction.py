@@ -1,4 +1,4 @@
-"""Observed and unobserved part of the state; reconstruction by G^+ and G_alpha (section 3.2).
+"""Reconstruction of the observed part of the state by G_alpha (section 3.2).
 
 With noisy data G^+ z is undefined or unstable if the range of G is not closed. Even if it is
 closed, the noise enters the law through B(w), which takes two derivatives. The paper replaces it by
@@ -14,8 +14,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import scipy
@@ -23,116 +22,22 @@ import scipy.linalg as sl
 import scipy.sparse as sp
 
 from livepde.errors import ObservationError
-from livepde.fem import FieldBlock, Form, FunctionSpace, Integrand, ddot, dot, grad, hess
-from livepde.linalg import Array, IntArray, Mask
-from livepde.spaces import HilbertSpace
-
-
-@dataclass(frozen=True, eq=False)
-class Split:
-    """Projections R = G^+ G on N(G)^perp and P = I - R on N(G), and G^+ itself.
-
-    Attributes
-    ----------
-    R, P
-        Sparse, shape (n, n); idempotent to rounding. Fixed (Dirichlet) coefficients are known, and
-        belong to P.
-    inverse, G
-        G^+ on the present sensors, shape (n, present), and their rows of G, shape (present, n).
-    present
-        Mask of the sensors used, shape (sensors,).
-    vectors
-        Basis of N(G)^perp, shape (n, k); None if the columns of `inverse` are one.
-    omega
-        Elements on which the data determine the state, for sensors on a subdomain: there the
-        paper's chi_omega is one, and integrals over Omega are split into those over `omega`, with
-        the data, and those over the other elements, with the estimate. None: all elements, with the
-        state split by R and P alone.
-    """
-
-    R: sp.csr_array
-    P: sp.csr_array
-    inverse: sp.csr_array
-    present: Array
-    G: sp.csr_array
-    vectors: Array | None = None
-    omega: IntArray | None = None
-
-    @property
-    def basis(self) -> Array:
-        """Basis of N(G)^perp, shape (n, k)."""
-        return self.inverse.toarray() if self.vectors is None else self.vectors
-
-    @cached_property
-    def _diagonal(self) -> Array | None:
-        """Diagonal of R if R is diagonal, else None."""
-        alone = bool(np.array_equal(self.R.indices, np.flatnonzero(np.diff(self.R.indptr))))
-        return self.R.diagonal() if alone else None
-
-    @cached_property
-    def _complete(self) -> bool:
-        """True if all sensors are present."""
-        return bool(self.present.all())
-
-    @cached_property
-    def _selected(self) -> IntArray | None:
-        """Coefficient read by each present sensor, if each reads a single one; else None."""
-        selects = self.vectors is None and is_selection(sp.csr_array(self.inverse.T))
-        return sp.csr_array(self.inverse.T).indices if selects else None
-
-    def project(self, u: Array) -> Array:
-        """Return R u."""
-        projected: Array = self.R @ u if self._diagonal is None else self._diagonal * u
-        return projected
-
-    def reconstruct(self, z: Array, boundary: Array | None) -> Array:
-        """Return the observed part R u* = G^+ z of the state in X, shape (n,).
-
-        Missing measurements (NaN) are ignored. `boundary` is a coefficient vector with the
-        Dirichlet values, zero elsewhere; None: zero.
-        """
-        known = z if self._complete else z[self.present]
-        if boundary is not None and boundary.any():
-            known = known - self.G @ boundary
-        if self._selected is None:
-            part: Array = self.inverse @ known
-            return part
-        part = np.zeros(self.R.shape[0])
-        part[self._selected] = known
-        return part
-
-
-def is_selection(G: sp.csr_array) -> bool:
-    """Return True if every row selects one coefficient, and no two rows the same."""
-    one_each = bool(np.all(np.diff(G.indptr) == 1) and np.all(G.data == 1.0))
-    return one_each and len(np.unique(G.indices)) == len(G.indices)
-
+from livepde.fem import FieldBlock, Form, Integrand, ddot, dot, grad, hess
+from livepde.linalg import Array, Mask
+from livepde.observation.operator import (
+    Observed,
+    Reconstructed,
+    Reconstruction,
+    Reconstructor,
+    data_norm,
+    weights,
+)
 
 SMALLEST, LARGEST = 1e-12, 1e12  # alpha of the discrepancy principle, in units of its scale
 # Relative accuracy of alpha in the discrepancy principle.
 ROOT = 1e-10
 # Largest number of sensors for a dense eigendecomposition.
 MOST_SENSORS = 10_000
-
-
-@dataclass(frozen=True, eq=False)
-class Reconstructed:
-    """Reconstruction u = u_alpha = G_alpha z of the observed part of the state, shape (n,).
-
-    Attributes
-    ----------
-    alpha
-        Regularisation parameter; 0 for G^+.
-    misfit
-        ||G u_alpha - z||_Z.
-    delta
-        Noise level ||z^delta - z||_Z used, or None if unknown.
-    """
-
-    u: Array
-    alpha: float
-    misfit: float
-    delta: float | None
 
 
 class Alpha(ABC):
@@ -223,72 +128,6 @@ class Discrepancy(Alpha):
         return float(np.exp(root))
 
 
-class BoundSensors(Protocol):
-    """Sensors bound to a state space, for reconstructions: see `Observed`."""
-
-    state: FunctionSpace
-    X: HilbertSpace
-
-    @property
-    def G(self) -> sp.csr_array: ...
-
-    @property
-    def noise(self) -> Array | None: ...
-
-    @property
-    def nodal(self) -> bool: ...
-
-    def split(self, present: Array | None = None) -> Split: ...
-
-
-class Reconstructor(ABC):
-    """Factorised G_alpha for one set of present sensors."""
-
-    @abstractmethod
-    def __call__(self, z: Array, boundary: Array, delta: float | None = None) -> Reconstructed:
-        """Return the reconstruction u_alpha from measurements of shape (sensors,).
-
-        `boundary` is a coefficient vector with the Dirichlet values, zero elsewhere; `delta` the
-        noise level ||z^delta - z||_Z, default that of the rule or the observation.
-        """
-
-
-class Reconstruction(ABC):
-    """Abstract method to reconstruct the observed part of the state from measurements."""
-
-    @property
-    def regularises(self) -> bool:
-        """False for G^+ itself."""
-        return True
-
-    @abstractmethod
-    def prepare(self, observed: BoundSensors, present: Array) -> Reconstructor:
-        """Return the reconstructor of a set of present sensors."""
-
-
-@dataclass(frozen=True)
-class Pseudoinverse(Reconstruction):
-    """Moore-Penrose inverse G^+: for exact data, and where averaging over time is enough."""
-
-    @property
-    def regularises(self) -> bool:
-        return False
-
-    def prepare(self, observed: BoundSensors, present: Array) -> Reconstructor:
-        return _Inverse(observed, present)
-
-
-class _Inverse(Reconstructor):
-    def __init__(self, observed: BoundSensors, present: Array) -> None:
-        self.split = observed.split(present)
-        self.weights = weights(observed, present)
-
-    def __call__(self, z: Array, boundary: Array, delta: float | None = None) -> Reconstructed:
-        u = self.split.reconstruct(z, boundary)
-        rest = self.split.G @ (u + boundary) - z[self.split.present]
-        return Reconstructed(u, 0.0, _norm(rest, self.weights), delta)
-
-
 @dataclass(frozen=True)
 class Tikhonov(Reconstruction):
     """Tikhonov-Phillips regularisation G_alpha: Z -> N(G)^perp (section 3.2).
@@ -346,7 +185,7 @@ class Tikhonov(Reconstruction):
                 f"{self.alpha!r}."
             )
 
-    def prepare(self, observed: BoundSensors, present: Array) -> Reconstructor:
+    def prepare(self, observed: Observed, present: Array) -> Reconstructor:
         return Spectral(self, observed, present)
 
 
@@ -358,7 +197,7 @@ class Spectral(Reconstructor):
     closed) as well as for k = 0 (the null space of |.|).
     """
 
-    def __init__(self, config: Tikhonov, observed: BoundSensors, present: Array) -> None:
+    def __init__(self, config: Tikhonov, observed: Observed, present: Array) -> None:
         self.config = config
         self.present = present
         if (count := int(present.sum())) > MOST_SENSORS:
@@ -368,7 +207,9 @@ class Spectral(Reconstructor):
             )
         self.G = sp.csr_array(observed.G[np.flatnonzero(present)])
         self.weights = weights(observed, present)
-        self.level = noise_level(observed, present, self.weights)
+        self.level: float | None = None  # root mean square of ||noise||_Z
+        if observed.noise is not None:
+            self.level = float(np.sqrt(self.weights.diagonal() @ observed.noise[present] ** 2))
         basis = observed.split(present).basis
         penalty = penalty_matrix(config.norm, observed, basis)
         self.size = basis.shape[1]
@@ -396,7 +237,9 @@ class Spectral(Reconstructor):
     def __call__(self, z: Array, boundary: Array, delta: float | None = None) -> Reconstructed:
         known = z[self.present] - self.G @ boundary
         if self.size == 0:
-            return Reconstructed(np.zeros(len(boundary)), 0.0, _norm(known, self.weights), delta)
+            return Reconstructed(
+                np.zeros(len(boundary)), 0.0, data_norm(known, self.weights), delta
+            )
         beta = self.fitted @ known
         shift = boundary @ self.pulled
         scaled = self.root @ known
@@ -424,7 +267,7 @@ class Spectral(Reconstructor):
             absolute, relative = rule.given
             delta = absolute
             if delta is None:
-                delta = self.level if relative is None else relative * _norm(z, self.weights)
+                delta = self.level if relative is None else relative * data_norm(z, self.weights)
         if delta is None:
             raise ObservationError(
                 f"Tikhonov: {type(rule).__name__} needs the noise level: give noise= to the "
@@ -433,90 +276,39 @@ class Spectral(Reconstructor):
         return delta, rule.choose(misfit, delta, self.rho)
 
 
-def weights(observed: BoundSensors, present: Array) -> sp.csr_array:
-    """Return the Gram matrix of Z for the sensors present (see `Tikhonov`)."""
-    if observed.nodal:
-        inverse = observed.split(present).inverse
-        return sp.csr_array(inverse.T @ observed.X.gram @ inverse)
-    if observed.noise is None:
-        return sp.csr_array(sp.eye_array(int(present.sum())))
-    return sp.csr_array(sp.diags_array(observed.noise[present] ** -2.0))
-
-
-def noise_level(observed: BoundSensors, present: Array, gram: sp.csr_array) -> float | None:
-    """Return delta, the root mean square of ||noise||_Z; None if the noise is unknown."""
-    if observed.noise is None:
-        return None
-    return float(np.sqrt(gram.diagonal() @ observed.noise[present] ** 2))
-
-
-def _norm(z: Array, gram: sp.csr_array) -> float:
-    return float(np.sqrt(max(float(z @ (gram @ z)), 0.0)))
-
-
-class _Inside:
-    """Part of the mesh over which a penalty is integrated."""
-
-    def __init__(self, observed: BoundSensors, basis: Array) -> None:
-        self.space: FunctionSpace = observed.state
-        if len(self.space.fields) > 1:
-            raise ObservationError(
-                "Tikhonov: norm 'V' and forms know states of one component; take norm='X'."
-            )
-        self.block: FieldBlock = self.space.component()[0]
-        self.cells: Mask | None = None  # all
-        if observed.nodal:
-            known = np.zeros(self.block.size, dtype=bool)
-            known[np.flatnonzero(np.abs(basis).any(axis=1))] = True
-            known[self.block.fixed] = True
-            self.cells = np.asarray(known[self.block.element_dofs].all(axis=0))
-
-    def matrix(self, integrand: Any) -> sp.csr_array:
-        """Assemble a symmetric form (u, v, x) over the elements inside."""
-        field = self.block.field
-        order = field.quadrature or 2 * int(field.element.maxdeg)
-        pair = {"u": self.space, "v": self.space}
-        form = Form("norm", integrand, pair, field.mesh, order)
-        if self.cells is not None:
-            form = form.on(np.flatnonzero(self.cells))
-        if not form.constant:
-            raise ObservationError("Tikhonov: the norm may not depend on time or inputs.")
-        return form.matrix("v", "u")
-
-    @cached_property
-    def bends(self) -> bool:
-        """True if the element provides second derivatives."""
-        return self.block.bends
-
-    @cached_property
-    def inner(self) -> Any:
-        """Mask of coefficients with all elements inside, without those on the mesh boundary."""
-        touched = np.zeros(self.block.size, dtype=bool)
-        if self.cells is not None:
-            touched[self.block.element_dofs[:, ~self.cells]] = True
-        touched[self.block.boundary] = True
-        return ~touched
-
-
-def penalty_matrix(norm: str | Integrand, observed: BoundSensors, basis: Array) -> sp.csr_array:
+def penalty_matrix(norm: str | Integrand, observed: Observed, basis: Array) -> sp.csr_array:
     """Return the matrix of |v|^2 on all coefficients, shape (n, n)."""
     if norm == "X":
         free = sp.diags_array(observed.X.free)
         return sp.csr_array(free @ observed.X.gram @ free)
-    inside = _Inside(observed, basis)
+    space = observed.state
+    if len(space.fields) > 1:
+        raise ObservationError(
+            "Tikhonov: norm 'V' and forms know states of one component; take norm='X'."
+        )
+    block, _ = space.component()
+    inside = _inside(block, basis) if observed.observation.nodal else None
+
+    def matrix(integrand: Any) -> sp.csr_array:
+        order = block.field.quadrature or 2 * int(block.field.element.maxdeg)
+        form = Form("norm", integrand, {"u": space, "v": space}, block.field.mesh, order)
+        if not form.constant:
+            raise ObservationError("Tikhonov: the norm may not depend on time or inputs.")
+        return (form if inside is None else form.on(np.flatnonzero(inside))).matrix("v", "u")
+
     if callable(norm):
-        matrix = inside.matrix(norm)
-        if abs(matrix - matrix.T).max() > 1e-10 * abs(matrix).max():
+        found = matrix(norm)
+        if abs(found - found.T).max() > 1e-10 * abs(found).max():
             raise ObservationError(
                 "Tikhonov: the form of the norm is not symmetric; write one that does not change "
                 "when its two functions are exchanged."
             )
-        return matrix
-    if inside.bends:
-        return inside.matrix(lambda u, v, x: ddot(hess(u), hess(v)))
+        return found
+    if block.bends:
+        return matrix(lambda u, v, x: ddot(hess(u), hess(v)))
     try:
-        stiff = inside.matrix(lambda u, v, x: dot(grad(u), grad(v)))
-        mass = inside.matrix(lambda u, v, x: u * v)
+        stiff = matrix(lambda u, v, x: dot(grad(u), grad(v)))
+        mass = matrix(lambda u, v, x: u * v)
     except Exception as error:
         raise ObservationError(
             "Tikhonov: norm 'V' knows scalar states with gradients; give a form (u, v, x) instead."
@@ -524,6 +316,16 @@ def penalty_matrix(norm: str | Integrand, observed: BoundSensors, basis: Array) 
     # Diagonal lumping, since the row sums of the mass matrix vanish at the vertices of quadratic
     # elements.
     lumped = mass.diagonal() * (mass.sum() / (mass.diagonal().sum() or 1.0))
-    rows = inside.inner & (lumped > 0)
+    rows = lumped > 0
+    rows[block.boundary] = False
+    if inside is not None:  # coefficients at the border of omega
+        rows[block.element_dofs[:, ~inside]] = False
     scale = np.where(rows, 1.0 / np.where(rows, lumped, 1.0), 0.0)
     return sp.csr_array(stiff.T @ sp.diags_array(scale) @ stiff)
+
+
+def _inside(block: FieldBlock, basis: Array) -> Mask:
+    """Return the mask of elements of which all coefficients are observed or known."""
+    known = np.asarray(np.abs(basis).any(axis=1))
+    known[block.fixed] = True
+    return np.asarray(known[block.element_dofs].all(axis=0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -31,158 +31,6 @@ def shift_names(sensor: str, dimension: int) -> list[str]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Shift:
-    """Effect of shifting one sensor along one coordinate by d: a quadratic interpolant.
-
-    The quadratic interpolates the values at -a, 0 and b (`below`, `above`), about a standard
-    deviation to each side. A derivative is not used because u has none at a node of linear
-    elements. At the end of the mesh a or b is 0, and the interpolant is the straight line to the
-    other side; where both are, at the top of a disc say, the shift has no effect. The rows `low`
-    and `high` evaluate the differences of u there to u at 0, shape (1, n); `column` is the position
-    of the shift in q.
-    """
-
-    sensor: int
-    column: int
-    below: float
-    above: float
-    low: sp.csr_array
-    high: sp.csr_array
-
-    def weights(self, d: float) -> tuple[float, float]:
-        """Return the interpolation weights of both differences at a shift d."""
-        a, b = self.below, self.above
-        if a == 0.0 or b == 0.0:
-            return (-d / a if a else 0.0), (d / b if b else 0.0)
-        return d * (d - b) / (a * (a + b)), d * (d + a) / (b * (a + b))
-
-    def slopes(self, d: float) -> tuple[float, float]:
-        """Return the derivatives of `weights`."""
-        a, b = self.below, self.above
-        if a == 0.0 or b == 0.0:
-            return (-1.0 / a if a else 0.0), (1.0 / b if b else 0.0)
-        return (2.0 * d - b) / (a * (a + b)), (2.0 * d + a) / (b * (a + b))
-
-
-class PlacedObserved(Observed):
-    """Bound point sensors at uncertain positions: linear in u, quadratic in the shifts.
-
-    `rows` is the matrix of the values that some sensors would measure at other places
-    (`Points.rows`), `at` the stated coordinates of all sensors, shape (sensors, d). The positions
-    of the sensors in `uncertain` have shifts of standard deviation `std`.
-    """
-
-    def __init__(
-        self,
-        observation: Observation,
-        state: FunctionSpace,
-        X: HilbertSpace,
-        parameter: FunctionSpace,
-        rows: Callable[[FunctionSpace, Array, Sequence[int]], sp.csr_array],
-        at: Array,
-        uncertain: Sequence[str],
-        std: float,
-    ) -> None:
-        super().__init__(observation, state, X, parameter)
-        block, _ = state.component(observation.of)
-        labels = parameter.labels
-
-        def difference(sensor: int, point: Array, start: Array) -> sp.csr_array:
-            values = rows(state, np.array([start, point]), [sensor, sensor])
-            return sp.csr_array(values[[1]] - values[[0]])
-
-        self.shifts = []
-        for name in uncertain:
-            sensor = self.names.index(name)
-            for axis, shift in enumerate(shift_names(name, at.shape[1])):
-                label = f"{POSITION}[{shift}]"
-                if label not in labels:
-                    raise ObservationError(
-                        f"the model has no unknown '{label}' for the position of sensor '{name}': "
-                        "an Identifier adds it for assimilated sensors; elsewhere take "
-                        "model.with_unknowns(observation.unknowns)."
-                    )
-                start = at[sensor]
-                # The interpolation points lie a standard deviation away, where the shift is
-                # expected, and are moved into the mesh at its boundary.
-                low, high = (_reached(block, start, axis, step) for step in (-std, std))
-                below, above = float(start[axis] - low[axis]), float(high[axis] - start[axis])
-                ends = (difference(sensor, low, start), difference(sensor, high, start))
-                self.shifts.append(_Shift(sensor, labels[label], below, above, *ends))
-
-    @property
-    def linear(self) -> bool:
-        return False
-
-    def predict(self, u: Array, q: Array, moment: Moment) -> Array:
-        z = super().predict(u, q, moment)
-        weights = [shift.weights(float(q[shift.column])) for shift in self.shifts]
-        np.add.at(z, self._sensors, np.ravel(weights) * (self._differences @ u))
-        return z
-
-    def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
-        direct = self._direct(moment)
-        H_q = np.zeros((self.size, self.parameter.dim)) if direct is None else direct.copy()
-        differences = (self._differences @ u).reshape(-1, 2)
-        weights = []
-        for shift, difference in zip(self.shifts, differences, strict=True):
-            d = float(q[shift.column])
-            H_q[shift.sensor, shift.column] += float(difference @ shift.slopes(d))
-            weights.append(shift.weights(d))
-        return self._placed(np.ravel(weights)), H_q
-
-    def _placed(self, weights: Array) -> sp.csr_array:
-        """Return G at the shifted positions, for weights of all differences, shape (sensors, n)."""
-        pattern, parts = self._parts
-        values = parts[0] + weights @ parts[1:]
-        return sp.csr_array((values, pattern.indices, pattern.indptr), shape=pattern.shape)
-
-    @cached_property
-    def _sensors(self) -> IntArray:
-        """Number of the sensor of each row of `_differences`."""
-        return np.repeat([shift.sensor for shift in self.shifts], 2)
-
-    @cached_property
-    def _differences(self) -> sp.csr_array:
-        """Rows `low` and `high` of each shift in turn, shape (2 shifts, n)."""
-        ends = [end for shift in self.shifts for end in (shift.low, shift.high)]
-        return sp.csr_array(sp.vstack(ends, format="csr"))
-
-    @cached_property
-    def _parts(self) -> tuple[sp.csr_array, Array]:
-        """Pattern of G at shifted positions, and values on it of G and of each difference."""
-        rows = self._sensors
-        sums = sp.csr_array(
-            (np.ones(len(rows)), (rows, np.arange(len(rows)))), shape=(self.size, len(rows))
-        )
-        pattern = sp.csr_array(abs(self.G) + sums @ abs(self._differences))
-        pattern.sort_indices()
-        row = np.repeat(np.arange(self.size), np.diff(pattern.indptr))
-        values = [np.asarray(self.G[row, pattern.indices])]
-        for k, sensor in enumerate(rows):
-            own = np.asarray(self._differences[np.full_like(row, k), pattern.indices])
-            values.append(np.where(row == sensor, own, 0.0))
-        return pattern, np.array(values)
-
-
-def _reached(block: FieldBlock, start: Array, axis: int, step: float) -> Array:
-    """Return start + step along an axis, or the last point on the way that is in the mesh."""
-    least, most = 0.0, 1.0  # a share below `NEAR` counts as zero: on the end of the mesh
-
-    def at(share: float) -> Array:
-        point: Array = start.copy()
-        point[axis] += share * step
-        return point
-
-    if block.contains(at(most)):
-        return at(most)
-    while most - least > NEAR:
-        middle = 0.5 * (least + most)
-        least, most = (middle, most) if block.contains(at(middle)) else (least, middle)
-    return at(least) if least > 0.0 else start
-
-
-@dataclass(frozen=True, eq=False)
 class Moving(Observation):
     """Point sensors with positions from the stream, z_k(t) = u(x_k(t), t).
 
@@ -202,6 +50,7 @@ class Moving(Observation):
     """
 
     positions: Mapping[str, str | Sequence[str]]
+    portable = True
 
     def __post_init__(self) -> None:
         if not self.positions:
@@ -221,13 +70,7 @@ class Moving(Observation):
     def optional(self) -> frozenset[str]:
         return frozenset(name for names in self.channels for name in names)
 
-    @property
-    def portable(self) -> bool:
-        return True
-
-    def bind(
-        self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace
-    ) -> MovingObserved:
+    def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
         return MovingObserved(self, state, X, parameter)
 
 
@@ -235,6 +78,7 @@ class MovingObserved(Observed):
     """Bound `Moving` sensors: G depends on the moment."""
 
     observation: Moving
+    linear = False
 
     def _prepare(self) -> None:
         self.block = self.observation.scalar_block(self.state)
@@ -251,10 +95,6 @@ class MovingObserved(Observed):
 
     def _names(self) -> tuple[str, ...]:
         return self.observation.names(len(self.observation.positions))
-
-    @property
-    def linear(self) -> bool:
-        return False
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
         G, seen = self._at(moment)
@@ -330,6 +170,7 @@ class Points(Observation):
     direct: Mapping[str, Direct] = field(default_factory=dict)
     position_std: float | Mapping[str, float] | None = None
     component: int | Sequence[int] | None = None
+    portable = True
 
     def __post_init__(self) -> None:
         if len(self.points) == 0:
@@ -389,10 +230,8 @@ class Points(Observation):
         return {POSITION: Scalars(names, Normal(0.0, self.shift_std))}
 
     def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
-        if self.position_std is None:
-            return Observed(self, state, X, parameter)
-        at, uncertain = self.positions, self.uncertain
-        return PlacedObserved(self, state, X, parameter, self.rows, at, uncertain, self.shift_std)
+        kind = Observed if self.position_std is None else PlacedObserved
+        return kind(self, state, X, parameter)
 
     def names(self, count: int) -> tuple[str, ...]:
         if isinstance(self.points, Mapping):
@@ -406,10 +245,6 @@ class Points(Observation):
     @property
     def directs(self) -> Mapping[str, Direct]:
         return self.direct
-
-    @property
-    def portable(self) -> bool:
-        return True
 
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
         mapping = isinstance(self.points, Mapping)
@@ -454,6 +289,142 @@ class Points(Observation):
 
 
 @dataclass(frozen=True, eq=False)
+class _Shift:
+    """Effect of shifting one sensor along one coordinate by d: a quadratic interpolant.
+
+    The quadratic interpolates the values at -a, 0 and b (`below`, `above`), about a standard
+    deviation to each side. A derivative is not used because u has none at a node of linear
+    elements. At the end of the mesh a or b is 0, and the interpolant is the straight line to the
+    other side; where both are, at the top of a disc say, the shift has no effect. The rows `low`
+    and `high` evaluate the differences of u there to u at 0, shape (1, n); `column` is the position
+    of the shift in q.
+    """
+
+    sensor: int
+    column: int
+    below: float
+    above: float
+    low: sp.csr_array
+    high: sp.csr_array
+
+    def weights(self, d: float) -> tuple[float, float]:
+        """Return the interpolation weights of both differences at a shift d."""
+        a, b = self.below, self.above
+        if a == 0.0 or b == 0.0:
+            return (-d / a if a else 0.0), (d / b if b else 0.0)
+        return d * (d - b) / (a * (a + b)), d * (d + a) / (b * (a + b))
+
+    def slopes(self, d: float) -> tuple[float, float]:
+        """Return the derivatives of `weights`."""
+        a, b = self.below, self.above
+        if a == 0.0 or b == 0.0:
+            return (-1.0 / a if a else 0.0), (1.0 / b if b else 0.0)
+        return (2.0 * d - b) / (a * (a + b)), (2.0 * d + a) / (b * (a + b))
+
+
+class PlacedObserved(Observed):
+    """Bound `Points` at uncertain positions: linear in u, quadratic in the shifts."""
+
+    observation: Points
+    linear = False
+
+    def _prepare(self) -> None:
+        points, at, std = self.observation, self.observation.positions, self.observation.shift_std
+        block, _ = self.state.component(points.of)
+        names, labels = points.names(len(at)), self.parameter.labels
+
+        def difference(sensor: int, point: Array) -> sp.csr_array:
+            values = points.rows(self.state, np.array([at[sensor], point]), [sensor, sensor])
+            return sp.csr_array(values[[1]] - values[[0]])
+
+        self.shifts = []
+        for name in points.uncertain:
+            sensor = names.index(name)
+            for axis, shift in enumerate(shift_names(name, at.shape[1])):
+                label = f"{POSITION}[{shift}]"
+                if label not in labels:
+                    raise ObservationError(
+                        f"the model has no unknown '{label}' for the position of sensor '{name}': "
+                        "an Identifier adds it for assimilated sensors; elsewhere take "
+                        "model.with_unknowns(observation.unknowns)."
+                    )
+                start = at[sensor]
+                # The interpolation points lie a standard deviation away, where the shift is
+                # expected, and are moved into the mesh at its boundary.
+                low, high = (_reached(block, start, axis, step) for step in (-std, std))
+                below, above = float(start[axis] - low[axis]), float(high[axis] - start[axis])
+                ends = (difference(sensor, low), difference(sensor, high))
+                self.shifts.append(_Shift(sensor, labels[label], below, above, *ends))
+
+    def predict(self, u: Array, q: Array, moment: Moment) -> Array:
+        z = super().predict(u, q, moment)
+        weights = [shift.weights(float(q[shift.column])) for shift in self.shifts]
+        np.add.at(z, self._sensors, np.ravel(weights) * (self._differences @ u))
+        return z
+
+    def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
+        direct = self._direct(moment)
+        H_q = np.zeros((self.size, self.parameter.dim)) if direct is None else direct.copy()
+        differences = (self._differences @ u).reshape(-1, 2)
+        weights = []
+        for shift, difference in zip(self.shifts, differences, strict=True):
+            d = float(q[shift.column])
+            H_q[shift.sensor, shift.column] += float(difference @ shift.slopes(d))
+            weights.append(shift.weights(d))
+        return self._placed(np.ravel(weights)), H_q
+
+    def _placed(self, weights: Array) -> sp.csr_array:
+        """Return G at the shifted positions, for weights of all differences, shape (sensors, n)."""
+        pattern, parts = self._parts
+        values = parts[0] + weights @ parts[1:]
+        return sp.csr_array((values, pattern.indices, pattern.indptr), shape=pattern.shape)
+
+    @cached_property
+    def _sensors(self) -> IntArray:
+        """Number of the sensor of each row of `_differences`."""
+        return np.repeat([shift.sensor for shift in self.shifts], 2)
+
+    @cached_property
+    def _differences(self) -> sp.csr_array:
+        """Rows `low` and `high` of each shift in turn, shape (2 shifts, n)."""
+        ends = [end for shift in self.shifts for end in (shift.low, shift.high)]
+        return sp.csr_array(sp.vstack(ends, format="csr"))
+
+    @cached_property
+    def _parts(self) -> tuple[sp.csr_array, Array]:
+        """Pattern of G at shifted positions, and values on it of G and of each difference."""
+        rows = self._sensors
+        sums = sp.csr_array(
+            (np.ones(len(rows)), (rows, np.arange(len(rows)))), shape=(self.size, len(rows))
+        )
+        pattern = sp.csr_array(abs(self.G) + sums @ abs(self._differences))
+        pattern.sort_indices()
+        row = np.repeat(np.arange(self.size), np.diff(pattern.indptr))
+        values = [np.asarray(self.G[row, pattern.indices])]
+        for k, sensor in enumerate(rows):
+            own = np.asarray(self._differences[np.full_like(row, k), pattern.indices])
+            values.append(np.where(row == sensor, own, 0.0))
+        return pattern, np.array(values)
+
+
+def _reached(block: FieldBlock, start: Array, axis: int, step: float) -> Array:
+    """Return start + step along an axis, or the last point on the way that is in the mesh."""
+    least, most = 0.0, 1.0  # a share below `NEAR` counts as zero: on the end of the mesh
+
+    def at(share: float) -> Array:
+        point: Array = start.copy()
+        point[axis] += share * step
+        return point
+
+    if block.contains(at(most)):
+        return at(most)
+    while most - least > NEAR:
+        middle = 0.5 * (least + most)
+        least, most = (middle, most) if block.contains(at(middle)) else (least, middle)
+    return at(least) if least > 0.0 else start
+
+
+@dataclass(frozen=True, eq=False)
 class Averages(Observation):
     """Mean values over regions or boundaries, z_k = (integral of u over omega_k) / |omega_k|.
 
@@ -469,6 +440,7 @@ class Averages(Observation):
     """
 
     regions: Mapping[str, Predicate | str]
+    portable = True
 
     def __post_init__(self) -> None:
         given: Any = self.regions
@@ -488,10 +460,6 @@ class Averages(Observation):
 
     def names(self, count: int) -> tuple[str, ...]:
         return tuple(self.regions)
-
-    @property
-    def portable(self) -> bool:
-        return True
 
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
         block = self.scalar_block(state)
@@ -542,6 +510,7 @@ class LineIntegrals(Observation):
 
     lines: Mapping[str, tuple[Any, Any]]
     mean: bool = False
+    portable = True
 
     def __post_init__(self) -> None:
         if not self.lines:
@@ -549,10 +518,6 @@ class LineIntegrals(Observation):
 
     def names(self, count: int) -> tuple[str, ...]:
         return tuple(self.lines)
-
-    @property
-    def portable(self) -> bool:
-        return True
 
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
         block = self.scalar_block(state)

@@ -44,6 +44,7 @@ class Subdomain(Observation):
     """
 
     omega: Predicate
+    nodal = True
 
     def elements(self, state: FieldBlock) -> IntArray:
         """Return the elements that lie in omega."""
@@ -141,10 +142,6 @@ class Subdomain(Observation):
         found = self.selected(block)
         entries = (np.ones(len(found)), (np.arange(len(found)), found))
         return state.widen(sp.csr_array(entries, shape=(len(found), block.size)), self.of)
-
-    @property
-    def nodal(self) -> bool:
-        return True
 
 
 def _interpolated(given: Any, points: Array, what: str) -> tuple[Array, bool]:

@@ -107,8 +107,6 @@ class TwinTracker:
         operators.
     gain, damping
         Those of the law: ||e||_Q^2 is divided by the gain, and the rule gives theta.
-    reconstruct
-        Function z -> u_alpha as used by the law; default that of the observation.
 
     Raises
     ------
@@ -131,7 +129,6 @@ class TwinTracker:
         spaces: Spaces,
         gain: float | Literal["auto"] = 1.0,
         damping: Damping | None = None,
-        reconstruct: Callable[[Array], Array] | None = None,
     ) -> None:
         model = twin.model
         if gain == "auto":
@@ -148,7 +145,6 @@ class TwinTracker:
         self.spaces = spaces
         self.gain = gain
         self.damping = damping
-        self.reconstruct = reconstruct
         self.errors: list[Errors] = []
         self._last: tuple[float, Array] | None = None
 
@@ -158,10 +154,7 @@ class TwinTracker:
         exact, split = twin.u(estimate.t), spaces.split
         boundary = twin.model.impose(np.zeros(len(exact)), Moment(estimate.t))
         z = spaces.observed.linearised(np.asarray(z, dtype=float), estimate.u)
-        if self.reconstruct is not None:
-            u_alpha = self.reconstruct(z)
-        else:
-            u_alpha = spaces.observed.reconstruct(z, boundary=boundary).u
+        u_alpha = spaces.observed.reconstruct(z, boundary=boundary).u
         error = estimate.u - exact
         # Estimate and truth have the same Dirichlet values, so the error lies in the tangent space.
         # The data error d is defined for the free coefficients, hence without the boundary values.
@@ -203,24 +196,12 @@ def _values(errors: Sequence[Errors], get: Callable[[Errors], float]) -> Array:
     return np.array([get(item) for item in errors])
 
 
-def _asked(
-    data: Data, c: Constants, sigma: float
-) -> tuple[Callable[[Errors, float], float], Callable[[Errors], float]]:
-    """Return the least theta, for a constant c_1, and the least nu required by a section."""
-
-    def theta(item: Errors, c1: float) -> float:
-        if data == "exact":
-            return theta_exact(c, item.p.V, item.r, c1)
-        if data == "noisy":
-            return theta_noisy(c, item.e, item.p.V, item.r, item.d, sigma, c1)
-        return theta_smoothed(c, item.p.V, item.r_alpha, item.d.V, item.rate, c1)
-
-    def nu(item: Errors) -> float:
-        if data == "exact":
-            return nu_exact(c, item.e, item.p)
-        return nu_noisy(c, item.e, item.p, item.d.V)
-
-    return theta, nu
+def _least_theta(data: Data, c: Constants, sigma: float, item: Errors, c1: float) -> float:
+    if data == "exact":
+        return theta_exact(c, item.p.V, item.r, c1)
+    if data == "noisy":
+        return theta_noisy(c, item.e, item.p.V, item.r, item.d, sigma, c1)
+    return theta_smoothed(c, item.p.V, item.r_alpha, item.d.V, item.rate, c1)
 
 
 def conditions(
@@ -260,7 +241,6 @@ def conditions(
     if not n:
         raise ConfigurationError("conditions: the tracker has not seen any estimate.")
     first, second, third = CONDITIONS[data]
-    asked_theta, asked_nu = _asked(data, c, sigma)
 
     def line(name: str, holds: Any, remedy: str) -> Check:
         return Check.at_least(f"{name} (share of samples)", np.mean(holds), 1.0, remedy)
@@ -268,7 +248,7 @@ def conditions(
     theta = _values(errors, lambda item: item.theta) * (1 + ROUNDING)
     lines = []
     for name, level in [(first, 0.0), *([(second, c1)] if c1 > 0 else [])]:
-        asked = np.array([asked_theta(item, level) for item in errors])
+        asked = np.array([_least_theta(data, c, sigma, item, level) for item in errors])
         zero = _values(errors, lambda item: item.r_alpha.X - floor * item.u_alpha) <= 0.0
         asked[zero] = 0.0
         lines.append(
@@ -280,7 +260,13 @@ def conditions(
                 "`SmoothedBound`, or go on: the bound is sufficient, not necessary.",
             )
         )
-    asked = _values(errors, asked_nu)
+    exact = data == "exact"
+    asked = np.array(
+        [
+            nu_exact(c, item.e, item.p) if exact else nu_noisy(c, item.e, item.p, item.d.V)
+            for item in errors
+        ]
+    )
     lines.append(
         line(
             third,
@@ -397,17 +383,14 @@ def stopping_time(errors: Sequence[Errors], c: Constants) -> float:
 
 
 def noise_size(
-    spaces: Spaces,
-    std: Array,
-    reconstruction: Array | sp.csr_array | None = None,
-    u_alpha: Array | None = None,
+    spaces: Spaces, std: Array, reconstruction: Array | sp.csr_array | None = None
 ) -> Norms:
-    """Return the root mean square of the data error d in X, VX~ and V~ from a noise level.
+    """Return the root mean square of the propagated noise G_alpha eta in X, VX~ and V~.
 
-    d = G_alpha eta + (G_alpha G - R) u*: the propagated noise, and the regularisation error of the
-    exact state. The second part is estimated by applying G_alpha G - R to u_alpha. Beyond 2000
-    sensors the first is the mean over 32 fixed random vectors, with a relative standard error of at
-    most 1/8, which decreases with the number of independent coefficients that contribute.
+    The data error is d = G_alpha eta + (G_alpha G - R) u*, with the regularisation error of the
+    exact state as its second part. Beyond 2000 sensors the mean is over 32 fixed random vectors,
+    with a relative standard error of at most 1/8, which decreases with the number of independent
+    coefficients that contribute.
 
     Parameters
     ----------
@@ -416,8 +399,6 @@ def noise_size(
     reconstruction
         Matrix of G_alpha, shape (n, sensors); default G^+. Raw nodal noise is about 1/h^2 times
         larger in V~ than in X, so without smoothing T* is reached immediately.
-    u_alpha
-        Reconstruction of the sample, shape (n,); None: omit the second part.
     """
     matrix = spaces.split.inverse if reconstruction is None else reconstruction
     if matrix.shape[1] != len(std):
@@ -430,9 +411,6 @@ def noise_size(
         factor = matrix @ (std[:, None] * signs) / np.sqrt(PROBES)
     else:
         factor = (matrix.toarray() if sp.issparse(matrix) else np.asarray(matrix)) * std
-    if u_alpha is not None:
-        lost = matrix @ (spaces.observed.G @ u_alpha) - u_alpha
-        factor = np.column_stack([factor, lost])
     return spaces.observed_part.root_mean_square(factor)
 
 
@@ -450,8 +428,7 @@ def reconstruction_matrix(observed: Observed, alpha: float | None = None) -> Arr
                 f"reconstruction_matrix: {inverse.shape[1]} sensors, up to {MOST_COLUMNS} are "
                 "possible; G^+ as a sparse matrix is observed.split().inverse."
             )
-        matrix: Array = inverse.toarray()
-        return matrix
+        return inverse.toarray()
     if alpha is not None and isinstance(rule, Tikhonov):
         rule = replace(rule, alpha=float(alpha))
     apply = rule.prepare(observed, np.ones(observed.size, dtype=bool))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,10 +18,8 @@ from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier
 from livepde.laws.damping import Constants, Damping, Norms
 from livepde.linalg import Array
-from livepde.model import Model
-from livepde.observation import Observed
 from livepde.result import Estimate
-from livepde.samples import Sample, sample_of
+from livepde.samples import Channels, Sample, sample_of
 from livepde.streams import Twin
 
 DEFINITIONS = {
@@ -117,11 +115,12 @@ class OnlineTracker:
     def __init__(self, identifier: Identifier, window: float, noise: Any = None) -> None:
         self.identifier = identifier
         self.window = window
-        law = identifier.law
+        law, model = identifier.law, identifier.model
+        self.channels = Channels(model.channels, identifier.observed, identifier.validation)
         self.gain = float(getattr(law, "gain", 1.0))
         damping = getattr(law, "damping", None)
         self.damping: Damping | None = damping if isinstance(damping, Damping) else None
-        self.spaces = Spaces.of(identifier.model, identifier.observed, law)
+        self.spaces = Spaces.of(model, identifier.observed, law)
         self.excitation = Excitation(self.spaces, window, self.gain)
         self.excited = self.excitation.init()
         self.moments: list[_Moment] = []
@@ -136,8 +135,8 @@ class OnlineTracker:
     def add(self, estimate: Estimate, sample: Sample) -> None:
         """Record one estimate; failed steps and samples without measurements are ignored."""
         model, observed = self.identifier.model, self.identifier.observed
-        self.inputs |= _inputs_of(sample, model)
-        z = _measured(sample, observed)
+        z, _, _, named = self.channels.parse(sample.z, sample.inputs or {})
+        self.inputs |= {name: named[name] for name in model.channels if name in named}
         z[~np.isfinite(estimate.innovation)] = np.nan
         if not estimate.status.ok or not np.isfinite(z).any():
             return
@@ -147,7 +146,11 @@ class OnlineTracker:
         if direct is not None:
             z = z - direct @ estimate.q
         z = observed.linearised(z, estimate.u)
-        u_alpha, alpha = self._reconstruct(z, boundary)
+        if self.damping is None:  # a law without a damping rule uses no G_alpha
+            u_alpha, alpha = observed.split(np.isfinite(z)).reconstruct(z, boundary), 0.0
+        else:
+            found = observed.reconstruct(z, boundary=boundary)
+            u_alpha, alpha = found.u, found.alpha
         r = observed.split(np.isfinite(z)).R @ (estimate.u - boundary) - u_alpha
         part = self.spaces.observed_part
         norms = part.norms(r)
@@ -169,32 +172,11 @@ class OnlineTracker:
                 self.states = self.states[::2]
                 self._every *= 2
 
-    def _reconstruct(self, z: Array, boundary: Array) -> tuple[Array, float]:
-        """Return u_alpha and alpha as used by a law with a damping rule; else G^+ z."""
-        observed = self.identifier.observed
-        if self.damping is None:
-            return observed.split(np.isfinite(z)).reconstruct(z, boundary), 0.0
-        found = observed.reconstruct(z, boundary=boundary)
-        return found.u, found.alpha
-
     def _noise_size(self, z: Array, u_alpha: Array, alpha: float) -> Norms | None:
         """Return the size of d, with G_alpha linearised at an alpha within a factor of 1.5."""
         if self.noise is None:
             return None
         observed, part = self.identifier.observed, self.spaces.observed_part
-        given = self.noise(z) if callable(self.noise) else self.noise
-        std = np.broadcast_to(np.asarray(given, dtype=float), (observed.size,))
-        key, matrix = self._matrix(alpha)
-        noise = None if callable(self.noise) else self._sizes.get(key)
-        if noise is None:
-            noise = self._sizes[key] = error_bounds.noise_size(self.spaces, std, matrix)
-        if alpha == 0:
-            return noise
-        lost = part.norms(matrix @ (observed.G @ u_alpha) - u_alpha)
-        return Norms(*(float(np.hypot(getattr(noise, n), getattr(lost, n))) for n in NORMS))
-
-    def _matrix(self, alpha: float) -> tuple[int, Array | sp.csr_array]:
-        """Return the matrix of G_alpha, and the key under which it is kept."""
         # One matrix for each octave of alpha: the discrepancy principle gives another alpha for
         # every sample, and each matrix is dense.
         key = round(float(np.log2(alpha))) if alpha > 0 else 0
@@ -202,13 +184,21 @@ class OnlineTracker:
             if len(self._matrices) >= MATRICES:
                 self._matrices.clear()
                 self._sizes.clear()
-            observed = self.identifier.observed
             self._matrices[key] = (
                 error_bounds.reconstruction_matrix(observed, alpha)
                 if alpha > 0
                 else observed.split().inverse
             )
-        return key, self._matrices[key]
+        matrix = self._matrices[key]
+        if callable(self.noise) or key not in self._sizes:
+            given = self.noise(z) if callable(self.noise) else self.noise
+            std = np.broadcast_to(np.asarray(given, dtype=float), (observed.size,))
+            self._sizes[key] = error_bounds.noise_size(self.spaces, std, matrix)
+        noise = self._sizes[key]
+        if alpha == 0:
+            return noise
+        lost = part.norms(matrix @ (observed.G @ u_alpha) - u_alpha)
+        return Norms(*(float(np.hypot(getattr(noise, n), getattr(lost, n))) for n in NORMS))
 
     @property
     def moment(self) -> Moment:
@@ -236,21 +226,6 @@ class OnlineTracker:
         if get in ("X", "VX", "V"):
             return np.array([getattr(item.r, get) for item in self.moments])
         return np.array([getattr(item, get) for item in self.moments])
-
-
-def _measured(sample: Sample, observed: Observed) -> Array:
-    """Return a sample's measurements as an array, NaN where missing."""
-    if not isinstance(sample.z, Mapping):
-        return np.array(sample.z, dtype=float).reshape(observed.size)
-    values = [sample.z.get(name) for name in observed.names]
-    return np.array([np.nan if value is None else value for value in values], dtype=float)
-
-
-def _inputs_of(sample: Sample, model: Model) -> dict[str, float]:
-    named = dict(sample.z) if isinstance(sample.z, Mapping) else {}
-    named |= dict(sample.inputs or {})
-    found = {name: named[name] for name in model.channels if name in named}
-    return {name: float(value) for name, value in found.items()}
 
 
 def theory_report(
@@ -290,7 +265,12 @@ def theory_report(
         window = max((items[-1].t - items[0].t) / 20.0, 1e-12)
     tracker = OnlineTracker(identifier, window, noise)
     notes: list[str] = []
-    followed = _followed(twin, tracker, notes)
+    followed = None
+    if twin is not None:
+        try:
+            followed = error_bounds.TwinTracker(twin, tracker.spaces, tracker.gain, tracker.damping)
+        except ConfigurationError as error:
+            notes.append(str(error))
     for sample in items:
         estimate = identifier.step(sample.t, sample.z, sample.inputs)
         tracker.add(estimate, sample)
@@ -310,37 +290,23 @@ def theory_report(
     return TheoryReport(tuple(tables), tuple(reports), tuple(notes), found, spectrum, stopping)
 
 
-def _followed(
-    twin: Twin | None, tracker: OnlineTracker, notes: list[str]
-) -> error_bounds.TwinTracker | None:
-    if twin is None:
-        return None
-    try:
-        return error_bounds.TwinTracker(twin, tracker.spaces, tracker.gain, tracker.damping)
-    except ConfigurationError as error:
-        notes.append(str(error))
-        return None
-
-
 def _constants(tracker: OnlineTracker, tables: list[Table], notes: list[str]) -> Constants | None:
     try:
         c = tracker.constants()
     except LivepdeError as error:
         notes.append(f"The constants cannot be computed: {error}")
         return None
+    how = dict.fromkeys(DEFINITIONS, "an eigenvalue")
+    how |= dict.fromkeys(("C_A", "observed_ratio", "hidden_ratio"), "a bound")
+    how |= dict.fromkeys(("c_M", "C_M", "c_N", "C_N"), "1 in these norms")
+    how |= dict.fromkeys(c.sampled, "estimated from below, by sampling")
     rows = [
-        (name, float(getattr(c, name)), text, label, _how(name, c))
+        (name, float(getattr(c, name)), text, label, how[name])
         for name, (label, text) in DEFINITIONS.items()
     ]
     columns = ("constant", "value", "definition", "in the paper", "is")
     tables.append(Table("Constants of the discretised model", columns, rows))
     return c
-
-
-def _how(name: str, c: Constants) -> str:
-    if name in c.sampled:
-        return "estimated from below, by sampling"
-    return "a bound" if name in ("C_A", "observed_ratio", "hidden_ratio") else "an eigenvalue"
 
 
 def _residual_tables(tracker: OnlineTracker, notes: list[str]) -> list[Table]:
