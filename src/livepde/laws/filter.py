@@ -33,8 +33,8 @@ from livepde.laws.noise_rows import (
     grades,
     lines,
     pieces,
-    with_input_noise,
-    with_unread_inputs,
+    unread_inputs,
+    with_input_errors,
 )
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadows import ShadowSet
@@ -247,12 +247,13 @@ class Filter:
     ) -> tuple[FilterState, Steps, StepFailed | None]:
         """Return the same of members that divide their substeps alike."""
         x, end, taken, failure = self._divided(x, span)
-        if failure is None and self.problem.input_noise:
-            end, failure = with_input_noise(self.carried, self.problem, x, end, span)
+        noise = self.problem.input_noise
+        if failure is None and noise:
+            end, failure = with_input_errors(self.carried, x, end, span, noise)
         # A refit of constant unknowns takes held values as exact, and so does their filter.
-        uncertain = self.moves or bool(self.problem.input_noise)
-        if failure is None and uncertain and self.input_gaps(span) is not None:
-            end, failure = with_unread_inputs(self.carried, self.problem, x, end, span)
+        if failure is None and (self.moves or noise) and self.input_gaps(span) is not None:
+            off = unread_inputs(self.problem, x, span)
+            end, failure = with_input_errors(self.carried, x, end, span, off)
             end = self.compressed(end) if end.U.shape[1] > self.rank else end
         if failure is not None:
             return x, taken, failure

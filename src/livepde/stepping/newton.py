@@ -38,22 +38,18 @@ class StagePoint(Protocol):
     @property
     def y(self) -> Array:
         """The iterate, shape (n,)."""
-        ...
 
     @property
     def residual(self) -> Array:
         """The residual, shape (n,)."""
-        ...
 
     @property
     def size(self) -> float:
         """Dual norm of the residual, relative to that of the largest term of the equation."""
-        ...
 
     @property
     def resolved(self) -> bool:
         """False if the residual is too large to resolve a small difference in the equation."""
-        ...
 
 
 Point = TypeVar("Point", bound=StagePoint)
@@ -64,15 +60,12 @@ class StageEquation(Protocol[Point]):
 
     def evaluate(self, y: Array) -> Point:
         """Return the evaluation at y."""
-        ...
 
     def factor(self, at: Point) -> Factor:
         """Return the factorised Jacobian at an iterate."""
-        ...
 
     def limited(self, at: Point, allowed: float) -> bool:
         """Return True if rounding errors alone keep the residual above `allowed`."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -110,21 +110,12 @@ class Judge:
         self.batch = batch_of(self.numbers)
         self._eye = np.eye(rank)[None]
 
-    def widened(self, more: int) -> Judge:
-        """Return the judge of a filter whose square root has more rows."""
-        sizes = self.sensors, self.unknowns, self.n, self.rank + more
-        return Judge(self.dictionary, *sizes, still=self.recorded)
-
     def start(self) -> Ledger:
         """Return the ledger of one member before any sample."""
         followed = self.unknowns if self.recorded else 0
         n = self.n if self.terms else 0
         counts = len(self.dictionary), followed, self.terms, n, self.windows, self.rank
         return Ledger.start(self.sensors, *counts, self.batch, self.numbers)
-
-    def answered(self, members: int) -> bool:
-        """Return whether missing terms are looked for: each costs a solve for each member."""
-        return self.terms > 0 and members <= MOST_MEMBERS
 
     def add(self, ledger: Ledger, sample: ScoredSample) -> tuple[Array, Ledger]:
         """Return M of the next sample before its update, the identity, and the ledger."""
@@ -135,7 +126,9 @@ class Judge:
         if np.count_nonzero(ledger.waiting % self.batch) < members:
             M, ledger = self._begin_batch(ledger, sample)
         reached = _reached(ledger, sample.at.t)
-        if self.answered(members) and np.count_nonzero(reached) < members:
+        # Missing terms cost a solve for each member.
+        follows = self.terms > 0 and members <= MOST_MEMBERS
+        if follows and np.count_nonzero(reached) < members:
             ledger = self._extend_answers(ledger, sample)
         rows, at, waiting = ledger.rows.copy(), self._at, ledger.waiting
         alone = members == 1
