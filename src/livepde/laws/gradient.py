@@ -92,10 +92,6 @@ class GradientParts:
         self.stage(present).solver.prepare()
         return self
 
-    def closed(self, excitation: ExcitationLevel) -> bool:
-        """Return true if the gate is closed: q is held."""
-        return self.gate is not None and self.gate.closed(excitation)
-
     def excited(
         self, excitation: ExcitationLevel, w: Array, u: Array, q: Array, moment: Moment
     ) -> ExcitationLevel:
@@ -221,7 +217,7 @@ def constant_parts(
     ).prepared()
 
 
-def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> GradientParts:
+def _tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> GradientParts:
     """Return the parts of the law that tunes itself."""
     _require_linear_readings(problem)
     model, observation = problem.model, problem.observed.observation
@@ -230,7 +226,8 @@ def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Gradi
             "GradientLaw: gain='auto' accumulates what is known of constant unknowns, and here "
             "one moves (evolution=): give a number for gain, or use SensitivityLaw."
         )
-    whole = _sees_all(problem)
+    hidden = abs(problem.observed.split().P) @ model.X.free
+    whole = not (hidden > ROUNDING).any()
     if not whole and model.form_A.differentiates("u"):
         raise LawError(
             "GradientLaw: gain='auto' needs data of the whole state where A contains derivatives "
@@ -251,11 +248,6 @@ def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Gradi
         metric=metric,
         memory=metric.pattern,
     ).prepared()
-
-
-def _sees_all(problem: Problem) -> bool:
-    hidden = abs(problem.observed.split().P) @ problem.model.X.free
-    return not bool((hidden > ROUNDING).any())
 
 
 def _for_scheme(newton: Newton, problem: Problem) -> Newton:
@@ -395,7 +387,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
 
     def _parts(self, problem: Problem) -> GradientParts:
         if self.gain == "auto":
-            return tuned_parts(problem, self.nu, self.N_op, self.newton)
+            return _tuned_parts(problem, self.nu, self.N_op, self.newton)
         return constant_parts(
             problem,
             self.gain,
@@ -442,7 +434,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
         refused = int(np.count_nonzero(readings.wild > state.readings.wild))
         interval = work.problem.linear_readings(interval, state.u)
         given, state = state, replace(state, readings=readings)
-        closed = work.closed(state.excitation)
+        closed = work.gate is not None and work.gate.closed(state.excitation)
         new, report = self._advanced(work, state, interval, closed)
         # A q that prior and data cannot explain is not believed: the step is taken again with q
         # held.
