@@ -75,11 +75,12 @@ class GradientParts:
 
     def stage(self, present: Array) -> CoupledStage:
         """Return the coupled stage for the sensors present."""
-        return self._stages.get(present.tobytes(), lambda: self._made(present))
 
-    def _made(self, present: Array) -> CoupledStage:
-        terms = StageTerms(self.forms(present), self.damping, self.memory)
-        return CoupledStage(terms, self.newton)
+        def made() -> CoupledStage:
+            terms = StageTerms(self.forms(present), self.damping, self.memory)
+            return CoupledStage(terms, self.newton)
+
+        return self._stages.get(present.tobytes(), made)
 
     def forms(self, present: Array) -> StageForms:
         """Return the forms of the stage for the sensors present."""

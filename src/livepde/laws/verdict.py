@@ -149,26 +149,23 @@ def with_discretisation(verdict: Verdict, shadows: ShadowSet | None, s: ShadowSt
     """Return a verdict that names the errors of the discretisation which are not held."""
     missing = "the discretisation: shadows = None" if shadows is None else shadows.unfollowed
     if shadows is not None and s.coarse[0]:
-        verdict = verdict.with_findings([_coarse(s, shadows.most)])
+        worst = float(s.coarsest[0])
+        text, remedy = FINDINGS["step"].filled(
+            count=int(s.coarse[0]),
+            steps=int(s.count[0]),
+            size=ALLOWED * worst,
+            allowed=ALLOWED,
+            parts=shadows.most,
+        )
+        # The shift by errors that are so large is estimated with few correct digits.
+        severity: Severity = "caution" if worst > COARSE else "note"
+        found = Finding("step", severity, text, "time step", worst, remedy=remedy)
+        verdict = verdict.with_findings([found])
     if not missing or not verdict.judged:
         return verdict
     text, _ = FINDINGS["untested"].filled(what=missing)
     more = Finding("untested", "note", text, "discretisation")
     return verdict.with_untested(missing).with_findings([more])
-
-
-def _coarse(s: ShadowState, most: int) -> Finding:
-    coarse, worst = int(s.coarse[0]), float(s.coarsest[0])
-    text, remedy = FINDINGS["step"].filled(
-        count=coarse,
-        steps=int(s.count[0]),
-        size=ALLOWED * worst,
-        allowed=ALLOWED,
-        parts=most,
-    )
-    # The shift by errors that are so large is estimated with few correct digits.
-    severity: Severity = "caution" if worst > COARSE else "note"
-    return Finding("step", severity, text, "time step", worst, remedy=remedy)
 
 
 def with_columns(verdict: Verdict, columns: Columns | str) -> Verdict:
@@ -318,13 +315,9 @@ def step_findings(counts: Mapping[str, int]) -> Iterator[Finding]:
         if not count:
             continue
         text, _ = FINDINGS[code].filled(count=count, samples=samples)
-        severity = _severity(code, count / samples)
-        remedy = Status(code).remedy
-        yield Finding("steps", severity, text, code, float(count), remedy=remedy)
-
-
-def _severity(code: str, share: float) -> Severity:
-    # A right model departs in one of a million cases: there is no mishap of that sort.
-    if share > (SOME if code == "departed" else MOST):
-        return "do not trust"
-    return "caution" if code == "departed" or share > SOME else "note"
+        share, departed = count / samples, code == "departed"
+        # A right model departs in one of a million cases: there is no mishap of that sort.
+        severity: Severity = "caution" if departed or share > SOME else "note"
+        if share > (SOME if departed else MOST):
+            severity = "do not trust"
+        yield Finding("steps", severity, text, code, float(count), remedy=Status(code).remedy)

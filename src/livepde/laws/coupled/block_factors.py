@@ -42,6 +42,7 @@ from livepde.linalg import (
     approximate_inverse,
     gmres,
 )
+from livepde.linalg.solvers import check_finite
 
 LARGE = 4000  # unknowns u and q together, from which a matrix that is not banded goes by blocks
 TOLERANCE = 1e-4  # of GMRES, relative to the first approximation: Newton goes on from there
@@ -141,8 +142,7 @@ class BlockSolver(StageSolver):
     def factorise(self, name: str, matrix: sp.csr_array, approximate: bool = False) -> Factor:
         """Return the factor of a matrix, by an engine for symmetric ones if it is positive."""
         matrix.sort_indices()
-        if not np.isfinite(matrix.data).all():
-            raise LinearAlgebraError("The matrix holds values that are not finite.")
+        check_finite(matrix.data)
         if abs(matrix - matrix.T).max() <= ROUNDING * abs(matrix).max():
             try:
                 return self._engine(name, matrix, True, approximate).factorise(matrix.data)
