@@ -77,9 +77,10 @@ class Reduction:
                 count = min(counts[name], int(inner.free.sum()))
                 mass = model.parameter_mass[part, part]
                 phi, _ = inner.modes(count, mass)
-                if modes == "auto":
+                if modes == "auto":  # as many as have all of the variance but `LEFT_OUT`
                     weights = mass.diagonal()
-                    phi = phi[:, : _enough(phi, weights, inner.spread(weights, phi))]
+                    enough = (1.0 - LEFT_OUT) * inner.spread(weights, phi)
+                    phi = phi[:, : 1 + int((np.cumsum(weights @ phi**2) < enough).sum())]
             else:
                 phi = np.eye(item.size) * item.unknown.prior.latent_std
             # One block of modes for each copy: of a periodic unknown the mean and the harmonics.
@@ -318,13 +319,6 @@ def _mode_counts(modes: int | str | dict[str, int], fields: object) -> dict[str,
     if any(count < 1 or count % 1 for count in counts.values()):
         raise LawError(f"SensitivityLaw: modes must be whole numbers of at least 1; got {modes!r}.")
     return counts
-
-
-def _enough(phi: Array, mass: Array, variance: float) -> int:
-    """Return how many modes hold all of the prior variance but a share of `LEFT_OUT`."""
-    held = np.cumsum(mass @ phi**2)
-    short = int((held < (1.0 - LEFT_OUT) * variance).sum())
-    return min(short + 1, len(held))
 
 
 @lru_cache(maxsize=64)

@@ -141,7 +141,12 @@ def _descended(samples: _FixedInterval, best: _SmootherPass | None) -> _Smoother
             "smaller dt_max, or a prior closer to what the run found."
         )
     for _ in range(ITERATIONS):
-        target, std = _smoothed_unknowns(samples.work, best)
+        # One by one: the filters of all samples at once, with their states, may need much memory.
+        found = [
+            (_reduced(samples.work, x, x.da), np.linalg.norm(x.C[0], axis=0))
+            for x in _backward(best, best.points[-1].x)
+        ]
+        target, std = map(np.array, zip(*reversed(found), strict=True))
         step = target - best.trajectory
         if (np.abs(step) <= CONVERGED * std + ROUNDING).all():
             break
@@ -152,17 +157,6 @@ def _descended(samples: _FixedInterval, best: _SmootherPass | None) -> _Smoother
             break
         best = better
     return best
-
-
-def _smoothed_unknowns(work: SensitivityWork, best: _SmootherPass) -> tuple[Array, Array]:
-    """Return reduced unknowns given all samples, and their standard deviations, as a trajectory."""
-    # One by one: the filters of all samples at once, with their states, may need much memory.
-    found = [
-        (_reduced(work, x, x.da), np.linalg.norm(x.C[0], axis=0))
-        for x in _backward(best, best.points[-1].x)
-    ]
-    a, std = zip(*reversed(found), strict=True)
-    return np.array(a), np.array(std)
 
 
 def _backward(best: _SmootherPass, after: FilterState) -> Iterator[FilterState]:

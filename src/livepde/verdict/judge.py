@@ -230,13 +230,6 @@ class Judge:
         told: Array = rows[:, :, at["d"]] + (rows[:, :, None, at["a"]] @ Y)[:, :, 0]
         return Y * used[:, :, None], told * used
 
-    @staticmethod
-    def _unit(ledger: Ledger, k: int, t: float) -> float:
-        """Return the usual interval of a member, or the time since its first sample."""
-        known = float(ledger.times[k, 1])
-        since = t - float(ledger.rows[k, 0, 0])
-        return known if np.isfinite(known) else since if since > 0.0 else 1.0
-
     def _with_interval(self, ledger: Ledger, rows: Array, there: Mask) -> Ledger:
         """Return the ledger with the usual interval, the first one, and the first predictions."""
         if np.isfinite(ledger.times[:, 1]).all() and np.isfinite(ledger.first).all():
@@ -349,7 +342,10 @@ class Judge:
             # Without a better guess, what the sensors showed first is where nothing is lost.
             first = ledger.first[k, np.isfinite(ledger.first[k])]
             rest = float(first.sum()) / max(len(first), 1)
-            unit = self._unit(ledger, k, t)
+            # The usual interval, or the time since the first sample.
+            unit, since = float(ledger.times[k, 1]), t - float(ledger.rows[k, 0, 0])
+            if not np.isfinite(unit):
+                unit = since if since > 0.0 else 1.0
             now = Now(sample.u[k], q[k], sample.at.member(k), unit, rest)
             if not np.isfinite(reached[k, 1]):
                 p[k] = process.start()
