@@ -11,7 +11,6 @@ import numpy as np
 import scipy  # scipy.optimize is slow to load, and rarely needed
 
 from livepde.fem import Moment
-from livepde.laws.coupled.block_factors import BlockSolver
 from livepde.laws.coupled.equation import (
     Metric,
     StageData,
@@ -20,7 +19,7 @@ from livepde.laws.coupled.equation import (
     StageSolver,
     StageTerms,
 )
-from livepde.laws.coupled.monolithic import BilinearSolver, MonolithicSolver
+from livepde.laws.coupled.stage_solvers import BilinearSolver, BlockSolver, MonolithicSolver
 from livepde.linalg import Array, Factor
 from livepde.stepping import Near, Newton, Solution, StepFailed
 
