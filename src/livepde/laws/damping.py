@@ -277,13 +277,7 @@ def theta_exact(c: Constants, p_V: float, r: Norms, c1: float = 0.0) -> float:
 
 
 def theta_noisy(
-    c: Constants,
-    e: float,
-    p_V: float,
-    r: Norms,
-    d: Norms,
-    sigma: float = 0.0,
-    c1: float = 0.0,
+    c: Constants, e: float, p_V: float, r: Norms, d: Norms, sigma: float = 0.0, c1: float = 0.0
 ) -> float:
     """Return the least theta for noisy data, Assumptions ass:mu_nu and, with c1, ass:mu_noisy.
 

@@ -616,10 +616,7 @@ def _under_way(
 
 @nonfinite_allowed()  # such a trajectory is refused
 def _run(
-    future: Future[SensitivityState],
-    work: SensitivityWork,
-    options: Refit,
-    state: SensitivityState,
+    future: Future[SensitivityState], work: SensitivityWork, options: Refit, state: SensitivityState
 ) -> None:
     try:
         future.set_result(refitted_now(work, options, state))

@@ -115,12 +115,7 @@ class HalvedMesh:
         return np.asarray(self.model.initial(given, moment) - coarse)
 
     def in_readings(
-        self,
-        u: Array,
-        q: Array,
-        coarse: Array,
-        difference: Array,
-        moment: Callable[[int], Moment],
+        self, u: Array, q: Array, coarse: Array, difference: Array, moment: Callable[[int], Moment]
     ) -> Array:
         """Return what sensors on the halved mesh read more than on the given one.
 

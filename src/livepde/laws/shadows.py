@@ -43,12 +43,7 @@ from livepde.laws.shadow_kinds import (
 )
 from livepde.laws.step_diagnostics import Diagnostics, stacked
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
-from livepde.stepping import (
-    TINY,
-    MemberStage,
-    Moments,
-    Span,
-)
+from livepde.stepping import TINY, MemberStage, Moments, Span
 from livepde.verdict import Shifts
 
 FIRST = 16  # steps that are all shadowed: where a run begins the error changes from step to step
@@ -323,14 +318,7 @@ class ShadowSet:
         return changed(x, shadows=changed(s, **parts)), np.where(rows, 0.0, seen)
 
     def update(
-        self,
-        x: FilterState,
-        U: Array,
-        C: Array,
-        left: Array,
-        weights: Array,
-        off: Array,
-        t: float,
+        self, x: FilterState, U: Array, C: Array, left: Array, weights: Array, off: Array, t: float
     ) -> ShadowState:
         """Return the shadows after a sample.
 

@@ -65,12 +65,7 @@ def judge_of(
     still = kept and not (reduction.moves or problem.input_noise)
     model = problem.model
     dictionary = Dictionary(
-        model,
-        problem.observed,
-        noise,
-        reduction.stay,
-        dearer=verdict is True,
-        windows=len(WINDOWS),
+        model, problem.observed, noise, reduction.stay, dearer=verdict is True, windows=len(WINDOWS)
     )
     sizes = problem.observed.size, reduction.size, model.X.dim
     # Noise of inputs, and errors of the start, add rows before they are compressed.

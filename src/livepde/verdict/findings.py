@@ -52,10 +52,7 @@ SETTING = 1.0  # the same if inputs are readings: no interval holds that
 HOLD = "hold"
 LISTED = 5  # unknowns in a sentence
 REFINE = {
-    "step": (
-        "the time step",
-        "Reduce `steps.dt_max`, or use a second-order scheme.",
-    ),
+    "step": ("the time step", "Reduce `steps.dt_max`, or use a second-order scheme."),
     "mesh": ("the mesh", "Refine the mesh (`mesh.cells`) where the state varies most."),
     "input": ("the linear interpolation of inputs", "Sample these inputs more often."),
 }

@@ -379,11 +379,7 @@ class StageTerms:
         return norms
 
     def norms(
-        self,
-        r: Array,
-        Mr: Array,
-        mass_r: Array,
-        observed: Callable[[], Residual] | None = None,
+        self, r: Array, Mr: Array, mass_r: Array, observed: Callable[[], Residual] | None = None
     ) -> Residual:
         """Return the norms of r that a damping rule may use."""
         tests = self.forms.tests
