@@ -23,12 +23,12 @@ import numpy as np
 from livepde.fem import Channel
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gate import Gate
-from livepde.laws.member_arrays import changed
 from livepde.laws.policies import Refit
 from livepde.laws.refit import WILD, Found, near_most, near_neighbours, refitted
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, nonfinite_allowed
+from livepde.linalg.member_arrays import changed
 from livepde.verdict import Cause, channel_setting
 from livepde.verdict.directions import boundary_lifts
 from livepde.verdict.sentences import LIKELY, amount_of, estimating, table_of

@@ -25,7 +25,6 @@ from scipy.linalg import lapack
 
 from livepde.laws.filter_state import FilterState, along, extended, with_rows
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed, join, product, put, take
 from livepde.laws.member_sensors import Anchor, MemberSensors
 from livepde.laws.noise_rows import (
     NoiseRows,
@@ -39,6 +38,7 @@ from livepde.laws.noise_rows import (
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadows import ShadowSet
 from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg.member_arrays import changed, join, product, put, take
 from livepde.stepping import Interval, MemberStage, Span, StageOfMembers, StepFailed, advance
 from livepde.verdict import Judge
 

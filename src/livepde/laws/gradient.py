@@ -45,7 +45,6 @@ from livepde.model import h1_form
 from livepde.stepping import Interval, Newton, advance
 
 ROUNDING = 1e-9  # of entries of P, which are at most about one
-SAME = 1e-9  # of a step: times that are the same but for rounding
 MOST_STAGES = 8  # kept for different sets of present sensors
 
 

@@ -23,10 +23,10 @@ from livepde.laws.assimilation import absorb, assimilate
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState, along, coordinates
 from livepde.laws.history import first_interval, intervals_since
-from livepde.laws.member_arrays import changed, put_each, take
 from livepde.laws.sensitivity_state import NEVER, SensitivityState, SensitivityWork, new_window
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, Mask
+from livepde.linalg.member_arrays import changed, put_each, take
 from livepde.stepping import Interval
 
 AGREED = 0.5  # standard deviations between reference and estimate at which the steps stop

@@ -16,9 +16,9 @@ import scipy.sparse as sp
 
 from livepde.laws.filter_state import FilterState
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array, Mask, RowProduct, row_product
+from livepde.linalg.member_arrays import changed
 from livepde.model import Model, h1_form
 from livepde.observation import Observed
 from livepde.spaces import HilbertSpace

@@ -33,9 +33,9 @@ import numpy as np
 from livepde.fem import Moment
 from livepde.laws.filter_state import FilterState, with_rows
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg.member_arrays import changed
 from livepde.stepping import Advance, Span, StepFailed
 
 SHORT = 1e-3  # steps over relaxation times below which a path is that of a random walk

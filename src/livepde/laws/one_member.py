@@ -23,7 +23,6 @@ from livepde.laws.iterated_smoother import (
     placed,
 )
 from livepde.laws.law import Report, Status
-from livepde.laws.member_arrays import changed
 from livepde.laws.policies import Guards, Jumps
 from livepde.laws.sensitivity_state import (
     SensitivityState,
@@ -35,6 +34,7 @@ from livepde.laws.sensitivity_state import (
     without_past,
 )
 from livepde.laws.step_diagnostics import Diagnostics
+from livepde.linalg.member_arrays import changed
 from livepde.stepping import Interval
 
 NEAR_ONSETS = (-8, -6, -4, -3, -2, -1, 0, 1, 2, 3)  # of a first guess of when a jump was

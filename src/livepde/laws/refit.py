@@ -27,7 +27,6 @@ from livepde.laws.filter_state import FilterState
 from livepde.laws.history import intervals_since
 from livepde.laws.iterated_smoother import HOLDS, apart, iterate_starts, usual
 from livepde.laws.law import numerical
-from livepde.laws.member_arrays import changed, put_each, take
 from livepde.laws.policies import Refit
 from livepde.laws.sensitivity_state import (
     FitState,
@@ -39,6 +38,7 @@ from livepde.laws.sensitivity_state import (
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, Mask, nonfinite_allowed
+from livepde.linalg.member_arrays import changed, put_each, take
 
 NEIGHBOURS = 3  # in time, to each side of a value
 FEW = 2 * NEIGHBOURS  # values of a sensor up to which all count as near

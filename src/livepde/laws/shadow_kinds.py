@@ -14,10 +14,10 @@ import scipy.sparse as sp
 from livepde.fem import FieldBlock, Moment
 from livepde.laws.filter_state import FilterState, ShadowState
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed, put, take, where
 from livepde.laws.noise_rows import grades, pieces
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array, IntArray, Mask, compact
+from livepde.linalg.member_arrays import changed, put, take, where
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.stepping import (

@@ -27,7 +27,6 @@ from livepde.errors import LawError, LivepdeError
 from livepde.fem import Moment
 from livepde.laws.filter_state import FilterState, ShadowState, along
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed, product, put, take
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadow_kinds import (
     HELD,
@@ -43,6 +42,7 @@ from livepde.laws.shadow_kinds import (
 )
 from livepde.laws.step_diagnostics import Diagnostics, stacked
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
+from livepde.linalg.member_arrays import changed, product, put, take
 from livepde.stepping import TINY, MemberStage, Moments, Span
 from livepde.verdict import Shifts
 

@@ -31,9 +31,9 @@ from livepde.laws.assimilation import GateDecision, absorb
 from livepde.laws.filter_state import FilterState, coordinates, unaccompanied, unjudged
 from livepde.laws.iterated_smoother import Window, expecting, missed, moved, placed
 from livepde.laws.law import FixedInterval
-from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array, Mask, nonfinite_allowed
+from livepde.linalg.member_arrays import changed
 from livepde.stepping import KeptFactors, Span
 
 ITERATIONS = 6  # Gauss-Newton steps at most

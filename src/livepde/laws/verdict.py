@@ -12,7 +12,6 @@ from livepde.laws.columns import Columns, likely_columns
 from livepde.laws.filter import Filter, reported_factors
 from livepde.laws.filter_state import PAUSE, SETTLED, FilterState, ShadowState
 from livepde.laws.law import Fit, Problem, Status
-from livepde.laws.member_arrays import changed
 from livepde.laws.model_errors import model_errors
 from livepde.laws.noise_rows import input_rank
 from livepde.laws.reduction import Reduction
@@ -21,6 +20,7 @@ from livepde.laws.shadow_kinds import ALLOWED
 from livepde.laws.shadows import ShadowSet
 from livepde.laws.stored_samples import StoredSamples
 from livepde.linalg import Array, IntArray, nonfinite_allowed
+from livepde.linalg.member_arrays import changed
 from livepde.records import STATUS_CODES
 from livepde.stepping import MOST_SUBSTEPS
 from livepde.verdict import (

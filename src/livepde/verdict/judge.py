@@ -26,16 +26,16 @@ estimate of the unknowns for each unit of the cause.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from livepde.linalg import Array, Mask, nonfinite_allowed
+from livepde.linalg.member_arrays import changed, where
 from livepde.stepping import Moments
 from livepde.verdict.directions import JUMP, Dictionary, Now, stride
 from livepde.verdict.evidence import causes_of, quiet
-from livepde.verdict.ledger import WINDOWS, Ledger, batch_of, blocked, changed, summed
+from livepde.verdict.ledger import WINDOWS, Ledger, batch_of, blocked, summed
 
 MOST_MEMBERS = 16  # of a fleet in which missing terms are looked for
 MOST_RECORDED = 400  # numbers in a block of the record of the unknowns
@@ -269,7 +269,7 @@ class Judge:
         if full.any():
             found, settled = self.summed_up(ledger, sample.M)
             w[full] = found[full]
-            ledger = settled if full.all() else _where(full, settled, ledger)
+            ledger = where(full, settled, ledger)
         w = self._begin_windows(ledger, sample, ledger.due & begins[:, None], w)
         kept = np.zeros_like(ledger.w)
         kept[:, :r] = w[:, : self.rank]
@@ -404,16 +404,6 @@ def _whitening(Y: Array) -> tuple[Array, Array]:
         scale /= np.where(values > 0.0, values, 1.0)
         axes = Yt @ axes
     return axes, scale[..., None]
-
-
-def _where(chosen: Mask, one: Ledger, other: Ledger) -> Ledger:
-    """Return a ledger whose chosen members are of one, the rest of another."""
-
-    def either(name: str) -> Any:
-        first, second = getattr(one, name), getattr(other, name)
-        return np.where(chosen.reshape(-1, *(1,) * (first.ndim - 1)), first, second)
-
-    return Ledger(**{item.name: either(item.name) for item in fields(Ledger)})
 
 
 def _sensitivity(C: Array, Y: Array) -> Array:
