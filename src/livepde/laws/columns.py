@@ -318,10 +318,7 @@ class _Trials:
         self.vain = len(self.base) if columns.state.fit.screened[0] else 0
 
     def refitted(self, samples: StoredSamples) -> Found | None:
-        """Return the end of a search.
-
-        It does not start from other points if that was no use in the fit of the run, or before.
-        """
+        """Return the end of a search; it begins at no other points where that was no use before."""
         found = refitted(samples, self.options, last=False, screened=self.vain)
         if found is not None and found.screened:
             self.vain = len(samples)

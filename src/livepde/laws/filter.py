@@ -148,10 +148,7 @@ class Filter:
         return q
 
     def _with_noise(self, x: FilterState, h: float, noise: NoiseRows | None) -> FilterState:
-        """Return the filter state with the unknowns predicted over a time h; u stays as it is.
-
-        Their process noise stands in new rows of the square root, in the same order for every h.
-        """
+        """Return the state with the unknowns predicted over a time h, their noise in new rows."""
         end = self.unknowns_after(x, h)
         if noise is None:
             return end
@@ -572,10 +569,7 @@ def robust_factors(reduction: Reduction, x: FilterState) -> tuple[Array, Array]:
 
 
 def reported_factors(filter_: Filter, x: FilterState) -> tuple[Array, Array]:
-    """Return a square root [U C] of the covariance that is reported, as `robust_factors` does.
-
-    It has one row more for the discretisation error, where shadows follow it.
-    """
+    """Return `robust_factors` with a row more for the discretisation error, as reported."""
     U, C = robust_factors(filter_.reduction, x)
     if filter_.shadows is None:
         return U, C

@@ -584,13 +584,13 @@ def _allowed(
             rows = zip(labels, range(part.start, part.stop), strict=True)
             for label, k in rows:
                 numbers = [float(value[k]), *(float(end[k]) for end in ends), float(wider[k])]
-                yield Allowed(label, unit, *numbers, of_sensor=name in own)
+                yield Allowed.of(label, unit, numbers, of_sensor=name in own)
             continue
         size = float(np.sqrt((value[part] ** 2).mean()))
         off = [float(np.sqrt(((end[part] - value[part]) ** 2).mean())) for end in ends]
         numbers = [size, size - off[0], size + off[1], size - off[2], size + off[3]]
         numbers.append(float(np.sqrt((wider[part] ** 2).mean())))
-        yield Allowed(name, unit, *numbers, of_sensor=name in own)
+        yield Allowed.of(name, unit, numbers, of_sensor=name in own)
 
 
 def linear_model(

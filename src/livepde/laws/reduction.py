@@ -240,12 +240,9 @@ class Reduction:
         return q if np.count_nonzero(inside) == q.size else np.minimum(np.maximum(q, lower), upper)
 
     def held(self, q: Array) -> Array:
-        """Return how many latent parameters would lie too far from the prior, (...) for (..., m).
-
-        Bounds that a user has set do not count.
-        """
+        """Return how many latent parameters are too far from the prior, (...) for (..., m)."""
         lower, upper = self.ends
-        bounds = self.problem.model.latent.bounds
+        bounds = self.problem.model.latent.bounds  # those that a user has set do not count
         return np.asarray(
             (((q < lower) & (lower > bounds[0])) | ((q > upper) & (upper < bounds[1]))).sum(axis=-1)
         )
@@ -285,10 +282,7 @@ class Reduction:
         return left
 
     def rest(self, age: float, drift: float) -> Array:
-        """Return the standard deviation of latent coefficients in the omitted modes, (m,).
-
-        These coefficients keep their prior, and have moved for a time `age`.
-        """
+        """Return standard deviations of the prior in the omitted modes at an age, (m,)."""
         if age == 0.0 or not self._left_out.any():
             return np.asarray(np.sqrt(self._left_out))
         grown = []

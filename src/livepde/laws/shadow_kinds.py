@@ -227,11 +227,9 @@ class StepTolerance:
         return np.array(states), np.array(parts)
 
     def excess(self, error: Array, x: FilterState, span: Span) -> Array:
-        """Return the sizes of errors of the state after a span, (members, n), over what is allowed.
-
-        A reading counts by its noise if that is smaller than the noise of its sensor.
-        """
+        """Return the sizes of errors of the state after a span, (members, n), over the allowed."""
         (states, parts), at = self._tests, span.end
+        # A reading counts by its noise if that is smaller than the noise of its sensor.
         noise = self.noise if span.noise is None else np.fmin(self.noise, span.noise)
         members, k = len(error), x.C.shape[2]
         U = np.broadcast_to(states, (members, *states.shape))

@@ -155,16 +155,12 @@ class SuperLUSolver:
 
     pattern: Pattern
     symmetric: bool = False
+    definite: bool = False  # it does not check the signs of pivots
     price: float = 30.0
 
     @property
     def name(self) -> str:
         return "SuperLU (SciPy)" + (", symmetric mode" if self.symmetric else "")
-
-    @property
-    def definite(self) -> bool:
-        """False: SuperLU does not check the signs of pivots."""
-        return False
 
     def factorise(self, data: Array) -> SuperLUFactor:
         """Factorise; raise `LinearAlgebraError` for a singular or non-finite matrix.

@@ -400,10 +400,7 @@ class BandedStage(MemberStage):
         return offset
 
     def _driven(self, u: Array, offset: Array | None, step: BandedStep, inputs: Array) -> Array:
-        """Return A(u) e_j = A_j u + offset_j of each unknown, (members, unknowns, n).
-
-        It drives the tangents.
-        """
+        """Return what drives the tangents, A(u) e_j = A_j u + offset_j, (members, unknowns, n)."""
         parts, count = self._slopes(u).reshape(len(u), -1, u.shape[1]), step.amounts.shape[1]
         found = parts
         if self._terms:

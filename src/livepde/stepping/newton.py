@@ -217,10 +217,7 @@ class _Iteration(Generic[Point]):
         return factor
 
     def _updated(self, at: Point, factor: Factor) -> tuple[Point, Array]:
-        try:
-            update = factor.solve(at.residual)
-        except LinearAlgebraError as error:
-            raise StepFailed("singular", str(error)) from error
+        update = solved(factor, at.residual)
         self.updates += 1
         new = self.equation.evaluate(at.y - update)
         if not math.isfinite(new.size):

@@ -179,10 +179,7 @@ def boundary_lifts(model: Model) -> dict[str, Array]:
 
 
 def flux_loads(model: Model, most: int | None = None) -> dict[str, Array]:
-    """Return boundary -> load of a flux of one through it, (n,), where no value is stated.
-
-    Of the first `most` boundaries of the mesh.
-    """
+    """Return loads of a flux of one, (n,), through those of `most` boundaries without a value."""
     ones, found = model.state_space.interpolate(1.0), {}
     for name in [str(one) for one in model.mesh.boundaries or {}][:most]:
         form: Any = On(name, lambda u, v, x: u * v)

@@ -160,8 +160,7 @@ class Judge:
     def summed_up(self, ledger: Ledger, M: Array) -> tuple[Array, Ledger]:
         """Return w and the ledger after all samples that wait are summed.
 
-        `M`: as it is now, (members, r, rank).
-        `w`: shape (members, r, windows times directions).
+        `M`: as it is now, (members, r, rank). `w`: (members, r, windows times directions).
         """
         members, at, due = len(ledger.seen), self._at, ledger.due
         # Only as many rows as some member has waiting are summed.

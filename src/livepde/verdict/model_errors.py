@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
@@ -36,6 +36,12 @@ class Allowed:
     wider: float  # width over that of the noise alone
     # Whether it is an error of a sensor, such as an offset, or a correction of an input
     of_sensor: bool = False
+
+    @classmethod
+    def of(cls, label: str, unit: str, numbers: Iterable[float], *, of_sensor: bool) -> Allowed:
+        """Return an unknown with its numbers in the order of the attributes."""
+        names = ("value", "low", "high", "plain_low", "plain_high", "wider")
+        return cls(label, unit, **dict(zip(names, numbers, strict=True)), of_sensor=of_sensor)
 
     @property
     def effect(self) -> float:

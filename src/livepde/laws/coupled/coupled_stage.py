@@ -30,11 +30,7 @@ ACCURACY = 1e-8  # relative, of theta: Newton goes on from there
 
 @dataclass(frozen=True, eq=False)
 class KeptFactor:
-    """Where a factor was made that goes from stage to stage.
-
-    The factor itself is made again from this where it is gone, after a restart say: the numbers
-    that follow are the same.
-    """
+    """Where a factor was made: where it is gone, as after a restart, the same is made again."""
 
     # Point, data and step of its Jacobian, shapes (n + m,) and (n,); empty if none is kept.
     y: Array
