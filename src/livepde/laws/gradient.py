@@ -112,29 +112,19 @@ class GradientParts:
         return self.tests.add(tested, equation())
 
 
+@dataclass(eq=False)
 class StageSequence:
     """The coupled stages of one interval, one after the other: a `Stage` for `advance`."""
 
-    def __init__(
-        self,
-        coupled: CoupledStage,
-        path: ObservedPath,
-        metric: MetricStep,
-        rate: Array | None,
-        kept: KeptFactor,
-        left: Array,
-        width: float,
-    ) -> None:
-        self.coupled = coupled
-        self.path = path
-        self.metric = metric
-        self.slope = rate
-        # Without a rate other sensors are present, or q is held now or was before: another matrix,
-        # so that the factor of the last stage does not serve.
-        self.kept = kept if rate is not None else KeptFactor.none()
-        self.left = left
-        self.width = width
-        self._last: tuple[StageProblem, float, StageIterate] | None = None
+    coupled: CoupledStage
+    path: ObservedPath
+    metric: MetricStep
+    slope: Array | None  # last change of (u - u_alpha, q) per unit of time; None: none predicts
+    kept: KeptFactor
+    # Residual of the last stage, and its step.
+    left: Array
+    width: float
+    _last: tuple[StageProblem, float, StageIterate] | None = None
 
     def __call__(self, c: Array, t: float, h: float) -> Array:
         """Return y = (u, q) at t of the stage that begins at c; raises `StepFailed`."""
@@ -472,10 +462,12 @@ class GradientLaw(Law[GradientParts, GradientState]):
 
         # u and q together, by coupled stages
         predicts = same and frozen == state.frozen
-        rate = state.rate if predicts else None
+        # Other sensors, or a q that is held now or was before, have another matrix: so that the
+        # factor of the last stage does not serve.
+        rate, kept = (state.rate, state.kept) if predicts else (None, KeptFactor.none())
         # While q is held its equation has a huge inner product: its residual is rounding.
         left = state.left if predicts and not frozen else 0.0 * state.left
-        stages = StageSequence(coupled, path, metric, rate, state.kept, left, state.width)
+        stages = StageSequence(coupled, path, metric, rate, kept, left, state.width)
         y = np.concatenate([state.u, state.q])
         end, steps, failure = advance(work.problem.control, stages, y, interval.t0, interval.t1)
         if failure is not None:

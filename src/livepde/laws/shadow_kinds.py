@@ -161,12 +161,12 @@ def _pointwise(given: Any) -> bool:
     return callable(given) or np.ndim(given) == 0
 
 
+@dataclass(frozen=True, eq=False)
 class _Prolonged(MemberStage):
     """A stage on the halved mesh that takes unknown fields as those of the mesh have them."""
 
-    def __init__(self, stage: MemberStage, unknowns: sp.csr_array) -> None:
-        self.stage = stage
-        self.unknowns = unknowns
+    stage: MemberStage
+    unknowns: sp.csr_array
 
     def twin(self) -> _Prolonged:
         return _Prolonged(self.stage.twin(), self.unknowns)

@@ -162,14 +162,14 @@ class Newton:
         return iteration.run(at, Near(at.y), self.tolerance, self.iterations)
 
 
+@dataclass(eq=False)
 class _Iteration(Generic[Point]):
     """Newton's iteration for one stage; `updates` counts over all of its attempts."""
 
-    def __init__(self, newton: Newton, equation: StageEquation[Point]) -> None:
-        self.newton = newton
-        self.equation = equation
-        self.updates = 0
-        self.made: tuple[Point, Factor] | None = None
+    newton: Newton
+    equation: StageEquation[Point]
+    updates: int = 0
+    made: tuple[Point, Factor] | None = None
 
     def run(self, at: Point, near: Near, allowed: float, factors: int) -> Solution[Point]:
         """Return the solution; raise `StepFailed` without convergence.
