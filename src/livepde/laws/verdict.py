@@ -26,7 +26,6 @@ from livepde.stepping import MOST_SUBSTEPS
 from livepde.verdict import (
     NOT_JUDGED,
     REFUSED,
-    WINDOWS,
     Dictionary,
     Finding,
     Judge,
@@ -64,9 +63,7 @@ def judge_of(
         return None
     still = kept and not (reduction.moves or problem.input_noise)
     model = problem.model
-    dictionary = Dictionary(
-        model, problem.observed, noise, reduction.stay, dearer=verdict is True, windows=len(WINDOWS)
-    )
+    dictionary = Dictionary(model, problem.observed, noise, reduction.stay, dearer=verdict is True)
     sizes = problem.observed.size, reduction.size, model.X.dim
     # Noise of inputs, and errors of the start, add rows before they are compressed.
     rows = rank + input_rank(problem) + problem.initial_rank

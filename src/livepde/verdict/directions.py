@@ -8,7 +8,7 @@ its size, to distinguish causes, and so costs a fraction of a step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias, cast
@@ -18,10 +18,11 @@ import scipy.sparse as sp
 
 from livepde.errors import ObservationError
 from livepde.fem import Inputs, Moment, On
-from livepde.linalg import Array, IntArray, RowProduct, row_product
+from livepde.linalg import Array, IntArray, row_product
 from livepde.model import Model
 from livepde.observation import CombinedObserved, Observed, Points
 from livepde.stepping import ForwardStage
+from livepde.verdict.ledger import WINDOWS
 
 FIXED = "the fixed boundary"  # constants of the model, which may be wrong as well
 
@@ -225,28 +226,6 @@ class ScoreDirection:
     at: float = np.nan  # coordinate of the sensor along the axis; NaN if it is not a position
 
 
-@dataclass(frozen=True, eq=False)
-class ForwardShifts:
-    """How readings change if sensors are shifted, as a matrix on the coefficients that matter."""
-
-    axes: int  # number of axes
-    # used, product: coefficients of the state, (m,), and the product of the matrix of all axes one
-    # after the other, (axes * sensors, m), with rows of them
-    used: IntArray
-    product: RowProduct
-
-    @classmethod
-    def of(cls, shifts: Sequence[sp.csr_array]) -> ForwardShifts:
-        """Return the value of the matrices of all axes, each (sensors, n)."""
-        rows = sp.csc_array(sp.vstack(shifts))
-        used = np.flatnonzero(np.diff(rows.indptr))
-        return cls(len(shifts), used, row_product(sp.csr_array(rows[:, used])))
-
-    def of_readings(self, u: Array) -> Array:
-        """Return the changes of readings with states u, (members, axes * sensors)."""
-        return self.product(u.take(self.used, axis=1))
-
-
 class Dictionary:
     """All directions of a model and its sensors.
 
@@ -256,7 +235,6 @@ class Dictionary:
     `noise`: standard deviation of each sensor.
     `unknowns`: labels of the coordinates that may jump, each with its place.
     `dearer`: with the directions that cost solves: terms that the process may lack.
-    `windows`: in how many windows sums are kept.
     """
 
     def __init__(
@@ -267,7 +245,6 @@ class Dictionary:
         unknowns: list[tuple[str, int]],
         *,
         dearer: bool,
-        windows: int,
     ) -> None:
         self.left_out: list[str] = []
         self.process = Process(model, observed, float(np.median(noise))) if dearer else None
@@ -280,7 +257,7 @@ class Dictionary:
         self.directions: list[ScoreDirection] = []
         self.parts: dict[str, slice] = {}
         # Every direction is a row and a column of sums of products, kept for each window.
-        room = MOST_SUMS // (windows * observed.size) - len(jumps) - len(terms)
+        room = MOST_SUMS // (len(WINDOWS) * observed.size) - len(jumps) - len(terms)
         self._add_sensors(model, observed, noise, room)
         self.jumps = [place for _, place in jumps]
         self._add("jump", [ScoreDirection("jump", label, JUMP) for label, _ in jumps])
@@ -318,7 +295,16 @@ class Dictionary:
             found = [ScoreDirection(kind, name, one, unit, k) for k, name, one, unit in each]
             self._add(kind, _within_reach(model, observed, found) if kind == "position" else found)
         self.own: IntArray = np.arange(len(self.directions)) % sensors  # sensor of each so far
-        self.shifts = ForwardShifts.of(shifts) if "position" in amplitudes else None
+        self.axes = len(shifts) if "position" in amplitudes else 0  # along which sensors may be off
+        if self.axes:
+            # The coefficients of the state that matter, and the matrices of all axes on them.
+            rows = sp.csc_array(sp.vstack(shifts))
+            self._used = np.flatnonzero(np.diff(rows.indptr))
+            self._moved = row_product(sp.csr_array(rows[:, self._used]))
+
+    def moved(self, u: Array) -> Array:
+        """Return changes of readings by shifts of sensors, (members, axes * sensors)."""
+        return self._moved(u.take(self._used, axis=1))
 
     def _add(self, part: str, directions: list[ScoreDirection]) -> None:
         """Append directions, and note their places."""

@@ -98,7 +98,7 @@ class Judge:
             "predicted": sensors,
             "Y": rank * sensors,
             "M": rank**2,
-            "moved": sensors * (dictionary.shifts.axes if dictionary.shifts else 0),
+            "moved": sensors * dictionary.axes,
             "answers": self.terms * sensors,
             "a": unknowns if self.recorded else 0,
             "C": unknowns**2 if self.recorded else 0,
@@ -140,8 +140,8 @@ class Judge:
             start, stop = at[name].start, at[name].stop
             row[:, start : start + part[0].size] = part.reshape(members, -1)
             row[:, start + part[0].size : stop] = 0.0  # rows that a square root lacks
-        if self.dictionary.shifts is not None:
-            row[:, at["moved"]] = self.dictionary.shifts.of_readings(sample.u)
+        if self.dictionary.axes:
+            row[:, at["moved"]] = self.dictionary.moved(sample.u)
         if self.terms:  # interpolated later on, many at once
             row[:, at["answers"]] = np.nan
         if self.recorded:
