@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from livepde.fem import Moment, Scalar, dot, grad
+from livepde.fem import Scalar, dot, grad
 from livepde.laws.filter_state import PAUSE
 from livepde.laws.policies import Refit
 from livepde.laws.refit import plausible
@@ -30,9 +30,12 @@ from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
 from livepde.model import Model
 from livepde.stepping import ForwardStage
 from livepde.verdict.directions import (
+    Load,
+    Now,
     boundary_lifts,
     flux_loads,
     force,
+    later,
     scaled_channel,
     sensor_shifts,
     stated_positions,
@@ -65,17 +68,6 @@ NEAR = 0.03  # posterior standard deviations within which a trajectory is that o
 QUANTILE = 1.96  # standard deviations to the end of a 95 % interval
 SHRINK = 10.0  # pairs of readings that the stated noise counts
 LEAST_LEVEL = 0.01  # least variance of the noise over the stated one that is believed
-
-Load: TypeAlias = Callable[["StatePoint"], Array]
-
-
-class StatePoint(NamedTuple):
-    """State, latent unknowns, time and inputs, and the change of the inputs in a unit of time."""
-
-    u: Array
-    q: Array
-    moment: Moment
-    rates: dict[str, float]
 
 
 class Answer(NamedTuple):
@@ -278,7 +270,7 @@ class ErrorColumns:
             due = (number + 1) % stride == 0 or number + 1 == len(spans) or number == 0
             if due:
                 moment = span.end.member(0)
-                now = StatePoint(x.u[0], q, moment, _rates(span))
+                now = Now(x.u[0], q, moment, rates=_rates(span))
                 if t > last:
                     share = max(0.5 * (t + last) - late, 0.0) / (end - late)
                     p = self._advanced(stage, p, now, t - last, share)
@@ -293,25 +285,18 @@ class ErrorColumns:
             found[:, :, column] = beyond_rounding(found[:, :, column], most)
         return found, states, predicted
 
-    def _advanced(
-        self, stage: ForwardStage, p: Array, now: StatePoint, h: float, share: float
-    ) -> Array:
+    def _advanced(self, stage: ForwardStage, p: Array, now: Now, h: float, share: float) -> Array:
         """Return the answers a time h later, shape (columns, n)."""
-        factor, rows = stage.linearised(now.u, now.q, h, now.moment)
-        free, known = self.model.X.free, np.asarray((self.model.mass @ p.T).T) / h
-        lifts = np.zeros_like(p)
+        loads, lifts = np.zeros_like(p), np.zeros_like(p)
         for first, (answer, course) in zip(self.first, self.answers, strict=True):
             own, weights = slice(first, first + course.size), course.at(share)[:, None]
             if answer.load is not None:
                 load = answer.load(now) if callable(answer.load) else answer.load
-                known[own] += weights * load
+                loads[own] = weights * load
             if answer.lift is not None:
                 lift = answer.lift(now) if callable(answer.lift) else answer.lift
                 lifts[own] = weights * lift
-        if lifts.any():
-            known -= np.asarray((rows @ lifts.T).T)
-        solved: Array = factor.solve((known * free).T).T
-        return solved * free + lifts
+        return later(stage, p, now, h, loads, lifts)
 
 
 def _halves(axis: int, middle: float) -> Callable[[Any], Any]:
@@ -356,9 +341,9 @@ def _late(lift: Array, name: str) -> Load:
 def _scaled(model: Model, name: str) -> Load:
     """Return the load of a channel that is larger by its own size."""
 
-    def load(now: StatePoint) -> Array:
-        more = scaled_channel(model, name, now.u, now.q, now.moment, STEP) / STEP
-        return beyond_rounding(more, force(model, now.u, now.q, now.moment) / STEP)
+    def load(now: Now) -> Array:
+        more = scaled_channel(model, name, now, STEP) / STEP
+        return beyond_rounding(more, force(model, now) / STEP)
 
     return load
 
@@ -366,9 +351,9 @@ def _scaled(model: Model, name: str) -> Load:
 def _changed(model: Model, direction: Array) -> Load:
     """Return the derivative of the load by a latent unknown."""
 
-    def load(now: StatePoint) -> Array:
-        more, less = now.q + STEP * direction, now.q - STEP * direction
-        up, down = (force(model, now.u, q, now.moment) for q in (more, less))
+    def load(now: Now) -> Array:
+        ends = (now.q + STEP * direction, now.q - STEP * direction)
+        up, down = (force(model, now._replace(q=q)) for q in ends)
         return beyond_rounding(up - down, up) / (2.0 * STEP)
 
     return load

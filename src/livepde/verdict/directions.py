@@ -8,9 +8,10 @@ its size, to distinguish causes, and so costs a fraction of a step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
@@ -43,16 +44,14 @@ MOST_SUMS = 12_000  # numbers in one kind of sum
 
 
 class Now(NamedTuple):
-    """Point of a response: state, latent parameter, inputs, usual interval and rest state."""
+    """Point of a response: state, latent parameter, time and inputs, and what a load asks for."""
 
-    # u, q, moment, unit: the state, the latent parameter, time and inputs, and the usual time
-    # between samples
     u: Array
     q: Array
     moment: Moment
-    unit: float
-    # Value at which the state has nothing to lose: the mean of the sensors at the start
-    rest: float
+    unit: float = 1.0  # usual time between samples
+    rest: float = 0.0  # state that has nothing to lose: the mean of the sensors at the start
+    rates: Mapping[str, float] = MappingProxyType({})  # changes of inputs per unit of time
 
 
 Load: TypeAlias = Callable[[Now], Array]
@@ -133,22 +132,31 @@ class Process:
 
     def advance(self, p: Array, now: Now, h: float) -> Array:
         """Return the responses a time h later, shape (terms, n)."""
-        # M (p+ - p)/h + S_u p+ = load, with p+ = lift on the boundary.
-        factor, rows = self.stage.linearised(now.u, now.q, h, now.moment)
-        known = (self.model.mass @ p.T).T / h - (rows @ self._lifts.T).T
+        loads = np.zeros_like(p)
         for k, term in enumerate(self.terms):
             if term.load is not None:
-                known[k] += term.load(now)
-        free = self.model.X.free
-        solved: Array = factor.solve((known * free).T).T
-        found: Array = solved * free + self._lifts
-        return found
+                loads[k] = term.load(now)
+        return later(self.stage, p, now, h, loads, self._lifts)
 
     def readings(self, p: Array, now: Now) -> Array:
         """Return the readings of the responses, shape (terms, sensors)."""
         physical = self.model.latent.value(now.q)
         H, _ = self.observed.jacobian(now.u, physical, now.moment)
         return np.asarray((H @ p.T).T)
+
+
+def later(stage: ForwardStage, p: Array, now: Now, h: float, loads: Array, lifts: Array) -> Array:
+    """Return responses p of a process a time h later; p, loads and lifts: (responses, n).
+
+    M (p+ - p)/h + S_u p+ = load, with p+ = lift on the boundary.
+    """
+    model = stage.model
+    factor, rows = stage.linearised(now.u, now.q, h, now.moment)
+    known = np.asarray((model.mass @ p.T).T) / h + loads
+    if lifts.any():
+        known -= np.asarray((rows @ lifts.T).T)
+    solved: Array = factor.solve((known * model.X.free).T).T
+    return solved * model.X.free + lifts
 
 
 def _constant(shape: Array, level: float) -> Load:
@@ -158,7 +166,7 @@ def _constant(shape: Array, level: float) -> Load:
 
 def _gain(model: Model, name: str) -> Load:
     """Return the load of a channel that is larger by `SCALED` than the model takes it for."""
-    return lambda now: scaled_channel(model, name, now.u, now.q, now.moment, SCALED)
+    return lambda now: scaled_channel(model, name, now, SCALED)
 
 
 def boundary_lifts(model: Model) -> dict[str, Array]:
@@ -190,19 +198,19 @@ def flux_loads(model: Model, most: int | None = None) -> dict[str, Array]:
     return found
 
 
-def force(model: Model, u: Array, q: Array, moment: Moment) -> Array:
-    """Return F - B(u) - A(u) q, (n,), of a latent parameter q."""
-    driven = model.physical_A.vector("v", moment, q=model.latent.value(q), u=u)
+def force(model: Model, now: Now) -> Array:
+    """Return F - B(u) - A(u) q, (n,)."""
+    u, moment = now.u, now.moment
+    driven = model.physical_A.vector("v", moment, q=model.latent.value(now.q), u=u)
     found: Array = model.F(moment) - model.B(u, moment) - driven
     return found
 
 
-def scaled_channel(
-    model: Model, name: str, u: Array, q: Array, moment: Moment, share: float
-) -> Array:
+def scaled_channel(model: Model, name: str, now: Now, share: float) -> Array:
     """Return the change of the force with a channel that is larger by a share of it, (n,)."""
-    more = Inputs({**moment.inputs, name: (1.0 + share) * moment.inputs[name]})
-    return force(model, u, q, Moment(moment.t, more)) - force(model, u, q, moment)
+    inputs = now.moment.inputs
+    more = Moment(now.moment.t, Inputs({**inputs, name: (1.0 + share) * inputs[name]}))
+    return force(model, now._replace(moment=more)) - force(model, now)
 
 
 def stride(seen: int) -> int:
