@@ -303,17 +303,18 @@ def after_pause(
 
     # How long the pause was is not sure either: the clock may have been set in it.
     rows = [(end.u - x.u) * pause[:, None]]
-    failure: StepFailed | None = None
-    names = [name for name in lines(problem) if sizes[:, problem.channels.index(name)].any()]
-    for name in names:
-        base, failure = after(name, 0)
-        for mode in range(1, MODES + 1):
+    for name in lines(problem):
+        if not sizes[:, problem.channels.index(name)].any():
+            continue
+        found = []
+        for mode in range(MODES + 1):
+            u, failure = after(name, mode)
             if failure is not None:
                 return end, failure
-            u, failure = after(name, mode)
-            rows.append(u - base)
+            found.append(u)
+        rows += [u - found[0] for u in found[1:]]
     U = np.stack(rows, axis=1)
-    return with_rows(end, U, np.zeros((*U.shape[:2], x.C.shape[2]))), failure
+    return with_rows(end, U, np.zeros((*U.shape[:2], x.C.shape[2]))), None
 
 
 def _mixed(span: Span, s: float) -> Array:
