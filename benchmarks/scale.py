@@ -31,8 +31,8 @@ from livepde.errors import ConfigurationError
 from livepde.fem import Field, Moment, box, dot, grad, linear, rectangle
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
-from livepde.laws.coupled.block_factors import BlockSolver
 from livepde.laws.coupled.equation import Metric, StageForms, StageProblem, StageTerms
+from livepde.laws.coupled.stage_solvers import BlockSolver
 from livepde.linalg import Array
 from livepde.model import Model, h1_form
 from livepde.observation import Full, Subdomain

@@ -13,10 +13,9 @@ import livepde as lp
 from benchmarks import scale
 from livepde.errors import ConfigurationError, LinearAlgebraError
 from livepde.fem import Moment
-from livepde.laws.coupled import block_factors
-from livepde.laws.coupled.block_factors import BlockJacobian, BlockSolver
+from livepde.laws.coupled import stage_solvers
 from livepde.laws.coupled.equation import Metric, StageProblem
-from livepde.laws.coupled.monolithic import BilinearSolver
+from livepde.laws.coupled.stage_solvers import BilinearSolver, BlockJacobian, BlockSolver
 from livepde.linalg import solvers
 
 EXACT = lp.stepping.Newton(tolerance=1e-11, share=0.0)
@@ -45,7 +44,7 @@ def data_of(model, sensors, times):
 
 def run(model, sensors, law, monkeypatch, large, samples=5, missing=None, **options):
     """Return (u, q) of each step, and the iterations of each solve by blocks."""
-    monkeypatch.setattr(block_factors, "LARGE", 1 if large else 10**9)
+    monkeypatch.setattr(stage_solvers, "LARGE", 1 if large else 10**9)
     monkeypatch.setattr(solvers, "WIDEST_BAND", 10)  # as it would be on a finer mesh
     times = 0.05 * np.arange(samples)
     ident = lp.Identifier(model, sensors, law, q0=0.5, u0=2.0, **options)
@@ -136,7 +135,7 @@ def test_blocks_serve_the_second_order_scheme_and_averages(monkeypatch):
 
 def first_stage(model, gain, monkeypatch, sensors=None, c1=1.0):
     """Return the solver by blocks, the first stage, and a point."""
-    monkeypatch.setattr(block_factors, "LARGE", 1)
+    monkeypatch.setattr(stage_solvers, "LARGE", 1)
     monkeypatch.setattr(solvers, "WIDEST_BAND", 10)
     law = lp.GradientLaw(gain=gain, damping=lp.laws.ResidualDamping(c1))
     ident = lp.Identifier(model, sensors or lp.Full(), law, q0=0.5, u0=2.0)
@@ -153,7 +152,7 @@ def first_stage(model, gain, monkeypatch, sensors=None, c1=1.0):
 @pytest.mark.slow
 def test_iterations_with_new_factors(monkeypatch):
     """To 1e-8, on two meshes: they hardly depend on the mesh."""
-    monkeypatch.setattr(block_factors, "LARGE", 1)
+    monkeypatch.setattr(stage_solvers, "LARGE", 1)
     monkeypatch.setattr(solvers, "WIDEST_BAND", 10)
     outcome = scale.iterations((1600, 2500))
     assert len(outcome.checks) == 2 * len(scale.ITERATIONS)
@@ -161,7 +160,7 @@ def test_iterations_with_new_factors(monkeypatch):
     engines = ("LU", "CHOLMOD")
     assert all(any(engine in row[4] for engine in engines) for row in outcome.tables[0].rows)
     assert all(row[5] for row in outcome.tables[0].rows)
-    monkeypatch.setattr(block_factors, "LARGE", 10**9)
+    monkeypatch.setattr(stage_solvers, "LARGE", 10**9)
     with pytest.raises(ConfigurationError, match="take more"):
         scale.iterations((300,))
 
@@ -230,7 +229,7 @@ def settled(model, sensors, samples, identifier=None):
 
 @pytest.fixture
 def stream(monkeypatch):
-    monkeypatch.setattr(block_factors, "LARGE", 1)
+    monkeypatch.setattr(stage_solvers, "LARGE", 1)
     monkeypatch.setattr(solvers, "WIDEST_BAND", 10)
     model, sensors = plane(), lp.Subdomain(inside)
     times = 0.05 * np.arange(30)
@@ -275,7 +274,7 @@ def test_a_jump_of_the_process_renews_the_factors(stream):
 @pytest.mark.slow
 def test_nothing_of_the_size_of_the_square_is_made(monkeypatch):
     """64 times the unknowns may take at most 100 times the memory of a step."""
-    monkeypatch.setattr(block_factors, "LARGE", 1)
+    monkeypatch.setattr(stage_solvers, "LARGE", 1)
     monkeypatch.setattr(solvers, "WIDEST_BAND", 2)
 
     def peak(cells):
@@ -316,7 +315,7 @@ def test_a_system_that_does_not_converge_is_a_status(monkeypatch):
 
 
 def test_banded_problems_are_factorised_at_any_size(monkeypatch):
-    monkeypatch.setattr(block_factors, "LARGE", 1)
+    monkeypatch.setattr(stage_solvers, "LARGE", 1)
     mesh = lp.interval(0.0, 1.0, 40)
     model = lp.Model(
         state=lp.Field(mesh, lp.linear(mesh), dirichlet={"boundary": 0.0}),

@@ -6,7 +6,7 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde.laws.filter import robust_factors
-from livepde.laws.member_arrays import changed
+from livepde.linalg.member_arrays import changed
 
 
 def learned(evolution=None, readings=60, size=1.0, noise=0.05):

@@ -9,7 +9,7 @@ import pytest
 
 import livepde as lp
 from benchmarks.step import problem
-from livepde.laws.coupled.monolithic import BilinearSolver
+from livepde.laws.coupled.stage_solvers import BilinearSolver
 from livepde.linalg import SuperLUSolver
 
 pytestmark = pytest.mark.slow

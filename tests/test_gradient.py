@@ -26,7 +26,7 @@ from livepde.fem import Moment
 from livepde.laws.coupled import coupled_stage as stage_module
 from livepde.laws.coupled.coupled_stage import CoupledStage
 from livepde.laws.coupled.equation import Metric, StageForms, StageProblem, StageTerms
-from livepde.laws.coupled.monolithic import BilinearSolver, MonolithicSolver
+from livepde.laws.coupled.stage_solvers import BilinearSolver, MonolithicSolver
 from livepde.model import h1_form
 from livepde.stepping import Near, StepFailed
 

@@ -13,8 +13,8 @@ from skfem import ElementLineP1
 import livepde as lp
 from livepde.laws.equation_tests import ExcitationLevel, Probes, pairs
 from livepde.laws.history import added, empty_log, opened
-from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import Scale
+from livepde.linalg.member_arrays import changed
 from livepde.reproduce import seed_excited
 from livepde.runs import doubts
 from livepde.stepping import ForwardStage, Interval, Span

@@ -12,8 +12,8 @@ from skfem import ElementLineP1, ElementLineP2
 import livepde as lp
 from livepde.fem import Inputs, Moment
 from livepde.laws.assimilation import absorb
-from livepde.laws.member_arrays import changed, join, put, put_each, take, where
 from livepde.linalg import Array
+from livepde.linalg.member_arrays import changed, join, put, put_each, take, where
 from livepde.stepping import BandedStage, ForwardStage, KeptFactors, Moments, Span, StageOfMembers
 from livepde.stepping.driven_vector import DrivenVector
 from livepde.stepping.member_stage import SeparateStages

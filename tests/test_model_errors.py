@@ -12,7 +12,7 @@ import pytest
 import scipy
 
 import livepde as lp
-from livepde.laws.error_columns import SMALL, ErrorColumns
+from livepde.laws.model_errors import SMALL, ErrorColumns
 from livepde.laws.stored_samples import StoredSamples
 from livepde.verdict import (
     Allowed,

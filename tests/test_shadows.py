@@ -10,7 +10,7 @@ import pytest
 from factories import driven_rod, readings
 
 import livepde as lp
-from livepde.laws.member_arrays import changed
+from livepde.linalg.member_arrays import changed
 from livepde.models import heat
 from livepde.stepping import ImplicitEuler
 from livepde.streams import AbsoluteNoise, Twin

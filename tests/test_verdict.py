@@ -571,7 +571,7 @@ def test_a_sensor_is_inside_the_body_and_not_beyond_the_next_one():
     model = driven_rod({"a": lp.Normal(1.0, 0.5)}, lambda t: t, lp.interval(0.0, 1.0, 20))
     observed = observe(model, lp.Points({"a": 0.1, "b": 0.4, "c": 0.5}, noise=0.1))
     noise = np.full(3, 0.1)
-    found = Dictionary(model, observed, noise, [], dearer=False, windows=2).directions
+    found = Dictionary(model, observed, noise, [], dearer=False).directions
     places = {one.subject: one for one in found if one.kind == "position"}
     reach = {name: (one.least, one.most) for name, one in places.items()}
     assert reach["a"] == pytest.approx((-0.1, 0.3))

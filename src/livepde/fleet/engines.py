@@ -12,9 +12,9 @@ import numpy as np
 
 from livepde import checkpoint, laws
 from livepde.fem import Moment
-from livepde.laws.member_arrays import join, take
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array, IntArray, nonfinite_allowed
+from livepde.linalg.member_arrays import join, take
 from livepde.stepping import Span
 
 State: TypeAlias = Any

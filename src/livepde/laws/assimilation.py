@@ -14,9 +14,9 @@ from livepde.laws.filter import Filter, Update
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gate import Gate
 from livepde.laws.law import Report, Status
-from livepde.laws.member_arrays import changed
 from livepde.laws.step_diagnostics import Diagnostics, stacked
 from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg.member_arrays import changed
 from livepde.stepping import Span
 from livepde.verdict import Judge, Ledger, ScoredSample
 

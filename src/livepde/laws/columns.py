@@ -23,12 +23,12 @@ import numpy as np
 from livepde.fem import Channel
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gate import Gate
-from livepde.laws.member_arrays import changed
 from livepde.laws.policies import Refit
 from livepde.laws.refit import WILD, Found, near_most, near_neighbours, refitted
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, nonfinite_allowed
+from livepde.linalg.member_arrays import changed
 from livepde.verdict import Cause, channel_setting
 from livepde.verdict.directions import boundary_lifts
 from livepde.verdict.sentences import LIKELY, amount_of, estimating, table_of
@@ -318,10 +318,7 @@ class _Trials:
         self.vain = len(self.base) if columns.state.fit.screened[0] else 0
 
     def refitted(self, samples: StoredSamples) -> Found | None:
-        """Return the end of a search.
-
-        It does not start from other points if that was no use in the fit of the run, or before.
-        """
+        """Return the end of a search; it begins at no other points where that was no use before."""
         found = refitted(samples, self.options, last=False, screened=self.vain)
         if found is not None and found.screened:
             self.vain = len(samples)

@@ -111,8 +111,7 @@ class ResidualDamping(Damping):
     c1: float = 1.0
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.c1) and self.c1 >= 0):
-            raise LawError(f"ResidualDamping: c1 must be a number >= 0; got {self.c1}.")
+        _check_bounds("ResidualDamping", c1=self.c1)
 
     def theta(self, r: Residual) -> float:
         return self.c1 * r.X / r.VX if r.VX > 0.0 else self.c1
@@ -255,10 +254,8 @@ class Constants:
         for name in ("c_M", "C_M", "c_N", "C_N"):
             if not getattr(self, name) > 0:
                 raise LawError(f"Constants: {name} must be positive; got {getattr(self, name)}.")
-        for name in ("L_C", "C_A", "hidden_V_VX", "hidden_VX_X", "hidden_ratio"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise LawError(f"Constants: {name} must be a number >= 0; got {value}.")
+        names = ("L_C", "C_A", "hidden_V_VX", "hidden_VX_X", "hidden_ratio")
+        _check_bounds("Constants", **{name: getattr(self, name) for name in names})
 
 
 def _over(numerator: float, denominator: float) -> float:
@@ -280,13 +277,7 @@ def theta_exact(c: Constants, p_V: float, r: Norms, c1: float = 0.0) -> float:
 
 
 def theta_noisy(
-    c: Constants,
-    e: float,
-    p_V: float,
-    r: Norms,
-    d: Norms,
-    sigma: float = 0.0,
-    c1: float = 0.0,
+    c: Constants, e: float, p_V: float, r: Norms, d: Norms, sigma: float = 0.0, c1: float = 0.0
 ) -> float:
     """Return the least theta for noisy data, Assumptions ass:mu_nu and, with c1, ass:mu_noisy.
 
@@ -348,10 +339,12 @@ def unobserved_damping(c: Constants, e_bound: float) -> float:
     return nu_exact(c, e_bound, Norms(c.hidden_ratio, 1.0, 1.0))
 
 
-def _check_bounds(name: str, **values: float) -> None:
+def _check_bounds(name: str, floor: float = 1.0, **values: float) -> None:
     for key, value in values.items():
         if not (np.isfinite(value) and value >= 0):
             raise LawError(f"{name}: {key} must be a number >= 0; got {value}.")
+    if not floor > 0:
+        raise LawError(f"{name}: floor must be positive; got {floor}.")
 
 
 @dataclass(frozen=True)
@@ -379,9 +372,7 @@ class ExactBound(Damping):
     floor: float = 1e-3
 
     def __post_init__(self) -> None:
-        _check_bounds("ExactBound", p_bound=self.p_bound, c1=self.c1)
-        if not self.floor > 0:
-            raise LawError(f"ExactBound: floor must be positive; got {self.floor}.")
+        _check_bounds("ExactBound", self.floor, p_bound=self.p_bound, c1=self.c1)
 
     def theta(self, r: Residual) -> float:
         c = self.constants
@@ -412,15 +403,8 @@ class SmoothedBound(Damping):
     floor: float = 1e-3
 
     def __post_init__(self) -> None:
-        _check_bounds(
-            "SmoothedBound",
-            p_bound=self.p_bound,
-            d_bound=self.d_bound,
-            rate_bound=self.rate_bound,
-            c1=self.c1,
-        )
-        if not self.floor > 0:
-            raise LawError(f"SmoothedBound: floor must be positive; got {self.floor}.")
+        values = {key: getattr(self, key) for key in ("p_bound", "d_bound", "rate_bound", "c1")}
+        _check_bounds("SmoothedBound", self.floor, **values)
 
     def theta(self, r: Residual) -> float:
         c = self.constants
@@ -460,17 +444,9 @@ class NoisyBound(Damping):
     theta_max: float = 1e3
 
     def __post_init__(self) -> None:
-        _check_bounds(
-            "NoisyBound",
-            p_bound=self.p_bound,
-            e_bound=self.e_bound,
-            d_X=self.d_bound.X,
-            d_VX=self.d_bound.VX,
-            d_V=self.d_bound.V,
-            sigma=self.sigma,
-            c1=self.c1,
-            theta_max=self.theta_max,
-        )
+        names = ("p_bound", "e_bound", "sigma", "c1", "theta_max")
+        norms = {f"d_{key}": value for key, value in vars(self.d_bound).items()}
+        _check_bounds("NoisyBound", **norms, **{name: getattr(self, name) for name in names})
 
     def theta(self, r: Residual) -> float:
         d = self.d_bound
@@ -488,9 +464,5 @@ class NoisyBound(Damping):
 def _pulled(r: Residual, pull: float, c1: float, floor: float) -> float:
     """Return max{pull / ||r||_X, c_1} ||r||_X^2 / ||r||_VX~^2, floored; c_1 where all is zero."""
     size = float(np.sqrt(max(r.X, floor**2 * r.observed.X))) if pull > 0.0 else 0.0
-    return max(pull / size if size > 0.0 else 0.0, c1) * _share(r)
-
-
-def _share(r: Residual) -> float:
-    """Return ||r||_X^2 / ||r||_VX~^2, 1 at r = 0."""
-    return r.X / r.VX if r.VX > 0.0 else 1.0
+    share = r.X / r.VX if r.VX > 0.0 else 1.0
+    return max(pull / size if size > 0.0 else 0.0, c1) * share

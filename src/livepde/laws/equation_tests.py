@@ -205,7 +205,13 @@ class Probes:
 def pairs(model: Model, split: Split) -> tuple[Array, Array]:
     """Return p and e of the probes, shapes (n, PROBES) and (m, PROBES)."""
     rng = np.random.default_rng(0)
-    p = _smooth(model, split, rng)
+    mass, smooth = _smooth_gram(model)
+    parts = split.R.T @ smooth @ split.R + split.P.T @ smooth @ split.P
+    space = HilbertSpace(sp.csr_array(parts), "probes", model.state_space.fixed)
+    # A white load: independent, with the variances on the diagonal of the mass matrix.
+    root = np.sqrt(mass.diagonal())[:, None]
+    white = root * rng.standard_normal((model.X.dim, PROBES))
+    p = np.asarray(split.R @ space.riesz(split.R.T @ white))
     # A copy of the space: the factor of a large one is not kept.
     found = copy(model.Q).riesz(rng.standard_normal((model.Q.dim, PROBES)))
     # Each unknown by itself, so that one in another unit does not outweigh it.
@@ -223,16 +229,6 @@ def _smooth_gram(model: Model) -> tuple[Any, Any]:
     extent = float(np.ptp(model.mesh.p, axis=1).max())
     mass = model.bilinear(mass_form)
     return mass, mass + extent**2 * (model.bilinear(h1_form) - mass)  # both have one unit
-
-
-def _smooth(model: Model, split: Split, rng: np.random.Generator) -> Array:
-    mass, smooth = _smooth_gram(model)
-    parts = split.R.T @ smooth @ split.R + split.P.T @ smooth @ split.P
-    space = HilbertSpace(sp.csr_array(parts), "probes", model.state_space.fixed)
-    # A white load: independent, with the variances on the diagonal of the mass matrix.
-    root = np.sqrt(mass.diagonal())[:, None]
-    white = root * rng.standard_normal((model.X.dim, PROBES))
-    return np.asarray(split.R @ space.riesz(split.R.T @ white))
 
 
 @dataclass(frozen=True, eq=False)

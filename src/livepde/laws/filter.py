@@ -25,7 +25,6 @@ from scipy.linalg import lapack
 
 from livepde.laws.filter_state import FilterState, along, extended, with_rows
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed, join, product, put, take
 from livepde.laws.member_sensors import Anchor, MemberSensors
 from livepde.laws.noise_rows import (
     NoiseRows,
@@ -33,12 +32,13 @@ from livepde.laws.noise_rows import (
     grades,
     lines,
     pieces,
-    with_input_noise,
-    with_unread_inputs,
+    unread_inputs,
+    with_input_errors,
 )
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadows import ShadowSet
 from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg.member_arrays import changed, join, product, put, take
 from livepde.stepping import Interval, MemberStage, Span, StageOfMembers, StepFailed, advance
 from livepde.verdict import Judge
 
@@ -148,10 +148,7 @@ class Filter:
         return q
 
     def _with_noise(self, x: FilterState, h: float, noise: NoiseRows | None) -> FilterState:
-        """Return the filter state with the unknowns predicted over a time h; u stays as it is.
-
-        Their process noise stands in new rows of the square root, in the same order for every h.
-        """
+        """Return the state with the unknowns predicted over a time h, their noise in new rows."""
         end = self.unknowns_after(x, h)
         if noise is None:
             return end
@@ -247,12 +244,13 @@ class Filter:
     ) -> tuple[FilterState, Steps, StepFailed | None]:
         """Return the same of members that divide their substeps alike."""
         x, end, taken, failure = self._divided(x, span)
-        if failure is None and self.problem.input_noise:
-            end, failure = with_input_noise(self.carried, self.problem, x, end, span)
+        noise = self.problem.input_noise
+        if failure is None and noise:
+            end, failure = with_input_errors(self.carried, x, end, span, noise)
         # A refit of constant unknowns takes held values as exact, and so does their filter.
-        uncertain = self.moves or bool(self.problem.input_noise)
-        if failure is None and uncertain and self.input_gaps(span) is not None:
-            end, failure = with_unread_inputs(self.carried, self.problem, x, end, span)
+        if failure is None and (self.moves or noise) and self.input_gaps(span) is not None:
+            off = unread_inputs(self.problem, x, span)
+            end, failure = with_input_errors(self.carried, x, end, span, off)
             end = self.compressed(end) if end.U.shape[1] > self.rank else end
         if failure is not None:
             return x, taken, failure
@@ -571,10 +569,7 @@ def robust_factors(reduction: Reduction, x: FilterState) -> tuple[Array, Array]:
 
 
 def reported_factors(filter_: Filter, x: FilterState) -> tuple[Array, Array]:
-    """Return a square root [U C] of the covariance that is reported, as `robust_factors` does.
-
-    It has one row more for the discretisation error, where shadows follow it.
-    """
+    """Return `robust_factors` with a row more for the discretisation error, as reported."""
     U, C = robust_factors(filter_.reduction, x)
     if filter_.shadows is None:
         return U, C

@@ -15,8 +15,8 @@ import numpy as np
 
 from livepde.laws.gate import Screened
 from livepde.laws.innovations import Innovations
-from livepde.laws.member_arrays import changed
 from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg.member_arrays import changed
 from livepde.stepping import KeptFactors, Span
 from livepde.verdict import Ledger
 

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from livepde.laws.member_arrays import changed
 from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg.member_arrays import changed
 from livepde.stepping import Interval
 
 MOVED = 20.0  # standard deviations of the noise: a smaller range does not show the process's size

@@ -45,7 +45,6 @@ from livepde.model import h1_form
 from livepde.stepping import Interval, Newton, advance
 
 ROUNDING = 1e-9  # of entries of P, which are at most about one
-SAME = 1e-9  # of a step: times that are the same but for rounding
 MOST_STAGES = 8  # kept for different sets of present sensors
 
 
@@ -75,11 +74,12 @@ class GradientParts:
 
     def stage(self, present: Array) -> CoupledStage:
         """Return the coupled stage for the sensors present."""
-        return self._stages.get(present.tobytes(), lambda: self._made(present))
 
-    def _made(self, present: Array) -> CoupledStage:
-        terms = StageTerms(self.forms(present), self.damping, self.memory)
-        return CoupledStage(terms, self.newton)
+        def made() -> CoupledStage:
+            terms = StageTerms(self.forms(present), self.damping, self.memory)
+            return CoupledStage(terms, self.newton)
+
+        return self._stages.get(present.tobytes(), made)
 
     def forms(self, present: Array) -> StageForms:
         """Return the forms of the stage for the sensors present."""
@@ -91,10 +91,6 @@ class GradientParts:
         present = np.ones(self.problem.observed.size, dtype=bool)
         self.stage(present).solver.prepare()
         return self
-
-    def closed(self, excitation: ExcitationLevel) -> bool:
-        """Return true if the gate is closed: q is held."""
-        return self.gate is not None and self.gate.closed(excitation)
 
     def excited(
         self, excitation: ExcitationLevel, w: Array, u: Array, q: Array, moment: Moment
@@ -116,29 +112,19 @@ class GradientParts:
         return self.tests.add(tested, equation())
 
 
+@dataclass(eq=False)
 class StageSequence:
     """The coupled stages of one interval, one after the other: a `Stage` for `advance`."""
 
-    def __init__(
-        self,
-        coupled: CoupledStage,
-        path: ObservedPath,
-        metric: MetricStep,
-        rate: Array | None,
-        kept: KeptFactor,
-        left: Array,
-        width: float,
-    ) -> None:
-        self.coupled = coupled
-        self.path = path
-        self.metric = metric
-        self.slope = rate
-        # Without a rate other sensors are present, or q is held now or was before: another matrix,
-        # so that the factor of the last stage does not serve.
-        self.kept = kept if rate is not None else KeptFactor.none()
-        self.left = left
-        self.width = width
-        self._last: tuple[StageProblem, float, StageIterate] | None = None
+    coupled: CoupledStage
+    path: ObservedPath
+    metric: MetricStep
+    slope: Array | None  # last change of (u - u_alpha, q) per unit of time; None: none predicts
+    kept: KeptFactor
+    # Residual of the last stage, and its step.
+    left: Array
+    width: float
+    _last: tuple[StageProblem, float, StageIterate] | None = None
 
     def __call__(self, c: Array, t: float, h: float) -> Array:
         """Return y = (u, q) at t of the stage that begins at c; raises `StepFailed`."""
@@ -221,7 +207,7 @@ def constant_parts(
     ).prepared()
 
 
-def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> GradientParts:
+def _tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> GradientParts:
     """Return the parts of the law that tunes itself."""
     _require_linear_readings(problem)
     model, observation = problem.model, problem.observed.observation
@@ -230,7 +216,8 @@ def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Gradi
             "GradientLaw: gain='auto' accumulates what is known of constant unknowns, and here "
             "one moves (evolution=): give a number for gain, or use SensitivityLaw."
         )
-    whole = _sees_all(problem)
+    hidden = abs(problem.observed.split().P) @ model.X.free
+    whole = not (hidden > ROUNDING).any()
     if not whole and model.form_A.differentiates("u"):
         raise LawError(
             "GradientLaw: gain='auto' needs data of the whole state where A contains derivatives "
@@ -251,11 +238,6 @@ def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Gradi
         metric=metric,
         memory=metric.pattern,
     ).prepared()
-
-
-def _sees_all(problem: Problem) -> bool:
-    hidden = abs(problem.observed.split().P) @ problem.model.X.free
-    return not bool((hidden > ROUNDING).any())
 
 
 def _for_scheme(newton: Newton, problem: Problem) -> Newton:
@@ -395,7 +377,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
 
     def _parts(self, problem: Problem) -> GradientParts:
         if self.gain == "auto":
-            return tuned_parts(problem, self.nu, self.N_op, self.newton)
+            return _tuned_parts(problem, self.nu, self.N_op, self.newton)
         return constant_parts(
             problem,
             self.gain,
@@ -442,7 +424,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
         refused = int(np.count_nonzero(readings.wild > state.readings.wild))
         interval = work.problem.linear_readings(interval, state.u)
         given, state = state, replace(state, readings=readings)
-        closed = work.closed(state.excitation)
+        closed = work.gate is not None and work.gate.closed(state.excitation)
         new, report = self._advanced(work, state, interval, closed)
         # A q that prior and data cannot explain is not believed: the step is taken again with q
         # held.
@@ -480,10 +462,12 @@ class GradientLaw(Law[GradientParts, GradientState]):
 
         # u and q together, by coupled stages
         predicts = same and frozen == state.frozen
-        rate = state.rate if predicts else None
+        # Other sensors, or a q that is held now or was before, have another matrix: so that the
+        # factor of the last stage does not serve.
+        rate, kept = (state.rate, state.kept) if predicts else (None, KeptFactor.none())
         # While q is held its equation has a huge inner product: its residual is rounding.
         left = state.left if predicts and not frozen else 0.0 * state.left
-        stages = StageSequence(coupled, path, metric, rate, state.kept, left, state.width)
+        stages = StageSequence(coupled, path, metric, rate, kept, left, state.width)
         y = np.concatenate([state.u, state.q])
         end, steps, failure = advance(work.problem.control, stages, y, interval.t0, interval.t1)
         if failure is not None:

@@ -76,10 +76,7 @@ def skipped(log: Array) -> Array:
 
 
 def _extended(log: Array) -> Array:
-    """Return a log with one more row, to be written at once.
-
-    Logs share a buffer: the row is where no log has written yet, else in a copy.
-    """
+    """Return a log with one more row, to be written at once: in a shared buffer, or a copy."""
     # A time that is not SPARE shows that another log with the same first rows has written here.
     rows, buffer = log.shape[1], log.base
     if (

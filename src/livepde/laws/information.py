@@ -318,7 +318,7 @@ class InformationMetric(MetricRule[Information]):
         self.diagonal = _diagonal(model.Q)
         every = np.arange(model.Q.dim)
         self.on_diagonal = self.pattern.positions(every, every)
-        self._normal: Memo[bytes, NormalEquations] = Memo(MOST_NORMAL)
+        self._normal: Memo[bytes, SelectedRows | ProjectedRows] = Memo(MOST_NORMAL)
 
     def init(self, q0: Array) -> Information:
         """Return the information before the first sample: none."""
@@ -356,11 +356,11 @@ class InformationMetric(MetricRule[Information]):
         held, weight = state.held / PULL, spread / PULL
         return lambda h: Metric(h * weight, 0.0, None, held, PULL / h)
 
-    def normal(self, forms: StageForms) -> NormalEquations:
+    def normal(self, forms: StageForms) -> SelectedRows | ProjectedRows:
         """Return the contribution of the samples of a stage to the normal equations."""
         return self._normal.get(forms.split.present.tobytes(), lambda: self._made(forms))
 
-    def _made(self, forms: StageForms) -> NormalEquations:
+    def _made(self, forms: StageForms) -> SelectedRows | ProjectedRows:
         X, Q, A = self.model.X, self.model.Q, forms.A_in.pattern("v", "q")
         if not self.selects:
             return ProjectedRows(A, forms.split.basis, forms.mass, X.free, Q.free)
@@ -466,19 +466,7 @@ class Gain:
     trace: Array  # trace(G_Q^{-1} matrix), shape (2,)
 
 
-class NormalEquations(ABC):
-    """Abstract contributions of samples of one set of sensors to the normal equations."""
-
-    @abstractmethod
-    def gain(self, A: Array, q: Array, error: Array, probes: Array) -> Gain:
-        """Return the contribution of a sample."""
-
-    @abstractmethod
-    def trace(self, A: Array, probes: Array) -> Array:
-        """Return `Gain.trace` alone."""
-
-
-class SelectedRows(NormalEquations):
+class SelectedRows:
     """Sensors that select coefficients: D is diagonal and J as sparse as A^T A.
 
     `pattern`: of A, shape (n, m). `inverse`: D^{-1} of the rows of both kinds, zero elsewhere,
@@ -528,6 +516,7 @@ class SelectedRows(NormalEquations):
         return data
 
     def gain(self, A: Array, q: Array, error: Array, probes: Array) -> Gain:
+        """Return the contribution of a sample."""
         matrix = self.pattern.compact(A)
         images = matrix @ np.column_stack([self.free * q, probes])
         y = images[:, 0] - error
@@ -537,13 +526,14 @@ class SelectedRows(NormalEquations):
         return Gain(self._matrix(A), products[:2], products[2], trace)
 
     def trace(self, A: Array, probes: Array) -> Array:
+        """Return `Gain.trace` alone."""
         images = self.pattern.compact(A) @ probes
         trace: Array = self.inverse @ np.square(images).sum(axis=1)
         return trace
 
 
-class ProjectedRows(NormalEquations):
-    """Sensors of any other kind: rows of a basis V of N(G)^perp, D = M, and J dense.
+class ProjectedRows:
+    """The same for other sensors: rows of a basis V of N(G)^perp, D = M, and J dense.
 
     All of them see the unobserved part.
 

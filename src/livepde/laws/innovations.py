@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from livepde.laws.member_arrays import product
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, Mask
+from livepde.linalg.member_arrays import product
 
 WINDOW = 500  # samples: older innovations fade, so that a poor start is forgotten
 SLOW = 50  # samples over which innovations are averaged to find errors that hide below the noise

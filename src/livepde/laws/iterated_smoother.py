@@ -23,10 +23,10 @@ from livepde.laws.assimilation import absorb, assimilate
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState, along, coordinates
 from livepde.laws.history import first_interval, intervals_since
-from livepde.laws.member_arrays import changed, put_each, take
 from livepde.laws.sensitivity_state import NEVER, SensitivityState, SensitivityWork, new_window
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, Mask
+from livepde.linalg.member_arrays import changed, put_each, take
 from livepde.stepping import Interval
 
 AGREED = 0.5  # standard deviations between reference and estimate at which the steps stop
@@ -213,7 +213,8 @@ def _descended(samples: _Samples, best: _Pass) -> _Pass:
         if deviations(best.x, step[-1]) <= CONVERGED:
             break
         step *= min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-300))
-        better = _damped(samples, best, step)
+        tried = (samples.about(best.trajectory + 0.5**k * step) for k in range(HALVINGS))
+        better = next((one for one in tried if one and one.misfit < best.misfit), None)
         if better is None:
             break
         gained, best = best.misfit - better.misfit, better
@@ -229,15 +230,6 @@ def _shares(before: FilterState, now: FilterState) -> Array:
     # The eigenproblem needs a definite matrix, also where a coordinate began without variance.
     found: Array = eigh(later, earlier + 1e-12 * np.trace(earlier) * np.eye(len(later)))[0]
     return found
-
-
-def _damped(samples: _Samples, best: _Pass, step: Array) -> _Pass | None:
-    """Return the pass about a trajectory a step, or less, away; None if none is better."""
-    for halving in range(HALVINGS):
-        found = samples.about(best.trajectory + 0.5**halving * step)
-        if found is not None and found.misfit < best.misfit:
-            return found
-    return None
 
 
 def apart(filter_: Filter, x: FilterState, other: FilterState) -> float:

@@ -9,6 +9,7 @@ the state becomes U - (H U + D C) K: what the readings determine depends no long
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -16,28 +17,27 @@ import scipy.sparse as sp
 
 from livepde.laws.filter_state import FilterState
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array, Mask, RowProduct, row_product
+from livepde.linalg.member_arrays import changed
 from livepde.model import Model, h1_form
 from livepde.observation import Observed
 from livepde.spaces import HilbertSpace
 from livepde.stepping import Moments
 
 
+@dataclass(frozen=True, eq=False)
 class MemberSensors:
     """Predicted readings of each member and their derivatives, linear about its point."""
 
-    def __init__(self, problem: Problem, reduction: Reduction) -> None:
-        self.problem = problem
-        self.reduction = reduction
-        observed = problem.observed
-        # Others may read the unknowns, inputs or the time, or bend at the state.
-        self.fixed = (
-            type(observed) is Observed
-            and not observed.observation.directs
-            and not observed.observation.inputs
-        )
+    problem: Problem
+    reduction: Reduction
+
+    @cached_property
+    def fixed(self) -> bool:
+        """False if sensors may read the unknowns, inputs or the time, or bend at the state."""
+        observed, observation = self.problem.observed, self.problem.observed.observation
+        return type(observed) is Observed and not (observation.directs or observation.inputs)
 
     @cached_property
     def _read(self) -> RowProduct:
@@ -132,11 +132,12 @@ class MemberSensors:
         return self._predicted(u, q, at, k), Y
 
 
+@dataclass(frozen=True, eq=False)
 class Anchor:
     """Corrects the state of members by their readings alone."""
 
-    def __init__(self, problem: Problem, sensors: MemberSensors) -> None:
-        self.problem, self.sensors = problem, sensors
+    problem: Problem
+    sensors: MemberSensors
 
     @cached_property
     def _space(self) -> HilbertSpace:

@@ -22,7 +22,7 @@ path: the end of the step is then halved, until its last part is short against t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -33,9 +33,9 @@ import numpy as np
 from livepde.fem import Moment
 from livepde.laws.filter_state import FilterState, with_rows
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg.member_arrays import changed
 from livepde.stepping import Advance, Span, StepFailed
 
 SHORT = 1e-3  # steps over relaxation times below which a path is that of a random walk
@@ -185,26 +185,49 @@ def input_rank(problem: Problem) -> int:
     return ROWS * len(problem.input_noise) + problem.initial_rank
 
 
-def with_input_noise(
-    propagate: Propagate, problem: Problem, x: FilterState, end: FilterState, span: Span
+def with_input_errors(
+    propagate: Propagate,
+    x: FilterState,
+    end: FilterState,
+    span: Span,
+    sizes: Mapping[str, float | Array],
 ) -> tuple[FilterState, StepFailed | None]:
-    """Return the state after a span with one more row for each noisy channel.
+    """Return the state after a span with one more row for each channel that may be off.
 
-    The error of a channel is taken as constant in a span and as independent from one to the next:
-    its integral over many spans has the variance of the straight lines between readings. Where a
-    state follows its boundary within a span, the variance is larger than that of the lines by up to
-    a quarter.
+    `sizes`: standard deviation of each such channel, one number or (members, 1). The error of a
+    channel is taken as constant in a span and as independent from one to the next: its integral
+    over many spans has the variance of the straight lines between readings. Where a state follows
+    its boundary within a span, the variance is larger than that of the lines by up to a quarter.
     The row is the difference to the state whose input is one standard deviation off, exact where
     the model is affine in it.
     """
-    members, k, bare = len(x), x.C.shape[2], _bare(x)
-    rows = []
-    for name, std in problem.input_noise.items():
-        off, _, failure = propagate(bare, _moved(span, name, std))
+    bare, rows = _bare(x), []
+    for name, size in sizes.items():
+        off, _, failure = propagate(bare, _moved(span, name, size))
         if failure is not None:
             return end, failure
         rows.append(off.u - end.u)
-    return with_rows(end, np.stack(rows, axis=1), np.zeros((members, len(rows), k))), None
+    if not rows:
+        return end, None
+    U = np.stack(rows, axis=1)
+    return with_rows(end, U, np.zeros((*U.shape[:2], x.C.shape[2]))), None
+
+
+def unread_inputs(problem: Problem, x: FilterState, span: Span) -> dict[str, Array]:
+    """Return by how much each channel that is held in a gap may be off, shapes (members, 1).
+
+    As far as inputs have moved before in such a time (`InputHistory.deviation`).
+    """
+    sizes: dict[str, Array] = {}
+    if span.gaps is None:
+        return sizes
+    for name in lines(problem):
+        held, missing = span.gaps[:, :, span.channels.index(name)].T
+        if np.count_nonzero(missing):
+            length = 2.0 * (held + span.t1 - span.t0)  # the end of a gap is open
+            size = x.driven.deviation(length)[:, problem.channels.index(name)] * missing
+            sizes[name] = size[:, None]
+    return sizes
 
 
 def _bare(x: FilterState) -> FilterState:
@@ -221,36 +244,8 @@ def _bare(x: FilterState) -> FilterState:
     )
 
 
-def with_unread_inputs(
-    propagate: Propagate, problem: Problem, x: FilterState, end: FilterState, span: Span
-) -> tuple[FilterState, StepFailed | None]:
-    """Return the state after a span with one more row for each channel that is held in a gap.
-
-    The channel may be as far from the value that it is held at as inputs have moved before in such
-    a time (`InputHistory.deviation`). Parameters are those of `with_input_noise`.
-    """
-    if span.gaps is None:
-        return end, None
-    members, k, bare, rows = len(x), x.C.shape[2], _bare(x), []
-    for name in lines(problem):
-        held, missing = span.gaps[:, :, span.channels.index(name)].T
-        if not np.count_nonzero(missing):
-            continue
-        length = 2.0 * (held + span.t1 - span.t0)  # the end of a gap is open
-        size = x.driven.deviation(length)[:, problem.channels.index(name)] * missing
-        off, _, failure = propagate(bare, _moved(span, name, size[:, None]))
-        if failure is not None:
-            return end, failure
-        rows.append(off.u - end.u)
-    if not rows:
-        return end, None
-    return with_rows(end, np.stack(rows, axis=1), np.zeros((members, len(rows), k))), None
-
-
-def _moved(span: Span, name: str, change: Any) -> Span:
-    shift = np.zeros(len(span.channels))
-    shift[span.channels.index(name)] = 1.0
-    shift = change * shift
+def _moved(span: Span, name: str, change: float | Array) -> Span:
+    shift = change * (np.arange(len(span.channels)) == span.channels.index(name))
     last = span.inputs1 + shift
     first = last if span.inputs0 is span.inputs1 else span.inputs0 + shift
     return replace(span, inputs0=first, inputs1=last, interval=None)
@@ -273,7 +268,7 @@ def after_pause(
 
     The deviation of an input from its line is a bridge: a sum of MODES sines over the pause with
     independent amplitudes. Each row is the response to one of them, and one row is the change of
-    the state in the pause. Parameters are those of `with_input_noise`.
+    the state in the pause.
     """
     pause = end.driven.pause
     length = span.t1 - span.t0
@@ -308,43 +303,47 @@ def after_pause(
 
     # How long the pause was is not sure either: the clock may have been set in it.
     rows = [(end.u - x.u) * pause[:, None]]
-    failure: StepFailed | None = None
-    names = [name for name in lines(problem) if sizes[:, problem.channels.index(name)].any()]
-    for name in names:
-        base, failure = after(name, 0)
-        for mode in range(1, MODES + 1):
+    for name in lines(problem):
+        if not sizes[:, problem.channels.index(name)].any():
+            continue
+        found = []
+        for mode in range(MODES + 1):
+            u, failure = after(name, mode)
             if failure is not None:
                 return end, failure
-            u, failure = after(name, mode)
-            rows.append(u - base)
+            found.append(u)
+        rows += [u - found[0] for u in found[1:]]
     U = np.stack(rows, axis=1)
-    return with_rows(end, U, np.zeros((*U.shape[:2], x.C.shape[2]))), failure
+    return with_rows(end, U, np.zeros((*U.shape[:2], x.C.shape[2]))), None
 
 
 def _mixed(span: Span, s: float) -> Array:
     return (1.0 - s) * span.inputs0 + s * span.inputs1
 
 
-def initial_rows(
-    problem: Problem, reduction: Reduction, noise: Array, q: Array, u: Array, moment: Moment
-) -> tuple[Array, Array]:
-    """Return the uncertainty of u0: rows of U and of C.
+def rows_of_sensors(problem: Problem, reduction: Reduction) -> IntArray:
+    """Return which of the initial rows are the noise of a reading, as its sensor states it."""
+    readings = problem.initial_readings.items()
+    of_sensor = [name in problem.observed.names and np.isnan(one.noise) for name, one in readings]
+    return reduction.size + np.flatnonzero(of_sensor)
+
+
+def with_initial_rows(
+    x: FilterState, problem: Problem, reduction: Reduction, noise: Array, moment: Moment
+) -> FilterState:
+    """Return the state of one member at the start with the uncertainty of its u0.
 
     The errors of u0 itself (`Problem.initial_errors`) are rows of their own. For a u0 made of
     readings, with u0 = sum_i w_i z_i the error of u0 is -sum_i w_i (noise_i + H_q Phi a): the noise
     of each reading is a row of its own, and the effect of the unknowns on the sensors, an offset
     say, stands in the rows of those unknowns. So the readings tell nothing more of them.
 
-    `noise`: standard deviation of each sensor, shape (sensors,). `q`, `u`, `moment`: latent
-    parameter, state, time and inputs at the start.
-
-    Returns
-    -------
-    U, C
-        Shapes (k + readings + errors, n) and (k + readings + errors, k).
+    `noise`: standard deviation of each sensor, shape (sensors,).
     """
+    if not problem.initial_rank:
+        return x
     observed, k = problem.observed, reduction.size
-    free = problem.model.X.free
+    free, u, q = problem.model.X.free, x.u[0], x.q[0]
     own, unknown = [], np.zeros((k, len(u)))
     _, H_q = observed.jacobian(u, problem.model.latent.value(q), moment)
     seen = np.zeros((k, observed.size))
@@ -358,23 +357,6 @@ def initial_rows(
             unknown -= np.outer(seen[:, sensor], direction)
         own.append(std * direction)
     own += [free * error for error in problem.initial_errors]
-    C = np.vstack([np.eye(k), np.zeros((len(own), k))])
-    return np.vstack([unknown, *own]), C
-
-
-def rows_of_sensors(problem: Problem, reduction: Reduction) -> IntArray:
-    """Return which of the initial rows are the noise of a reading, as its sensor states it."""
-    readings = problem.initial_readings.items()
-    of_sensor = [name in problem.observed.names and np.isnan(one.noise) for name, one in readings]
-    return reduction.size + np.flatnonzero(of_sensor)
-
-
-def with_initial_rows(
-    x: FilterState, problem: Problem, reduction: Reduction, noise: Array, moment: Moment
-) -> FilterState:
-    """Return the state at the start with the uncertainty of the initial state."""
-    if not problem.initial_rank:
-        return x
-    U, C = initial_rows(problem, reduction, noise, x.q[0], x.u[0], moment)
+    U, C = np.vstack([unknown, *own]), np.vstack([np.eye(k), np.zeros((len(own), k))])
     causes = np.zeros((1, len(C), x.causes.shape[2]))
     return changed(x, U=U[None], C=C[None], past=np.zeros((1, len(C), 0)), causes=causes)

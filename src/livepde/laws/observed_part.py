@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeAlias
 
@@ -238,14 +238,14 @@ class SmoothingOperator:
 Find: TypeAlias = Callable[[Array, Array | None], Reconstructed]
 
 
+@dataclass(frozen=True, eq=False)
 class ObservedPath:
     """u_alpha at any time of an interval, each found once."""
 
-    def __init__(self, problem: Problem, interval: Interval, find: Find) -> None:
-        self.problem = problem
-        self.interval = interval
-        self._find = find  # from measurements, and Dirichlet values or None if all are zero
-        self._found: dict[float, Reconstructed] = {}
+    problem: Problem
+    interval: Interval
+    find: Find  # from measurements, and Dirichlet values or None if all are zero
+    _found: dict[float, Reconstructed] = field(default_factory=dict)
 
     def at(self, t: float) -> Reconstructed:
         """Return u_alpha at a time."""
@@ -253,7 +253,7 @@ class ObservedPath:
             model, known = self.problem.model, None
             if not model.homogeneous:
                 known = model.impose(np.zeros(model.X.dim), self.interval.at(t))
-            self._found[t] = self._find(self.interval.z(t), known)
+            self._found[t] = self.find(self.interval.z(t), known)
         return self._found[t]
 
     def diagnostics(self) -> Diagnostics[float]:

@@ -23,7 +23,6 @@ from livepde.laws.iterated_smoother import (
     placed,
 )
 from livepde.laws.law import Report, Status
-from livepde.laws.member_arrays import changed
 from livepde.laws.policies import Guards, Jumps
 from livepde.laws.sensitivity_state import (
     SensitivityState,
@@ -35,6 +34,7 @@ from livepde.laws.sensitivity_state import (
     without_past,
 )
 from livepde.laws.step_diagnostics import Diagnostics
+from livepde.linalg.member_arrays import changed
 from livepde.stepping import Interval
 
 NEAR_ONSETS = (-8, -6, -4, -3, -2, -1, 0, 1, 2, 3)  # of a first guess of when a jump was
@@ -131,10 +131,8 @@ def _iterated(
 def _converged(
     work: SensitivityWork, window: Window, interval: Interval, most: int
 ) -> FilterState | None:
-    """Return the filter after a sample, about the reference where Gauss-Newton steps end, or None.
-
-    The search follows neither ledger nor discretisation errors, which cost as much again.
-    """
+    """Return the filter after a sample, about where Gauss-Newton steps end, or None."""
+    # The search follows neither ledger nor discretisation errors, which cost as much again.
     filter_, searching, start = work.filter, work.unaccompanied, unaccompanied(window.start)
     for _ in range(most):
         last, q = window, next_reference(filter_, window)
@@ -161,10 +159,7 @@ def _rescued(
     new: SensitivityState,
     report: Report,
 ) -> tuple[SensitivityState, Report]:
-    """Return one member and report after a sample that may have failed or be far off.
-
-    A restart does not use the last samples again: the older state is propagated without them.
-    """
+    """Return one member and report after a sample that may have failed or be far off."""
     noise = work.filter.noise_of(state.now, interval)
     z = interval.z1[None]
     scale = state.scale.add(z, z - report.predicted)
@@ -179,6 +174,7 @@ def _rescued(
         ), report
     older = changed(work.filter.relinearised(state.older), kept=new.now.kept)
     row = int(state.since_older[0])
+    # The last samples are not used again: the older state is propagated without them.
     silent = [item.silent for item in [*_since(work, state, row), interval]]
     # The estimate of before with a wider covariance comes first, the prior is the last resort.
     for start in (work.filter.inflated(older, 1.0), work.filter.with_prior(older)):

@@ -11,8 +11,8 @@ import scipy
 
 from livepde.errors import LawError
 from livepde.laws.innovations import Innovations
-from livepde.laws.member_arrays import where
 from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg.member_arrays import where
 
 LARGEST = 3.0  # Huber's bound: of Gaussian innovations it cuts off 0.3 %, and 1 % of their variance
 CHANCE = 1e-2  # of so many repetitions in a row, below which a sensor seems stuck

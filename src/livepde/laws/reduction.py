@@ -77,9 +77,10 @@ class Reduction:
                 count = min(counts[name], int(inner.free.sum()))
                 mass = model.parameter_mass[part, part]
                 phi, _ = inner.modes(count, mass)
-                if modes == "auto":
+                if modes == "auto":  # as many as have all of the variance but `LEFT_OUT`
                     weights = mass.diagonal()
-                    phi = phi[:, : _enough(phi, weights, inner.spread(weights, phi))]
+                    enough = (1.0 - LEFT_OUT) * inner.spread(weights, phi)
+                    phi = phi[:, : 1 + int((np.cumsum(weights @ phi**2) < enough).sum())]
             else:
                 phi = np.eye(item.size) * item.unknown.prior.latent_std
             # One block of modes for each copy: of a periodic unknown the mean and the harmonics.
@@ -239,12 +240,9 @@ class Reduction:
         return q if np.count_nonzero(inside) == q.size else np.minimum(np.maximum(q, lower), upper)
 
     def held(self, q: Array) -> Array:
-        """Return how many latent parameters would lie too far from the prior, (...) for (..., m).
-
-        Bounds that a user has set do not count.
-        """
+        """Return how many latent parameters are too far from the prior, (...) for (..., m)."""
         lower, upper = self.ends
-        bounds = self.problem.model.latent.bounds
+        bounds = self.problem.model.latent.bounds  # those that a user has set do not count
         return np.asarray(
             (((q < lower) & (lower > bounds[0])) | ((q > upper) & (upper < bounds[1]))).sum(axis=-1)
         )
@@ -284,10 +282,7 @@ class Reduction:
         return left
 
     def rest(self, age: float, drift: float) -> Array:
-        """Return the standard deviation of latent coefficients in the omitted modes, (m,).
-
-        These coefficients keep their prior, and have moved for a time `age`.
-        """
+        """Return standard deviations of the prior in the omitted modes at an age, (m,)."""
         if age == 0.0 or not self._left_out.any():
             return np.asarray(np.sqrt(self._left_out))
         grown = []
@@ -318,13 +313,6 @@ def _mode_counts(modes: int | str | dict[str, int], fields: object) -> dict[str,
     if any(count < 1 or count % 1 for count in counts.values()):
         raise LawError(f"SensitivityLaw: modes must be whole numbers of at least 1; got {modes!r}.")
     return counts
-
-
-def _enough(phi: Array, mass: Array, variance: float) -> int:
-    """Return how many modes hold all of the prior variance but a share of `LEFT_OUT`."""
-    held = np.cumsum(mass @ phi**2)
-    short = int((held < (1.0 - LEFT_OUT) * variance).sum())
-    return min(short + 1, len(held))
 
 
 @lru_cache(maxsize=64)

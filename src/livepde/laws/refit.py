@@ -27,7 +27,6 @@ from livepde.laws.filter_state import FilterState
 from livepde.laws.history import intervals_since
 from livepde.laws.iterated_smoother import HOLDS, apart, iterate_starts, usual
 from livepde.laws.law import numerical
-from livepde.laws.member_arrays import changed, put_each, take
 from livepde.laws.policies import Refit
 from livepde.laws.sensitivity_state import (
     FitState,
@@ -39,6 +38,7 @@ from livepde.laws.sensitivity_state import (
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, Mask, nonfinite_allowed
+from livepde.linalg.member_arrays import changed, put_each, take
 
 NEIGHBOURS = 3  # in time, to each side of a value
 FEW = 2 * NEIGHBOURS  # values of a sensor up to which all count as near
@@ -160,11 +160,12 @@ def refitted(
     search had that began again at screened points in vain.
     """
     search = _Search(samples, options, last, lacking=1 if screened else AGREED)
-    search.descend(samples.reached)
+    start = samples.reached
+    search.descend(start)
     screens = search.suspicious and len(samples) >= (ANEW_LAST if last else ANEW) * screened
     if screens:
         search.screen()
-    elif screened and search.stays(samples.reached):
+    elif screened and search.best and np.linalg.norm(search.best.xi - start) < STAYS:
         search.lacking = 0  # fewer samples have shown that there is no other end
     if last and search.lost:
         search.draw()
@@ -211,10 +212,6 @@ class _Search:
             self.used = near_neighbours(readings, WILD) & near_most(readings, WILD)
 
     @property
-    def _ends(self) -> float:
-        return ENDS if self.last else ENDS_EARLY
-
-    @property
     def plausible(self) -> Mask:
         """Readings near the best trajectory, (samples, sensors); not only those in use.
 
@@ -256,10 +253,6 @@ class _Search:
         self.passes += 1.0
         return self.samples.about(xi)
 
-    def stays(self, xi: Array) -> bool:
-        """True if the best trajectory is within a prior standard deviation of another one."""
-        return self.best is not None and bool(np.linalg.norm(self.best.xi - xi) < STAYS)
-
     def _elsewhere(self, xi: Array) -> None:
         """Search from another point, and note whether that ends at the best trajectory."""
         start, best = self._about(self.samples.within_bounds(xi)), self.best
@@ -274,10 +267,10 @@ class _Search:
 
     def _descend(self, start: Passed) -> Passed:
         """Take Levenberg-Marquardt steps from a pass, and keep the end if it is the best."""
-        end, settled = start, False
+        end, settled, ends = start, False, ENDS if self.last else ENDS_EARLY
         budget, delta = self.passes + self.options.passes, DELTA
         while self.passes < budget:
-            if math.sqrt(2.0 * self._decrease(end)) < self._ends:
+            if math.sqrt(2.0 * self._decrease(end)) < ends:
                 settled = True
                 break
             better, delta = self._stepped(end, delta, budget)
@@ -413,7 +406,8 @@ class _Search:
         # At the end of a run a misfit that pins all unknowns is most likely an error of the model.
         fitted = 1 if self.last and not self.lost else FITTED
         for place in order[:fitted].tolist():
-            if np.isfinite(costs[place]) and not self._known(points[place]):
+            known = self.best is not None and self._near(self.best, points[place])
+            if np.isfinite(costs[place]) and not known:
                 self._elsewhere(points[place])
             if not self.suspicious or self.lacking <= 0:
                 return
@@ -424,10 +418,6 @@ class _Search:
         whole = np.zeros((len(points), len(alive)))
         whole[:, alive] = points
         return np.array([self.samples.within_bounds(one) for one in whole])
-
-    def _known(self, xi: Array) -> bool:
-        """True if a point is at the best trajectory."""
-        return self.best is not None and self._near(self.best, xi)
 
     def _near(self, one: Passed, xi: Array) -> bool:
         """True if a point is within a posterior standard deviation of a trajectory."""
@@ -626,10 +616,7 @@ def _under_way(
 
 @nonfinite_allowed()  # such a trajectory is refused
 def _run(
-    future: Future[SensitivityState],
-    work: SensitivityWork,
-    options: Refit,
-    state: SensitivityState,
+    future: Future[SensitivityState], work: SensitivityWork, options: Refit, state: SensitivityState
 ) -> None:
     try:
         future.set_result(refitted_now(work, options, state))

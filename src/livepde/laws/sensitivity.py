@@ -26,7 +26,6 @@ from livepde.laws.history import added, empty_log, opened, skipped
 from livepde.laws.innovations import Innovations
 from livepde.laws.iterated_smoother import AGREED, Window, distance, next_reference, placed
 from livepde.laws.law import Belief, Deferred, Fit, FixedInterval, Law, Problem, Report, finite
-from livepde.laws.member_arrays import changed, put_each, take, where, zeros
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.noise_rows import PAUSE_ROWS, input_rank, with_initial_rows
 from livepde.laws.one_member import step_alone
@@ -59,6 +58,7 @@ from livepde.laws.verdict import (
     with_noise,
 )
 from livepde.linalg import Array, Mask, nonfinite_allowed
+from livepde.linalg.member_arrays import changed, put_each, take, where, zeros
 from livepde.stepping import (
     Alexander2,
     BandedStage,

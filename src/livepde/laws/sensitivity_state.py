@@ -14,11 +14,11 @@ from livepde.laws.filter import Filter, robust_factors
 from livepde.laws.filter_state import NO_LEDGER, FilterState, unaccompanied
 from livepde.laws.history import added, trimmed, withdrawn
 from livepde.laws.law import Fit, InitialReading
-from livepde.laws.member_arrays import changed, take, where, zeros
 from livepde.laws.noise_rows import rows_of_sensors
 from livepde.laws.policies import Guards, Jumps, Refit, Watch
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg.member_arrays import changed, take, where, zeros
 from livepde.records import refusal
 from livepde.stepping import Span
 

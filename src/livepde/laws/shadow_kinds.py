@@ -14,10 +14,10 @@ import scipy.sparse as sp
 from livepde.fem import FieldBlock, Moment
 from livepde.laws.filter_state import FilterState, ShadowState
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed, put, take, where
 from livepde.laws.noise_rows import grades, pieces
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array, IntArray, Mask, compact
+from livepde.linalg.member_arrays import changed, put, take, where
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.stepping import (
@@ -115,12 +115,7 @@ class HalvedMesh:
         return np.asarray(self.model.initial(given, moment) - coarse)
 
     def in_readings(
-        self,
-        u: Array,
-        q: Array,
-        coarse: Array,
-        difference: Array,
-        moment: Callable[[int], Moment],
+        self, u: Array, q: Array, coarse: Array, difference: Array, moment: Callable[[int], Moment]
     ) -> Array:
         """Return what sensors on the halved mesh read more than on the given one.
 
@@ -166,12 +161,12 @@ def _pointwise(given: Any) -> bool:
     return callable(given) or np.ndim(given) == 0
 
 
+@dataclass(frozen=True, eq=False)
 class _Prolonged(MemberStage):
     """A stage on the halved mesh that takes unknown fields as those of the mesh have them."""
 
-    def __init__(self, stage: MemberStage, unknowns: sp.csr_array) -> None:
-        self.stage = stage
-        self.unknowns = unknowns
+    stage: MemberStage
+    unknowns: sp.csr_array
 
     def twin(self) -> _Prolonged:
         return _Prolonged(self.stage.twin(), self.unknowns)
@@ -232,11 +227,9 @@ class StepTolerance:
         return np.array(states), np.array(parts)
 
     def excess(self, error: Array, x: FilterState, span: Span) -> Array:
-        """Return the sizes of errors of the state after a span, (members, n), over what is allowed.
-
-        A reading counts by its noise if that is smaller than the noise of its sensor.
-        """
+        """Return the sizes of errors of the state after a span, (members, n), over the allowed."""
         (states, parts), at = self._tests, span.end
+        # A reading counts by its noise if that is smaller than the noise of its sensor.
         noise = self.noise if span.noise is None else np.fmin(self.noise, span.noise)
         members, k = len(error), x.C.shape[2]
         U = np.broadcast_to(states, (members, *states.shape))

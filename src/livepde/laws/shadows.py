@@ -27,7 +27,6 @@ from livepde.errors import LawError, LivepdeError
 from livepde.fem import Moment
 from livepde.laws.filter_state import FilterState, ShadowState, along
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed, product, put, take
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadow_kinds import (
     HELD,
@@ -43,12 +42,8 @@ from livepde.laws.shadow_kinds import (
 )
 from livepde.laws.step_diagnostics import Diagnostics, stacked
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
-from livepde.stepping import (
-    TINY,
-    MemberStage,
-    Moments,
-    Span,
-)
+from livepde.linalg.member_arrays import changed, product, put, take
+from livepde.stepping import TINY, MemberStage, Moments, Span
 from livepde.verdict import Shifts
 
 FIRST = 16  # steps that are all shadowed: where a run begins the error changes from step to step
@@ -323,14 +318,7 @@ class ShadowSet:
         return changed(x, shadows=changed(s, **parts)), np.where(rows, 0.0, seen)
 
     def update(
-        self,
-        x: FilterState,
-        U: Array,
-        C: Array,
-        left: Array,
-        weights: Array,
-        off: Array,
-        t: float,
+        self, x: FilterState, U: Array, C: Array, left: Array, weights: Array, off: Array, t: float
     ) -> ShadowState:
         """Return the shadows after a sample.
 

@@ -31,9 +31,9 @@ from livepde.laws.assimilation import GateDecision, absorb
 from livepde.laws.filter_state import FilterState, coordinates, unaccompanied, unjudged
 from livepde.laws.iterated_smoother import Window, expecting, missed, moved, placed
 from livepde.laws.law import FixedInterval
-from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array, Mask, nonfinite_allowed
+from livepde.linalg.member_arrays import changed
 from livepde.stepping import KeptFactors, Span
 
 ITERATIONS = 6  # Gauss-Newton steps at most
@@ -115,7 +115,7 @@ def _begun(
     if best is None:
         return bare, None
     decisions = best.decisions if used is None else _fitted(best.decisions, used, data)
-    samples = bare.decided(decisions)
+    samples = replace(bare, decisions=decisions)
     if not best.refuses and decisions is best.decisions:
         return samples, best
     return samples, samples.about(samples.estimated) or samples.about(None)
@@ -141,7 +141,12 @@ def _descended(samples: _FixedInterval, best: _SmootherPass | None) -> _Smoother
             "smaller dt_max, or a prior closer to what the run found."
         )
     for _ in range(ITERATIONS):
-        target, std = _smoothed_unknowns(samples.work, best)
+        # One by one: the filters of all samples at once, with their states, may need much memory.
+        found = [
+            (_reduced(samples.work, x, x.da), np.linalg.norm(x.C[0], axis=0))
+            for x in _backward(best, best.points[-1].x)
+        ]
+        target, std = map(np.array, zip(*reversed(found), strict=True))
         step = target - best.trajectory
         if (np.abs(step) <= CONVERGED * std + ROUNDING).all():
             break
@@ -152,17 +157,6 @@ def _descended(samples: _FixedInterval, best: _SmootherPass | None) -> _Smoother
             break
         best = better
     return best
-
-
-def _smoothed_unknowns(work: SensitivityWork, best: _SmootherPass) -> tuple[Array, Array]:
-    """Return reduced unknowns given all samples, and their standard deviations, as a trajectory."""
-    # One by one: the filters of all samples at once, with their states, may need much memory.
-    found = [
-        (_reduced(work, x, x.da), np.linalg.norm(x.C[0], axis=0))
-        for x in _backward(best, best.points[-1].x)
-    ]
-    a, std = zip(*reversed(found), strict=True)
-    return np.array(a), np.array(std)
 
 
 def _backward(best: _SmootherPass, after: FilterState) -> Iterator[FilterState]:
@@ -199,39 +193,22 @@ def _reduced(work: SensitivityWork, x: FilterState, da: Array | float = 0.0) -> 
     return a
 
 
+@dataclass(frozen=True, eq=False)
 class _FixedInterval:
-    """The samples of one member, ready to be filtered about trajectories of its unknowns.
+    """The samples of one member, ready to be filtered about trajectories of its unknowns."""
 
-    `decisions` are those of the gate on the samples, the first one at the start; None: it decides.
-    """
+    work: SensitivityWork
+    start: FilterState
+    initial: bool  # True if it begins with the initial state that the model says
+    after: FilterState
+    data: FixedInterval
+    # Those of the gate on the samples, the first one at the start; None: it decides.
+    decisions: Sequence[GateDecision] | None = None
 
-    def __init__(
-        self,
-        work: SensitivityWork,
-        start: FilterState,
-        initial: bool,
-        after: FilterState,
-        data: FixedInterval,
-        decisions: Sequence[GateDecision] | None = None,
-    ) -> None:
-        self.work, self.data, self.decisions = work, data, decisions
-        self.jumps = set(data.jumps) if work.jumps is not None else set()
-        self.moves = work.filter.moves or bool(self.jumps)
-        opening, intervals = data.opening, data.intervals
-        length = intervals[-1].t1 - opening.t1 if intervals else 0.0
-        self.window = Window(
-            start=start,
-            now=after,
-            reference=start.q[0],
-            initial=initial,
-            moment=opening.end,
-            length=length,
-        )
-
-    def decided(self, decisions: Sequence[GateDecision]) -> _FixedInterval:
-        """Return the same samples with the gate's decisions on them."""
-        start, initial, after = self.window.start, self.window.initial, self.window.now
-        return _FixedInterval(self.work, start, initial, after, self.data, decisions)
+    @property
+    def moves(self) -> bool:
+        """True if an unknown moves or jumps."""
+        return self.work.filter.moves or bool(self.work.jumps is not None and self.data.jumps)
 
     def _absorbed(
         self, x: FilterState, span: Span, number: int
@@ -287,12 +264,21 @@ class _FixedInterval:
 
     def _started(self, trajectory: Array | None) -> tuple[FilterState, float, GateDecision]:
         """Return the filter after a sample at the start, the misfit, and the gate's decision."""
-        filter_, opening, start = self.work.filter, self.data.opening, self.window.start
+        filter_, opening, start = self.work.filter, self.data.opening, self.start
         q, shift = start.q[0], np.zeros(start.C.shape[2])
         if trajectory is not None:
             shift = trajectory[0] - _reduced(self.work, start)
             q = q + filter_.reduction.Phi @ shift
-        x = placed(filter_, self.window, filter_.reduction.bounded(q))
+        end = self.data.intervals[-1].t1 if self.data.intervals else opening.t1
+        window = Window(
+            start=start,
+            now=self.after,
+            reference=start.q[0],
+            initial=self.initial,
+            moment=opening.end,
+            length=end - opening.t1,
+        )
+        x = placed(filter_, window, filter_.reduction.bounded(q))
         # Coordinates xi of the shift: its probability at the start goes with exp(-|xi|^2/2).
         weights = coordinates(start.C[0], shift)
         misfit = float(weights @ weights)
@@ -308,9 +294,9 @@ class _FixedInterval:
     def _gained(self, variance: Array, number: int, h: float) -> Array:
         """Return the variance that coordinates gain in an interval, with a jump, shape (k,)."""
         filter_, jumps = self.work.filter, self.work.jumps
-        drifts = filter_.drifts(self.window.now.member)
+        drifts = filter_.drifts(self.after.member)
         gained = filter_.reduction.gained(h, variance, drifts)[0]
-        if jumps is not None and number in self.jumps:
+        if jumps is not None and number in self.data.jumps:
             # The jump is at the beginning of the interval, and is carried to its end.
             F = filter_.reduction.transition(h)
             gained = gained + jumps.size**2 * (F**2 @ self.work.jumping)
@@ -320,7 +306,7 @@ class _FixedInterval:
         """Return the filter before the update at the end of an interval, and P."""
         filter_, jumps, rows = self.work.filter, self.work.jumps, x.C.shape[1]
         x = changed(x, past=np.eye(rows)[None], dpast=np.zeros((1, rows)))
-        if jumps is not None and number in self.jumps:
+        if jumps is not None and number in self.data.jumps:
             x = filter_.inflated(x, jumps.size, self.work.jumping)
         span = filter_.span(self.data.intervals[number])
         x, _, failure = filter_.predict(x, span)

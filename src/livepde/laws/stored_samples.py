@@ -19,9 +19,9 @@ from livepde.laws.filter import Filter, contraction
 from livepde.laws.filter_state import FilterState, coordinates, extended
 from livepde.laws.gate import Gate
 from livepde.laws.history import LogRows, first_interval, intervals_since
-from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg.member_arrays import changed
 from livepde.stepping import BandedStage, Moments, Span, StageOfMembers, Steps, Sweep, advance
 
 FACTORS = 32  # factorised matrices that a pass keeps: one for each length of a stage

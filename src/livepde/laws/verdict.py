@@ -12,7 +12,6 @@ from livepde.laws.columns import Columns, likely_columns
 from livepde.laws.filter import Filter, reported_factors
 from livepde.laws.filter_state import PAUSE, SETTLED, FilterState, ShadowState
 from livepde.laws.law import Fit, Problem, Status
-from livepde.laws.member_arrays import changed
 from livepde.laws.model_errors import errors_of_innovations, model_errors
 from livepde.laws.noise_rows import input_rank
 from livepde.laws.reduction import Reduction
@@ -21,12 +20,12 @@ from livepde.laws.shadow_kinds import ALLOWED
 from livepde.laws.shadows import ShadowSet
 from livepde.laws.stored_samples import StoredSamples
 from livepde.linalg import Array, IntArray, nonfinite_allowed
+from livepde.linalg.member_arrays import changed
 from livepde.records import STATUS_CODES
 from livepde.stepping import MOST_SUBSTEPS
 from livepde.verdict import (
     NOT_JUDGED,
     REFUSED,
-    WINDOWS,
     Dictionary,
     Finding,
     Judge,
@@ -64,14 +63,7 @@ def judge_of(
         return None
     still = kept and not (reduction.moves or problem.input_noise)
     model = problem.model
-    dictionary = Dictionary(
-        model,
-        problem.observed,
-        noise,
-        reduction.stay,
-        dearer=verdict is True,
-        windows=len(WINDOWS),
-    )
+    dictionary = Dictionary(model, problem.observed, noise, reduction.stay, dearer=verdict is True)
     sizes = problem.observed.size, reduction.size, model.X.dim
     # Noise of inputs, and errors of the start, add rows before they are compressed.
     rows = rank + input_rank(problem) + problem.initial_rank
@@ -149,26 +141,23 @@ def with_discretisation(verdict: Verdict, shadows: ShadowSet | None, s: ShadowSt
     """Return a verdict that names the errors of the discretisation which are not held."""
     missing = "the discretisation: shadows = None" if shadows is None else shadows.unfollowed
     if shadows is not None and s.coarse[0]:
-        verdict = verdict.with_findings([_coarse(s, shadows.most)])
+        worst = float(s.coarsest[0])
+        text, remedy = FINDINGS["step"].filled(
+            count=int(s.coarse[0]),
+            steps=int(s.count[0]),
+            size=ALLOWED * worst,
+            allowed=ALLOWED,
+            parts=shadows.most,
+        )
+        # The shift by errors that are so large is estimated with few correct digits.
+        severity: Severity = "caution" if worst > COARSE else "note"
+        found = Finding("step", severity, text, "time step", worst, remedy=remedy)
+        verdict = verdict.with_findings([found])
     if not missing or not verdict.judged:
         return verdict
     text, _ = FINDINGS["untested"].filled(what=missing)
     more = Finding("untested", "note", text, "discretisation")
     return verdict.with_untested(missing).with_findings([more])
-
-
-def _coarse(s: ShadowState, most: int) -> Finding:
-    coarse, worst = int(s.coarse[0]), float(s.coarsest[0])
-    text, remedy = FINDINGS["step"].filled(
-        count=coarse,
-        steps=int(s.count[0]),
-        size=ALLOWED * worst,
-        allowed=ALLOWED,
-        parts=most,
-    )
-    # The shift by errors that are so large is estimated with few correct digits.
-    severity: Severity = "caution" if worst > COARSE else "note"
-    return Finding("step", severity, text, "time step", worst, remedy=remedy)
 
 
 def with_columns(verdict: Verdict, columns: Columns | str) -> Verdict:
@@ -316,13 +305,9 @@ def step_findings(counts: Mapping[str, int]) -> Iterator[Finding]:
         if not count:
             continue
         text, _ = FINDINGS[code].filled(count=count, samples=samples)
-        severity = _severity(code, count / samples)
-        remedy = Status(code).remedy
-        yield Finding("steps", severity, text, code, float(count), remedy=remedy)
-
-
-def _severity(code: str, share: float) -> Severity:
-    # A right model departs in one of a million cases: there is no mishap of that sort.
-    if share > (SOME if code == "departed" else MOST):
-        return "do not trust"
-    return "caution" if code == "departed" or share > SOME else "note"
+        share, departed = count / samples, code == "departed"
+        # A right model departs in one of a million cases: there is no mishap of that sort.
+        severity: Severity = "caution" if departed or share > SOME else "note"
+        if share > (SOME if departed else MOST):
+            severity = "do not trust"
+        yield Finding("steps", severity, text, code, float(count), remedy=Status(code).remedy)

@@ -46,7 +46,6 @@ class Factor(Protocol):
 
     def solve(self, b: Array, /) -> Array:
         """Return x with K x = b; `b` has shape (n,) or, for several right-hand sides, (n, k)."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,17 +61,14 @@ class Solver(Protocol):
     @property
     def name(self) -> str:
         """Name of the solver for messages."""
-        ...
 
     @property
     def pattern(self) -> Pattern:
         """Sparsity pattern of its matrices."""
-        ...
 
     @property
     def definite(self) -> bool:
         """True if it refuses a matrix that is not positive definite, at the latest in a solve."""
-        ...
 
     @property
     def price(self) -> float:
@@ -80,7 +76,6 @@ class Solver(Protocol):
 
         A constant, not a measured time: timings must not influence the numbers computed.
         """
-        ...
 
     def factorise(self, data: Array) -> Factor:
         """Factorise the matrix `pattern.matrix(data)`.
@@ -90,7 +85,6 @@ class Solver(Protocol):
         LinearAlgebraError
             The matrix is singular to working precision or holds a value that is not finite.
         """
-        ...
 
 
 def check_finite(data: Array) -> None:
@@ -161,16 +155,12 @@ class SuperLUSolver:
 
     pattern: Pattern
     symmetric: bool = False
+    definite: bool = False  # it does not check the signs of pivots
     price: float = 30.0
 
     @property
     def name(self) -> str:
         return "SuperLU (SciPy)" + (", symmetric mode" if self.symmetric else "")
-
-    @property
-    def definite(self) -> bool:
-        """False: SuperLU does not check the signs of pivots."""
-        return False
 
     def factorise(self, data: Array) -> SuperLUFactor:
         """Factorise; raise `LinearAlgebraError` for a singular or non-finite matrix.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -21,6 +22,7 @@ ROUNDING = 1e-11
 LARGE = 2.0**20
 
 
+@dataclass(frozen=True, eq=False)
 class DrivenVector:
     """A vector v(t, inputs), (n,), usually affine in the inputs and independent of time.
 
@@ -28,15 +30,9 @@ class DrivenVector:
     returns True if the vector has read the time so far.
     """
 
-    def __init__(
-        self,
-        vector: Callable[[Moment], Array],
-        channels: tuple[str, ...],
-        timed: Callable[[], bool],
-    ) -> None:
-        self.vector = vector
-        self.channels = channels
-        self._timed = timed
+    vector: Callable[[Moment], Array]
+    channels: tuple[str, ...]
+    timed: Callable[[], bool]
 
     def _at(self, t: float, inputs: Array) -> Array:
         named = dict(zip(self.channels, inputs.tolist(), strict=True))
@@ -69,7 +65,7 @@ class DrivenVector:
         if not self.affine:
             return None
         base, changes = self.assembled()
-        return None if self._timed() else (base[None], changes)
+        return None if self.timed() else (base[None], changes)
 
     def without_inputs(self) -> Array:
         """Return the vector at time 0 without inputs, (n,)."""

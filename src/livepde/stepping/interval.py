@@ -76,8 +76,6 @@ class Held:
 
 
 LINES = Held()
-
-
 NO_INPUTS = np.zeros((1, 0))
 
 
@@ -198,13 +196,6 @@ class Interval:
         s = self._weight(t)
         start = np.where(np.isfinite(self.z0), self.z0, self.z1)
         return (1 - s) * start + s * self.z1
-
-    def change(self, start: float, stop: float) -> Array:
-        """Return the change of z between two times; zero where z is missing at t0."""
-        share = (stop - start) / (self.t1 - self.t0)
-        change: Array = share * (self.z1 - self.z0)
-        change[np.isnan(change)] = 0.0
-        return change
 
 
 def _values(inputs: Mapping[str, float], channels: tuple[str, ...]) -> Array:

@@ -348,13 +348,7 @@ class BandedStage(MemberStage):
         # The state first: the tangents need it.
         u[:] = step.factor.solve(new[:1])[0]
         if len(columns) > 1:
-            # A(u) e_j = A_j u + offset_j of each unknown, (members, unknowns, n), drives the
-            # tangents.
-            driven = self._slopes(u).reshape(size, -1, n)
-            if self._terms:
-                driven = self._by_inputs(driven, step, inputs)
-            if offset is not None:
-                driven = driven + offset
+            driven = self._driven(u, offset, step, inputs)
             along, chosen = stage.h * stage.directions, together // size - 1
             if step.slopes is not None:
                 along = along @ step.slopes.transpose(0, 2, 1)
@@ -405,14 +399,16 @@ class BandedStage(MemberStage):
             offset[:, term.unknown] += drawn
         return offset
 
-    def _by_inputs(self, driven: Array, step: BandedStep, inputs: Array) -> Array:
-        """Return A(u) e_j of each unknown from its parts, (members, unknowns, n)."""
-        count = step.amounts.shape[1]
-        found, more = driven[:, :count].copy(), iter(range(count, driven.shape[1]))
-        for term in self._terms:
-            if term.unknown >= 0:
-                found[:, term.unknown] += inputs[:, term.channel, None] * driven[:, next(more)]
-        return found
+    def _driven(self, u: Array, offset: Array | None, step: BandedStep, inputs: Array) -> Array:
+        """Return what drives the tangents, A(u) e_j = A_j u + offset_j, (members, unknowns, n)."""
+        parts, count = self._slopes(u).reshape(len(u), -1, u.shape[1]), step.amounts.shape[1]
+        found = parts
+        if self._terms:
+            found, more = parts[:, :count].copy(), iter(range(count, parts.shape[1]))
+            for term in self._terms:
+                if term.unknown >= 0:
+                    found[:, term.unknown] += inputs[:, term.channel, None] * parts[:, next(more)]
+        return found if offset is None else found + offset
 
     def _forced(self, h: float) -> tuple[Array, Array] | None:
         """Return what drives the state in a stage, (1, n), and its derivative in the inputs.

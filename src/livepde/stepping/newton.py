@@ -38,22 +38,18 @@ class StagePoint(Protocol):
     @property
     def y(self) -> Array:
         """The iterate, shape (n,)."""
-        ...
 
     @property
     def residual(self) -> Array:
         """The residual, shape (n,)."""
-        ...
 
     @property
     def size(self) -> float:
         """Dual norm of the residual, relative to that of the largest term of the equation."""
-        ...
 
     @property
     def resolved(self) -> bool:
         """False if the residual is too large to resolve a small difference in the equation."""
-        ...
 
 
 Point = TypeVar("Point", bound=StagePoint)
@@ -64,15 +60,12 @@ class StageEquation(Protocol[Point]):
 
     def evaluate(self, y: Array) -> Point:
         """Return the evaluation at y."""
-        ...
 
     def factor(self, at: Point) -> Factor:
         """Return the factorised Jacobian at an iterate."""
-        ...
 
     def limited(self, at: Point, allowed: float) -> bool:
         """Return True if rounding errors alone keep the residual above `allowed`."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,14 +162,14 @@ class Newton:
         return iteration.run(at, Near(at.y), self.tolerance, self.iterations)
 
 
+@dataclass(eq=False)
 class _Iteration(Generic[Point]):
     """Newton's iteration for one stage; `updates` counts over all of its attempts."""
 
-    def __init__(self, newton: Newton, equation: StageEquation[Point]) -> None:
-        self.newton = newton
-        self.equation = equation
-        self.updates = 0
-        self.made: tuple[Point, Factor] | None = None
+    newton: Newton
+    equation: StageEquation[Point]
+    updates: int = 0
+    made: tuple[Point, Factor] | None = None
 
     def run(self, at: Point, near: Near, allowed: float, factors: int) -> Solution[Point]:
         """Return the solution; raise `StepFailed` without convergence.
@@ -224,10 +217,7 @@ class _Iteration(Generic[Point]):
         return factor
 
     def _updated(self, at: Point, factor: Factor) -> tuple[Point, Array]:
-        try:
-            update = factor.solve(at.residual)
-        except LinearAlgebraError as error:
-            raise StepFailed("singular", str(error)) from error
+        update = solved(factor, at.residual)
         self.updates += 1
         new = self.equation.evaluate(at.y - update)
         if not math.isfinite(new.size):

@@ -8,9 +8,10 @@ its size, to distinguish causes, and so costs a fraction of a step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
@@ -18,10 +19,11 @@ import scipy.sparse as sp
 
 from livepde.errors import ObservationError
 from livepde.fem import Inputs, Moment, On
-from livepde.linalg import Array, IntArray, RowProduct, row_product
+from livepde.linalg import Array, IntArray, row_product
 from livepde.model import Model
 from livepde.observation import CombinedObserved, Observed, Points
 from livepde.stepping import ForwardStage
+from livepde.verdict.ledger import WINDOWS
 
 FIXED = "the fixed boundary"  # constants of the model, which may be wrong as well
 
@@ -42,16 +44,14 @@ MOST_SUMS = 12_000  # numbers in one kind of sum
 
 
 class Now(NamedTuple):
-    """Point of a response: state, latent parameter, inputs, usual interval and rest state."""
+    """Point of a response: state, latent parameter, time and inputs, and what a load asks for."""
 
-    # u, q, moment, unit: the state, the latent parameter, time and inputs, and the usual time
-    # between samples
     u: Array
     q: Array
     moment: Moment
-    unit: float
-    # Value at which the state has nothing to lose: the mean of the sensors at the start
-    rest: float
+    unit: float = 1.0  # usual time between samples
+    rest: float = 0.0  # state that has nothing to lose: the mean of the sensors at the start
+    rates: Mapping[str, float] = MappingProxyType({})  # changes of inputs per unit of time
 
 
 Load: TypeAlias = Callable[[Now], Array]
@@ -132,22 +132,31 @@ class Process:
 
     def advance(self, p: Array, now: Now, h: float) -> Array:
         """Return the responses a time h later, shape (terms, n)."""
-        # M (p+ - p)/h + S_u p+ = load, with p+ = lift on the boundary.
-        factor, rows = self.stage.linearised(now.u, now.q, h, now.moment)
-        known = (self.model.mass @ p.T).T / h - (rows @ self._lifts.T).T
+        loads = np.zeros_like(p)
         for k, term in enumerate(self.terms):
             if term.load is not None:
-                known[k] += term.load(now)
-        free = self.model.X.free
-        solved: Array = factor.solve((known * free).T).T
-        found: Array = solved * free + self._lifts
-        return found
+                loads[k] = term.load(now)
+        return later(self.stage, p, now, h, loads, self._lifts)
 
     def readings(self, p: Array, now: Now) -> Array:
         """Return the readings of the responses, shape (terms, sensors)."""
         physical = self.model.latent.value(now.q)
         H, _ = self.observed.jacobian(now.u, physical, now.moment)
         return np.asarray((H @ p.T).T)
+
+
+def later(stage: ForwardStage, p: Array, now: Now, h: float, loads: Array, lifts: Array) -> Array:
+    """Return responses p of a process a time h later; p, loads and lifts: (responses, n).
+
+    M (p+ - p)/h + S_u p+ = load, with p+ = lift on the boundary.
+    """
+    model = stage.model
+    factor, rows = stage.linearised(now.u, now.q, h, now.moment)
+    known = np.asarray((model.mass @ p.T).T) / h + loads
+    if lifts.any():
+        known -= np.asarray((rows @ lifts.T).T)
+    solved: Array = factor.solve((known * model.X.free).T).T
+    return solved * model.X.free + lifts
 
 
 def _constant(shape: Array, level: float) -> Load:
@@ -157,7 +166,7 @@ def _constant(shape: Array, level: float) -> Load:
 
 def _gain(model: Model, name: str) -> Load:
     """Return the load of a channel that is larger by `SCALED` than the model takes it for."""
-    return lambda now: scaled_channel(model, name, now.u, now.q, now.moment, SCALED)
+    return lambda now: scaled_channel(model, name, now, SCALED)
 
 
 def boundary_lifts(model: Model) -> dict[str, Array]:
@@ -179,10 +188,7 @@ def boundary_lifts(model: Model) -> dict[str, Array]:
 
 
 def flux_loads(model: Model, most: int | None = None) -> dict[str, Array]:
-    """Return boundary -> load of a flux of one through it, (n,), where no value is stated.
-
-    Of the first `most` boundaries of the mesh.
-    """
+    """Return loads of a flux of one, (n,), through those of `most` boundaries without a value."""
     ones, found = model.state_space.interpolate(1.0), {}
     for name in [str(one) for one in model.mesh.boundaries or {}][:most]:
         form: Any = On(name, lambda u, v, x: u * v)
@@ -192,19 +198,19 @@ def flux_loads(model: Model, most: int | None = None) -> dict[str, Array]:
     return found
 
 
-def force(model: Model, u: Array, q: Array, moment: Moment) -> Array:
-    """Return F - B(u) - A(u) q, (n,), of a latent parameter q."""
-    driven = model.physical_A.vector("v", moment, q=model.latent.value(q), u=u)
+def force(model: Model, now: Now) -> Array:
+    """Return F - B(u) - A(u) q, (n,)."""
+    u, moment = now.u, now.moment
+    driven = model.physical_A.vector("v", moment, q=model.latent.value(now.q), u=u)
     found: Array = model.F(moment) - model.B(u, moment) - driven
     return found
 
 
-def scaled_channel(
-    model: Model, name: str, u: Array, q: Array, moment: Moment, share: float
-) -> Array:
+def scaled_channel(model: Model, name: str, now: Now, share: float) -> Array:
     """Return the change of the force with a channel that is larger by a share of it, (n,)."""
-    more = Inputs({**moment.inputs, name: (1.0 + share) * moment.inputs[name]})
-    return force(model, u, q, Moment(moment.t, more)) - force(model, u, q, moment)
+    inputs = now.moment.inputs
+    more = Moment(now.moment.t, Inputs({**inputs, name: (1.0 + share) * inputs[name]}))
+    return force(model, now._replace(moment=more)) - force(model, now)
 
 
 def stride(seen: int) -> int:
@@ -228,28 +234,6 @@ class ScoreDirection:
     at: float = np.nan  # coordinate of the sensor along the axis; NaN if it is not a position
 
 
-@dataclass(frozen=True, eq=False)
-class ForwardShifts:
-    """How readings change if sensors are shifted, as a matrix on the coefficients that matter."""
-
-    axes: int  # number of axes
-    # used, product: coefficients of the state, (m,), and the product of the matrix of all axes one
-    # after the other, (axes * sensors, m), with rows of them
-    used: IntArray
-    product: RowProduct
-
-    @classmethod
-    def of(cls, shifts: Sequence[sp.csr_array]) -> ForwardShifts:
-        """Return the value of the matrices of all axes, each (sensors, n)."""
-        rows = sp.csc_array(sp.vstack(shifts))
-        used = np.flatnonzero(np.diff(rows.indptr))
-        return cls(len(shifts), used, row_product(sp.csr_array(rows[:, used])))
-
-    def of_readings(self, u: Array) -> Array:
-        """Return the changes of readings with states u, (members, axes * sensors)."""
-        return self.product(u.take(self.used, axis=1))
-
-
 class Dictionary:
     """All directions of a model and its sensors.
 
@@ -259,7 +243,6 @@ class Dictionary:
     `noise`: standard deviation of each sensor.
     `unknowns`: labels of the coordinates that may jump, each with its place.
     `dearer`: with the directions that cost solves: terms that the process may lack.
-    `windows`: in how many windows sums are kept.
     """
 
     def __init__(
@@ -270,7 +253,6 @@ class Dictionary:
         unknowns: list[tuple[str, int]],
         *,
         dearer: bool,
-        windows: int,
     ) -> None:
         self.left_out: list[str] = []
         self.process = Process(model, observed, float(np.median(noise))) if dearer else None
@@ -283,7 +265,7 @@ class Dictionary:
         self.directions: list[ScoreDirection] = []
         self.parts: dict[str, slice] = {}
         # Every direction is a row and a column of sums of products, kept for each window.
-        room = MOST_SUMS // (windows * observed.size) - len(jumps) - len(terms)
+        room = MOST_SUMS // (len(WINDOWS) * observed.size) - len(jumps) - len(terms)
         self._add_sensors(model, observed, noise, room)
         self.jumps = [place for _, place in jumps]
         self._add("jump", [ScoreDirection("jump", label, JUMP) for label, _ in jumps])
@@ -321,7 +303,16 @@ class Dictionary:
             found = [ScoreDirection(kind, name, one, unit, k) for k, name, one, unit in each]
             self._add(kind, _within_reach(model, observed, found) if kind == "position" else found)
         self.own: IntArray = np.arange(len(self.directions)) % sensors  # sensor of each so far
-        self.shifts = ForwardShifts.of(shifts) if "position" in amplitudes else None
+        self.axes = len(shifts) if "position" in amplitudes else 0  # along which sensors may be off
+        if self.axes:
+            # The coefficients of the state that matter, and the matrices of all axes on them.
+            rows = sp.csc_array(sp.vstack(shifts))
+            self._used = np.flatnonzero(np.diff(rows.indptr))
+            self._moved = row_product(sp.csr_array(rows[:, self._used]))
+
+    def moved(self, u: Array) -> Array:
+        """Return changes of readings by shifts of sensors, (members, axes * sensors)."""
+        return self._moved(u.take(self._used, axis=1))
 
     def _add(self, part: str, directions: list[ScoreDirection]) -> None:
         """Append directions, and note their places."""

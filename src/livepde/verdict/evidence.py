@@ -115,17 +115,11 @@ class LinearModel:
 
 
 class Mixture(NamedTuple):
-    """Normal components of numbers.
+    """Normal components of numbers."""
 
-    Attributes
-    ----------
-    weights, means, deviations
-        Shapes (components,), (components, numbers), (components, numbers).
-    """
-
-    weights: Array
-    means: Array
-    deviations: Array
+    weights: Array  # (components,)
+    means: Array  # (components, numbers)
+    deviations: Array  # (components, numbers)
 
     def widened(self, shift: Array) -> Mixture:
         """Return the same numbers with an error of a known size besides, (numbers,)."""
@@ -180,13 +174,12 @@ class _Axes(NamedTuple):
 
 
 class _Tried(NamedTuple):
-    """Hypotheses: sum of squares left, half a determinant, shifts and variances of the numbers.
+    """Hypotheses, and what each says of the numbers."""
 
-    Shapes (hypotheses,), (hypotheses,), and (hypotheses, numbers) twice.
-    """
-
+    # Sum of squares that is left, and half the logarithm of a determinant, (hypotheses,)
     squares: Array
     volume: Array
+    # Shapes (hypotheses, numbers)
     shift: Array
     variance: Array
 
@@ -367,18 +360,12 @@ def following(ledger: Ledger, window: int) -> Following | None:
 
 
 def quiet(ledger: Ledger, log_e: Array) -> bool:
-    """Return whether there is no evidence against the model in the windows that restart.
-
-    `log_e`: of all windows and directions.
-    """
+    """Return whether windows that restart have no evidence; log_e: (windows, directions)."""
     return unsuspicious(log_e[1:]) and following(ledger, -1) is None
 
 
 def unsuspicious(log_e: Array) -> bool:
-    """Return whether no window has evidence against the model.
-
-    `log_e`: of some windows and all directions.
-    """
+    """Return whether no window has evidence against the model; log_e: (windows, directions)."""
     if not log_e.size:
         return True
     each = scipy.special.logsumexp(log_e, axis=1) - np.log(log_e.shape[1])

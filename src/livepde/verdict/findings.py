@@ -52,10 +52,7 @@ SETTING = 1.0  # the same if inputs are readings: no interval holds that
 HOLD = "hold"
 LISTED = 5  # unknowns in a sentence
 REFINE = {
-    "step": (
-        "the time step",
-        "Reduce `steps.dt_max`, or use a second-order scheme.",
-    ),
+    "step": ("the time step", "Reduce `steps.dt_max`, or use a second-order scheme."),
     "mesh": ("the mesh", "Refine the mesh (`mesh.cells`) where the state varies most."),
     "input": ("the linear interpolation of inputs", "Sample these inputs more often."),
 }
@@ -325,22 +322,19 @@ class Verdict:
         new = [finding for finding in more if finding.text not in texts]
         later = {(one.what, one.subject) for one in new if one.subject or one.what in ONCE}
         kept = [one for one in self.findings if (one.what, one.subject) not in later]
-        return self._with([*kept, *new])
+        return self._with(findings=[*kept, *new])
 
     def with_errors(self, errors: ModelErrors) -> Verdict:
         """Return the verdict whose level follows from fit and effect."""
-        return Verdict.of(
-            self.findings, self.untested, self.unseen, judged=self.judged, errors=errors
-        )
-
-    def _with(self, findings: Iterable[Finding], *untested: str) -> Verdict:
-        """Return the verdict with other findings, and more that was not tested."""
-        more = (*self.untested, *untested)
-        return Verdict.of(findings, more, self.unseen, judged=self.judged, errors=self.errors)
+        return self._with(errors=errors)
 
     def with_untested(self, untested: str) -> Verdict:
         """Return the verdict with one more thing that was not tested."""
-        return self._with(self.findings, untested)
+        return self._with(untested=(*self.untested, untested))
+
+    def _with(self, **parts: Any) -> Verdict:
+        own = {name: value for name, value in vars(self).items() if name != "level"}
+        return Verdict.of(**(own | parts))
 
     def with_causes(self, causes: Sequence[Cause]) -> Verdict:
         """Return the verdict with other causes of its misfit, the likeliest first.
@@ -381,8 +375,7 @@ class Verdict:
             causes=tuple(ranked),
             shift=misfit.shift if same else {},
         )
-        kept = [better, *(one for one in self.findings if one is not misfit)]
-        return self._with(kept)
+        return self._with(findings=[better, *(one for one in self.findings if one is not misfit)])
 
     @property
     def every_sentence(self) -> list[str]:

@@ -26,16 +26,16 @@ the estimate of the unknowns for each unit of the cause.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from livepde.linalg import Array, Mask, nonfinite_allowed
+from livepde.linalg.member_arrays import changed, where
 from livepde.stepping import Moments
 from livepde.verdict.directions import JUMP, Dictionary, Now, stride
 from livepde.verdict.evidence import causes_of, quiet
-from livepde.verdict.ledger import WINDOWS, Ledger, batch_of, blocked, changed, summed
+from livepde.verdict.ledger import WINDOWS, Ledger, batch_of, blocked, summed
 
 MOST_MEMBERS = 16  # of a fleet in which missing terms are looked for
 MOST_RECORDED = 400  # numbers in a block of the record of the unknowns
@@ -98,7 +98,7 @@ class Judge:
             "predicted": sensors,
             "Y": rank * sensors,
             "M": rank**2,
-            "moved": sensors * (dictionary.shifts.axes if dictionary.shifts else 0),
+            "moved": sensors * dictionary.axes,
             "answers": self.terms * sensors,
             "a": unknowns if self.recorded else 0,
             "C": unknowns**2 if self.recorded else 0,
@@ -110,21 +110,12 @@ class Judge:
         self.batch = batch_of(self.numbers)
         self._eye = np.eye(rank)[None]
 
-    def widened(self, more: int) -> Judge:
-        """Return the judge of a filter whose square root has more rows."""
-        sizes = self.sensors, self.unknowns, self.n, self.rank + more
-        return Judge(self.dictionary, *sizes, still=self.recorded)
-
     def start(self) -> Ledger:
         """Return the ledger of one member before any sample."""
         followed = self.unknowns if self.recorded else 0
         n = self.n if self.terms else 0
         counts = len(self.dictionary), followed, self.terms, n, self.windows, self.rank
         return Ledger.start(self.sensors, *counts, self.batch, self.numbers)
-
-    def answered(self, members: int) -> bool:
-        """Return whether missing terms are looked for: each costs a solve for each member."""
-        return self.terms > 0 and members <= MOST_MEMBERS
 
     def add(self, ledger: Ledger, sample: ScoredSample) -> tuple[Array, Ledger]:
         """Return M of the next sample before its update, the identity, and the ledger."""
@@ -135,7 +126,9 @@ class Judge:
         if np.count_nonzero(ledger.waiting % self.batch) < members:
             M, ledger = self._begin_batch(ledger, sample)
         reached = _reached(ledger, sample.at.t)
-        if self.answered(members) and np.count_nonzero(reached) < members:
+        # Missing terms cost a solve for each member.
+        follows = self.terms > 0 and members <= MOST_MEMBERS
+        if follows and np.count_nonzero(reached) < members:
             ledger = self._extend_answers(ledger, sample)
         rows, at, waiting = ledger.rows.copy(), self._at, ledger.waiting
         alone = members == 1
@@ -147,8 +140,8 @@ class Judge:
             start, stop = at[name].start, at[name].stop
             row[:, start : start + part[0].size] = part.reshape(members, -1)
             row[:, start + part[0].size : stop] = 0.0  # rows that a square root lacks
-        if self.dictionary.shifts is not None:
-            row[:, at["moved"]] = self.dictionary.shifts.of_readings(sample.u)
+        if self.dictionary.axes:
+            row[:, at["moved"]] = self.dictionary.moved(sample.u)
         if self.terms:  # interpolated later on, many at once
             row[:, at["answers"]] = np.nan
         if self.recorded:
@@ -167,8 +160,7 @@ class Judge:
     def summed_up(self, ledger: Ledger, M: Array) -> tuple[Array, Ledger]:
         """Return w and the ledger after all samples that wait are summed.
 
-        `M`: as it is now, (members, r, rank).
-        `w`: shape (members, r, windows times directions).
+        `M`: as it is now, (members, r, rank). `w`: (members, r, windows times directions).
         """
         members, at, due = len(ledger.seen), self._at, ledger.due
         # Only as many rows as some member has waiting are summed.
@@ -237,13 +229,6 @@ class Judge:
         told: Array = rows[:, :, at["d"]] + (rows[:, :, None, at["a"]] @ Y)[:, :, 0]
         return Y * used[:, :, None], told * used
 
-    @staticmethod
-    def _unit(ledger: Ledger, k: int, t: float) -> float:
-        """Return the usual interval of a member, or the time since its first sample."""
-        known = float(ledger.times[k, 1])
-        since = t - float(ledger.rows[k, 0, 0])
-        return known if np.isfinite(known) else since if since > 0.0 else 1.0
-
     def _with_interval(self, ledger: Ledger, rows: Array, there: Mask) -> Ledger:
         """Return the ledger with the usual interval, the first one, and the first predictions."""
         if np.isfinite(ledger.times[:, 1]).all() and np.isfinite(ledger.first).all():
@@ -283,7 +268,7 @@ class Judge:
         if full.any():
             found, settled = self.summed_up(ledger, sample.M)
             w[full] = found[full]
-            ledger = settled if full.all() else _where(full, settled, ledger)
+            ledger = where(full, settled, ledger)
         w = self._begin_windows(ledger, sample, ledger.due & begins[:, None], w)
         kept = np.zeros_like(ledger.w)
         kept[:, :r] = w[:, : self.rank]
@@ -356,7 +341,10 @@ class Judge:
             # Without a better guess, what the sensors showed first is where nothing is lost.
             first = ledger.first[k, np.isfinite(ledger.first[k])]
             rest = float(first.sum()) / max(len(first), 1)
-            unit = self._unit(ledger, k, t)
+            # The usual interval, or the time since the first sample.
+            unit, since = float(ledger.times[k, 1]), t - float(ledger.rows[k, 0, 0])
+            if not np.isfinite(unit):
+                unit = since if since > 0.0 else 1.0
             now = Now(sample.u[k], q[k], sample.at.member(k), unit, rest)
             if not np.isfinite(reached[k, 1]):
                 p[k] = process.start()
@@ -415,16 +403,6 @@ def _whitening(Y: Array) -> tuple[Array, Array]:
         scale /= np.where(values > 0.0, values, 1.0)
         axes = Yt @ axes
     return axes, scale[..., None]
-
-
-def _where(chosen: Mask, one: Ledger, other: Ledger) -> Ledger:
-    """Return a ledger whose chosen members are of one, the rest of another."""
-
-    def either(name: str) -> Any:
-        first, second = getattr(one, name), getattr(other, name)
-        return np.where(chosen.reshape(-1, *(1,) * (first.ndim - 1)), first, second)
-
-    return Ledger(**{item.name: either(item.name) for item in fields(Ledger)})
 
 
 def _sensitivity(C: Array, Y: Array) -> Array:

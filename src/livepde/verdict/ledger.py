@@ -18,6 +18,7 @@ import numpy as np
 import scipy
 
 from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg.member_arrays import changed
 from livepde.verdict.findings import FEWEST, Cause, Finding, Severity, Shifts, channel_setting
 from livepde.verdict.model_errors import FAILED, OF_SIGNAL
 from livepde.verdict.sentences import FINDINGS, LIKELY, table_of
@@ -168,13 +169,6 @@ def batch_of(numbers: int) -> int:
     while batch > 1 and batch * numbers > ROOM:
         batch //= 2
     return batch
-
-
-def changed(ledger: Ledger, **parts: Any) -> Ledger:
-    """Return a ledger with some fields exchanged: `dataclasses.replace` in a tenth of its time."""
-    new: Ledger = object.__new__(Ledger)
-    object.__setattr__(new, "__dict__", {**ledger.__dict__, **parts})
-    return new
 
 
 def summed(old: Ledger, due: Mask, whitened: Array, used: Array) -> dict[str, Array]:

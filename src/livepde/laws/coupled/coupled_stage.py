@@ -11,7 +11,6 @@ import numpy as np
 import scipy  # scipy.optimize is slow to load, and rarely needed
 
 from livepde.fem import Moment
-from livepde.laws.coupled.block_factors import BlockSolver
 from livepde.laws.coupled.equation import (
     Metric,
     StageData,
@@ -20,7 +19,7 @@ from livepde.laws.coupled.equation import (
     StageSolver,
     StageTerms,
 )
-from livepde.laws.coupled.monolithic import BilinearSolver, MonolithicSolver
+from livepde.laws.coupled.stage_solvers import BilinearSolver, BlockSolver, MonolithicSolver
 from livepde.linalg import Array, Factor
 from livepde.stepping import Near, Newton, Solution, StepFailed
 
@@ -31,11 +30,7 @@ ACCURACY = 1e-8  # relative, of theta: Newton goes on from there
 
 @dataclass(frozen=True, eq=False)
 class KeptFactor:
-    """Where a factor was made that goes from stage to stage.
-
-    The factor itself is made again from this where it is gone, after a restart say: the numbers
-    that follow are the same.
-    """
+    """Where a factor was made: where it is gone, as after a restart, the same is made again."""
 
     # Point, data and step of its Jacobian, shapes (n + m,) and (n,); empty if none is kept.
     y: Array

@@ -379,11 +379,7 @@ class StageTerms:
         return norms
 
     def norms(
-        self,
-        r: Array,
-        Mr: Array,
-        mass_r: Array,
-        observed: Callable[[], Residual] | None = None,
+        self, r: Array, Mr: Array, mass_r: Array, observed: Callable[[], Residual] | None = None
     ) -> Residual:
         """Return the norms of r that a damping rule may use."""
         tests = self.forms.tests
@@ -405,11 +401,6 @@ class StageTerms:
         """Return two ends between which the theta of a solved stage lies."""
         h = data.problem.h
         return 1.0 / (STIFFEST * h), min(self.damping.most(data.observed()), STIFFEST / h)
-
-    def theta(self, data: StageData, norms: Residual) -> float:
-        """Return the weight of R^T M_op r."""
-        own = data.problem.metric.theta
-        return self.damped(data, norms) if own is None else own
 
     def slope(self, data: StageData, at: StageIterate) -> Array | None:
         """Return the derivative of theta in u, shape (n,); None if it is zero."""
@@ -468,10 +459,6 @@ class StageSolver(ABC):
     def __init__(self, terms: StageTerms) -> None:
         self.terms = terms
 
-    def accuracy(self, data: StageData) -> float:
-        """Return the relative accuracy of r in a solved stage."""
-        return RESOLVED if data.problem.left is None else self.carried
-
     @abstractmethod
     def factor(self, data: StageData, at: StageIterate) -> Factor:
         """Return the factorised Jacobian at a point."""
@@ -512,7 +499,8 @@ class StageSolver(ABC):
             B = B + forms.hidden @ u
         Mr, mass_r = terms.pull @ r, terms.observed_mass @ r
         norms = terms.norms(r, Mr, mass_r, data.observed)
-        theta = terms.theta(data, norms)
+        theta = stage.metric.theta
+        theta = terms.damped(data, norms) if theta is None else theta
 
         u_t = terms.mass @ ((u - stage.c[:n]) / stage.h)
         pull, coupling = theta * Mr, inside.transposed @ r
@@ -524,7 +512,7 @@ class StageSolver(ABC):
         residual[n:] = (learned - coupling - data.load) * terms.free_q
 
         first, second = [residual[:n], u_t, Aq, pull], [residual[n:], learned - data.rest, coupling]
-        accuracy = self.accuracy(data)
+        accuracy = RESOLVED if stage.left is None else self.carried
         size, resolved, scales = terms.measured(data, first, second, norms.X, theta, accuracy)
         return StageIterate(y, residual, size, resolved, scales, w, r, A, theta, norms, Mr, mass_r)
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from livepde.linalg import Array, Mask
+from livepde.linalg.arrays import Array, Mask
 
 State = TypeVar("State")
 
