@@ -25,7 +25,7 @@ NUMBERS: dict[Level, int] = {NOT_JUDGED: -1, "trusted": 0, "caution": 1, "do not
 
 PROMISES: dict[Level, str] = {
     "trusted": "no significant model error was found",
-    "caution": "the model is not exact",
+    "caution": "the model may not be exact",
     NOT_JUDGED: "the model was not tested",
     LEVELS[-1]: "do not use the estimates as they are",
 }
