@@ -42,9 +42,10 @@ from livepde.model import Model
 from livepde.observation import Points
 from livepde.result import Estimate
 from livepde.runs import Check, Journal, Outcome, Table, journal_of
+from livepde.runs.backlog import Retention
 from livepde.runs.database import log_of
 from livepde.runs.feeds import Gathered
-from livepde.runs.live_loop import Live, Retention
+from livepde.runs.live_loop import Live
 from livepde.stepping import Advance, simulate
 from livepde.streams.clock import Clock
 from livepde.streams.intake import Intake, Policy

@@ -29,10 +29,11 @@ import livepde as lp
 from livepde import checkpoint, runs
 from livepde.records import Record
 from livepde.runs import RunWriter, database
+from livepde.runs.backlog import Retention
 from livepde.runs.database import in_use, log_of, written
 from livepde.runs.feeds import SampleFeed
 from livepde.runs.journal import KEPT_EVENTS, Event, Journal
-from livepde.runs.live_loop import Live, Retention
+from livepde.runs.live_loop import Live
 from livepde.streams.csvfile import are_labels
 from livepde.streams.intake import Intake
 from livepde.streams.sources import Follow, Row, Rows, json_row

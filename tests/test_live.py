@@ -22,8 +22,10 @@ from live_rod import CLOCK, COLUMNS, OPENED, identifier, live, rows, same, write
 from patience import PATIENCE
 
 import livepde as lp
+from livepde.runs.backlog import Backlog
 from livepde.runs.journal import Event, Journal
-from livepde.runs.live_loop import JUDGED, Backlog, Live
+from livepde.runs.live_loop import Live
+from livepde.runs.looks import JUDGED
 from livepde.runs.monitor import Metrics, Monitor
 from livepde.runs.web import Address
 from livepde.stepping import Advance, ImplicitEuler

@@ -31,7 +31,7 @@ from livepde.linalg import Array
 from livepde.result import Estimate
 from livepde.runs import RunWriter
 from livepde.runs import open as open_run
-from livepde.runs.live_loop import Sink
+from livepde.runs.backlog import Sink
 
 COUNT, FIRST, END = 600, 200, 300  # rows, and those of them that come again
 ALPHA, STEP, NOISE = 2e-5, 60.0, 0.05  # m^2/s, s, K

@@ -19,7 +19,7 @@ from livepde.cases.case_channels import columns_of
 from livepde.cases.case_content import CaseContent, check_options, load_code, own_code
 from livepde.cases.schema import SENSORS, BrokerSpec, CaseSpec, DataSpec, FileSpec, NodesSpec
 from livepde.dates import since_1970
-from livepde.runs.live_loop import Backlog, Retention, Sink
+from livepde.runs.backlog import Backlog, Retention, Sink
 from livepde.streams import (
     Clock,
     Column,

@@ -30,9 +30,10 @@ from livepde.cases.data import (
 )
 from livepde.dates import since_1970
 from livepde.errors import ConfigurationError, DataError
+from livepde.runs.backlog import Sink
 from livepde.runs.feeds import Feed, Gathered, Paced, SampleFeed
 from livepde.runs.journal import Journal
-from livepde.runs.live_loop import LOOK, Live, Sink
+from livepde.runs.live_loop import LOOK, Live
 from livepde.samples import Sample
 from livepde.streams.gaps import RECENT
 from livepde.streams.intake import Intake, Ready, Remark, gather

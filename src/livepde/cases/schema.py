@@ -42,7 +42,7 @@ from livepde.cases.values import (
 from livepde.fem import Scalar
 from livepde.laws import GradientLaw, Guards, Jumps, Refit, SensitivityLaw, Shadows
 from livepde.observation import Discrepancy
-from livepde.runs.live_loop import Backlog, Retention
+from livepde.runs.backlog import Backlog, Retention
 from livepde.stepping import Between
 from livepde.streams.csvfile import UTF_8
 from livepde.streams.intake import Policy

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from livepde.diagnostics.check_report import Check, Table
+from livepde.runs.backlog import Backlog, Retention, Sink
 from livepde.runs.directory import (
     JOURNAL,
     RECORD,
@@ -16,7 +17,7 @@ from livepde.runs.directory import (
 from livepde.runs.directory import open_run as open
 from livepde.runs.drive import Driven, conduct, drive, journal_of, stopped_by_signals
 from livepde.runs.journal import Journal
-from livepde.runs.live_loop import Backlog, Live, Retention, Sink
+from livepde.runs.live_loop import Live
 from livepde.runs.run_verdict import (
     clock_findings,
     doubts,

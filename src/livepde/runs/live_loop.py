@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import threading
@@ -10,21 +9,21 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol
-
-import numpy as np
+from dataclasses import replace
+from typing import Any
 
 from livepde.errors import DataError, LivepdeError, RunError
 from livepde.identifier import Identifier
 from livepde.laws import numerical
 from livepde.result import Estimate, Result
+from livepde.runs.backlog import Backlog, Retention, Sink
 from livepde.runs.directory import attempted
 from livepde.runs.feeds import Feed
 from livepde.runs.journal import Event, Journal, Taken
+from livepde.runs.looks import JUDGED, Looks, is_due
 from livepde.stepping import LONG_SUBSTEPS, interruptible
 from livepde.streams.intake import Ready, Remark
-from livepde.verdict import LEVELS, NOT_JUDGED, ModelErrors, Verdict
+from livepde.verdict import LEVELS
 
 GROUP = 64  # most samples of one commit
 AGE = 0.25  # seconds after which no step begins before what was taken until then is committed
@@ -34,11 +33,6 @@ CHECKPOINT = 256  # most samples between two checkpoints
 APART, COST = 1.0, 0.05
 # Seconds after a signal in which a step may end, and the last fit; then they are interrupted.
 GRACE, LAST_GRACE = 0.5, 1.0
-JUDGED = 50  # samples between two looks at the verdict
-SELDOM = 128  # looks of which one computes errors of the model, beside those at doublings
-# Keys of a stored verdict: the level that was reported last, the samples at the last look, another
-# level that this look was the first to find, and the errors of the model as they were computed.
-TOLD, LOOKED, NEXT, ERRORS = "told", "looked", "next", "computed_errors"
 # Without `intake.silence`: usual intervals and seconds after which a source without rows is silent.
 SILENT, LEAST_SILENCE = 10.0, 60.0
 LOOK = 0.5  # seconds between two checks whether to stop
@@ -55,76 +49,6 @@ LOG = logging.getLogger("livepde.run")
 
 class Interrupted(KeyboardInterrupt):
     """A step was left between two substeps, since the run is to stop; the state is that before."""
-
-
-class Sink(Protocol):
-    """A destination of estimates."""
-
-    def put(self, estimate: Estimate) -> None:
-        """Take one estimate."""
-
-    def close(self) -> None:
-        """Release its resources."""
-        return
-
-
-@dataclass(frozen=True)
-class Backlog:
-    """Policy for samples that arrive faster than they are processed.
-
-    Parameters
-    ----------
-    overflow
-        "queue": all samples wait, those beyond `length` at their source; "merge": the oldest beyond
-        `length` become one sample, with the mean of each channel at the last time; "drop": the
-        oldest are dropped. Merged and dropped samples are counted.
-    length
-        Maximum number of waiting samples.
-    """
-
-    overflow: Literal["queue", "merge", "drop"] = "queue"
-    length: int = 1000
-
-    def relieved(self, waiting: deque[Ready]) -> list[Ready]:
-        """Shorten the queue, and return the samples that were merged or dropped."""
-        excess = len(waiting) - self.length
-        if self.overflow == "queue" or excess <= 0:
-            return []
-        oldest = [waiting.popleft() for _ in range(excess)]
-        if self.overflow == "merge":
-            waiting.appendleft(_merged([*oldest, waiting.popleft()]))
-        return oldest
-
-    def has_room(self, waiting: deque[Ready]) -> bool:
-        """Return whether more rows should be polled from the source."""
-        return self.overflow != "queue" or len(waiting) < self.length
-
-
-@dataclass(frozen=True)
-class Retention:
-    """Retention policy of a journal.
-
-    Parameters
-    ----------
-    span
-        Duration, in model time, for which all records are kept.
-    every
-        One in `every` older estimates is kept; older samples and fields are deleted.
-    """
-
-    span: float = math.inf
-    every: int = 1
-
-
-def _merged(samples: Sequence[Ready]) -> Ready:
-    values: dict[str, list[float]] = {}
-    for sample in samples:
-        for channel, value in sample.values.items():
-            if np.isfinite(value):
-                values.setdefault(channel, []).append(value)
-    mean = {channel: float(np.mean(several)) for channel, several in values.items()}
-    tokens = [token for sample in samples for token in sample.tokens]
-    return Ready(t=samples[-1].t, values=mean, tokens=tokens)
 
 
 class Live:
@@ -242,11 +166,7 @@ class Live:
         self._kept_at = self._cost = 0.0  # `_seconds` at the last checkpoint, and its duration
         self._wild = False  # whether wild readings have been reported
         self._replay = (0, 0)  # samples taken again so far, and their number
-        stored = json.loads(journal.verdict) if journal.verdict else Verdict.unjudged().to_dict()
-        self._verdict = Verdict.from_dict(stored)
-        self._level, self._next = stored.get(TOLD, NOT_JUDGED), stored.get(NEXT, "")
-        self._looked = stored.get(LOOKED, 0)
-        self._errors = ModelErrors.from_dict(stored.get(ERRORS))
+        self.looks = Looks.stored(journal.verdict)
         self._seconds = 0.0  # spent in steps
         self.fields_every = fields_every
         self.result = self._read()
@@ -328,7 +248,7 @@ class Live:
         """Write again the events and counts that the journal has lost."""
         for event in self._events:
             self.journal.note(event)
-        self._keep_verdict(self._verdict)
+        self._keep_verdict(self.looks)
         written = Counter(self.journal.counts)
         # Committed counts have survived, so only the difference is written again.
         lost = self._counts - written
@@ -425,7 +345,7 @@ class Live:
                     verdict = settled.verdict
                 last = settled
                 self.result._settle(last)
-                self._keep_verdict(verdict)
+                self._keep_verdict(replace(self.looks, verdict=verdict))
             except Interrupted:
                 self._tell("unfinished", "the final fit was skipped, because the run was stopped")
         if self.journal.estimated:
@@ -559,7 +479,7 @@ class Live:
         """State of the run for a watchdog: "ok", the reason if not, and counters."""
         last = self.result.last
         counts = self._counts.copy()  # requests come from other threads
-        (ailment, why), verdict = self._ill(), self._verdict
+        (ailment, why), verdict = self._ill(), self.looks.verdict
         return {
             "ok": not why,
             "why": why,
@@ -760,7 +680,7 @@ class Live:
         # Counted from the start of the run, so that a resumed run judges the same samples.
         look, others = divmod(len(self.result), JUDGED)
         # A run of finished data ends with a verdict: it is looked at seldom before.
-        if not others and (self.waits or _due(look)):
+        if not others and (self.waits or is_due(look)):
             self._judge(estimate)
         by_count = self._steps % CHECKPOINT == 0
         if by_count or self._seconds - self._kept_at >= max(APART, self._cost / COST):
@@ -776,57 +696,23 @@ class Live:
         self._cost, self._kept_at = time.monotonic() - begun, self._seconds
 
     def _judge(self, estimate: Estimate) -> None:
-        """Look at the verdict: another level counts once two looks in a row differ in one way.
-
-        Both are worse than the reported level, or both are better: findings that alternate between
-        two levels must not keep a better one. The first one that is judged counts at once.
-        """
-        if len(self.result) <= self._looked:  # samples that are taken again have been judged
+        """Look at the verdict, and report another level."""
+        before = self.looks
+        looked = before.after(self.identifier, estimate, len(self.result), live=self.waits)
+        if looked is None:  # samples that are taken again have been judged
             return
-        verdict, self._looked = self._with_errors(estimate), len(self.result)
-        before = self._level
-        # The first level that is found is reported at once.
-        known = before in (NOT_JUDGED, verdict.level) or (
-            self._next != ""
-            and (LEVELS.index(self._next) > LEVELS.index(before))
-            == (LEVELS.index(verdict.level) > LEVELS.index(before))
-        )
-        self._next = "" if known else verdict.level
-        if known:
-            self._level = verdict.level
-        self._keep_verdict(verdict if known else self._verdict)
-        if self._level != before:
+        self._keep_verdict(looked)
+        level, verdict = looked.level, looked.verdict
+        if level != before.level:
             first = verdict.sentences[0] if verdict.sentences else "no problems detected"
-            message = f"{verdict.level}: {first.removeprefix('Not judged: ')}"
+            message = f"{level}: {first.removeprefix('Not judged: ')}"
             # Each sound run begins as not judged, and is trusted then: that is no warning.
-            self._tell("verdict", message, harmless=verdict.level == LEVELS[0])
+            self._tell("verdict", message, harmless=level == LEVELS[0])
 
-    def _with_errors(self, estimate: Estimate) -> Verdict:
-        """Return the verdict whose level follows from fit and effect, once these are known.
-
-        They are computed at doublings of the number of samples. In between an interval is as much
-        wider than the plain one as it was then.
-        """
-        if not self.waits:  # the end is near, and has them
-            return estimate.verdict
-        if _due(len(self.result) // JUDGED):
-            settled = self.identifier._settled(estimate, columns=False)
-            self._errors = settled.verdict.errors or self._errors
-        if self._errors is None:
-            return estimate.verdict
-        values = {}
-        for label in estimate.space.labels:
-            unknown = estimate[label]
-            low, high = unknown.interval()
-            values[label] = float(unknown.median), float(low), float(high)
-        return estimate.verdict.with_errors(self._errors.about(values))
-
-    def _keep_verdict(self, verdict: Verdict) -> None:
+    def _keep_verdict(self, looked: Looks) -> None:
         """Make a verdict the current one, which all readers see."""
-        self._verdict = verdict
-        errors = None if self._errors is None else self._errors.to_dict()
-        look = {TOLD: self._level, LOOKED: self._looked, NEXT: self._next, ERRORS: errors}
-        self.journal.judge({**verdict.to_dict(), **look})
+        self.looks = looked
+        self.journal.judge(looked.to_dict())
 
     def _put(self, estimate: Estimate) -> None:
         """Hand an estimate to all sinks; a sink that fails is removed, and the run continues."""
@@ -847,11 +733,3 @@ class Live:
             self._heard, self.silent = now, False
         elif now - self._heard > self.silence:
             self.silent = True
-
-
-def _due(look: int) -> bool:
-    """Return whether a look is at a doubling, or one of `SELDOM`.
-
-    Such a look computes errors of the model in a live run, and is the only kind in a batch run.
-    """
-    return look > 1 and (look & (look - 1) == 0 or look % SELDOM == 0)

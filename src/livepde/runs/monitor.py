@@ -15,7 +15,7 @@ from livepde import __version__
 from livepde.errors import RunError, optional
 from livepde.library_messages import OneLine
 from livepde.result import Estimate
-from livepde.runs.live_loop import Sink
+from livepde.runs.backlog import Sink
 from livepde.runs.web import Address, Server
 from livepde.verdict import NUMBERS
 
