@@ -150,7 +150,7 @@ KINDS: dict[str, Callable[..., Any]] = {
     "field": lambda **options: lp.Field(MESH, linear(MESH), inner="H1", **options),
 }
 FORMS: dict[str, Callable[[Any, Any, Any, Any], Any]] = {
-    "linear": lambda k, u, v, x: k * lp.dot(lp.grad(u), lp.grad(v)),
+    "linear": lambda k, u, v, x: k * u * v + lp.dot(lp.grad(u), lp.grad(v)),
     "nonlinear": lambda k, u, v, x: k**2 * u**2 * v + lp.dot(lp.grad(u), lp.grad(v)) / (2 + k**2),
 }
 

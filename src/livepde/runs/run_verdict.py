@@ -100,11 +100,13 @@ def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
         if not parts:
             continue
         held = (counts.get("missing", 0) + counts.get("ended", 0)) / max(len(journal), 1)
-        kind = next((kind for kind in ("bridged", "ended") if counts.get(kind)), "counts")
+        sentence = FINDINGS["input, counts"]
+        if counts.get("bridged"):
+            sentence = FINDINGS["input, bridged"]
+        elif counts.get("ended"):
+            sentence = FINDINGS["input, ended"]
         skip = channel_setting(name, "missing", '"skip"')
-        text, remedy = FINDINGS[f"input, {kind}"].filled(
-            name=name, counts=", ".join(parts), skip=skip
-        )
+        text, remedy = sentence.filled(name=name, counts=", ".join(parts), skip=skip)
         found.append(Finding("input", "note", text, name, held, remedy=remedy))
     return found
 
