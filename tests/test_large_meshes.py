@@ -266,7 +266,8 @@ def square(cells=12):
             lp.Subdomain(lambda x: x[0] < 0.6),
         ),
         (
-            lp.SensitivityLaw(modes=4, noise=1e-3, refit=lp.laws.Refit(start=1), shadows=None),
+            # Where a search of the refit ends that does not converge depends on rounding.
+            lp.SensitivityLaw(modes=4, noise=1e-3, refit=None, shadows=None),
             lp.Points([(0.3, 0.4), (0.7, 0.6)]),
         ),
     ],
