@@ -16,6 +16,7 @@ from scipy.sparse.linalg import splu
 import livepde as lp
 from benchmarks.first_hour import TABLES, save
 from benchmarks.user_jobs.data import JOBS
+from benchmarks.wrong_channels import Fault, with_fault
 from livepde.cases.case import load
 from livepde.verdict import Cause, Finding, Verdict
 
@@ -306,3 +307,31 @@ def test_exchanged_sensors_that_contradict_all_are_found_from_the_start(tmp_path
     found = [finding.causes[0] for finding in last.verdict.findings if finding.causes]
     assert found[0].kind == "exchange"
     assert found[0].share > 0.95
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "fault",
+    [
+        Fault("furnace", ("T_cold",), "fahrenheit"),
+        pytest.param(Fault("furnace", ("T_2", "T_4"), "exchanged"), marks=pytest.mark.long),
+        pytest.param(Fault("furnace", ("T_2",), "late", 30.0), marks=pytest.mark.long),
+    ],
+    ids=str,
+)
+def test_wrong_columns_are_named_where_an_unknown_moves(fault: Fault, tmp_path: Path):
+    """A furnace with an unknown flux that moves: samples are filtered, not fitted, again."""
+    folder = Path(__file__).parents[1] / "examples" / "first_hour"
+    shutil.copy(folder / "furnace.toml", tmp_path)
+    case = load(tmp_path / "furnace.toml")
+    columns = {name: str(item.column) for name, item in case.spec.channels.items()}
+    header, rows, _ = TABLES["furnace"](1)
+    save(tmp_path / "furnace.csv", header, with_fault(fault, header, rows, columns)[:400])
+    prepared = case.prepare()
+    verdict = prepared.identifier.run(prepared.stream).last.verdict
+    first = next(finding.causes[0] for finding in verdict.findings if finding.causes)
+    kinds = {"fahrenheit": "unit", "exchanged": "exchange", "late": "lag"}
+    assert (first.kind, first.subject) == (kinds[fault.kind], fault.channels[0])
+    assert first.share > 0.9
+    if fault.kind == "late":
+        assert first.size == pytest.approx(60.0, rel=0.1)

@@ -13,16 +13,18 @@ and the cost falls by (g r)^2 / (2 (g g - h H^-1 h)). The most promising errors 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import chain, combinations
 from typing import NamedTuple
 
 import numpy as np
 
 from livepde.fem import Channel
-from livepde.laws.filter_state import FilterState
+from livepde.laws.filter_state import FilterState, unaccompanied
 from livepde.laws.gate import Gate
+from livepde.laws.history import intervals_since
+from livepde.laws.one_member import filtered
 from livepde.laws.policies import Refit
 from livepde.laws.refit import WILD, Found, near_most, near_neighbours, refitted
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
@@ -50,6 +52,10 @@ SETTLED = 0.02  # relative change of a size that is none
 # Of the misfit, and of the noise: within the smaller one nothing is left to explain, and the error
 # with fewer numbers is likelier.
 CLOSE, SLIGHT = 0.05, 0.2
+# Where unknowns move: passes of a filter at most, the share of a misfit that is worth a word, and
+# how many such errors are named.
+MOST_FILTERED, SOME, NAMED = 60, 0.1, 3
+SLIGHT_LAG = 0.02  # share that a lag of one sample has to explain before longer ones are tried
 TEMPERATURES = ("degC", "degF", "K")
 
 
@@ -130,8 +136,11 @@ class Columns:
         # At two places: three errors of each input, and all exchanges with an input.
         passes = 2 * len(inputs) * (3 + len(names) + len(inputs))
         passes += PASSES * ROUNDS * sum(TRIED.values())
+        most = MOST_ROWS
+        if work.filter.moves:
+            passes, most = MOST_FILTERED, MOST_ROWS // 2
         each = problem.model.X.dim * (1 + work.filter.reduction.size)
-        most = min(MOST_ROWS, int(MOST_WORK / (passes * each)))
+        most = min(most, int(MOST_WORK / (passes * each)))
         if most < FEWEST_ROWS:
             return "the mesh is too large to fit that often"
         rows = min(log.shape[1], most)
@@ -155,12 +164,14 @@ class Columns:
         return replace(self, state=changed(self.state, log=log))
 
     def samples(self, error: Error | None = None) -> StoredSamples:
-        """Return the samples, with the columns of an error corrected.
+        """Return the samples, with the columns of an error corrected."""
+        return StoredSamples.of(self.work, self.state if error is None else self.corrected(error))
 
-        A fit of those without an error that is small begins at the prior mean.
+    def corrected(self, error: Error) -> SensitivityState:
+        """Return the member with the columns of an error corrected.
+
+        A fit of its samples begins at the prior mean if the error is not small.
         """
-        if error is None:
-            return StoredSamples.of(self.work, self.state)
         begun = self.state if error.numbers else changed(self.state, now=self.state.start)
         log, names = self.state.log.copy(), error.names
         at = [self.places[name] for name in names]
@@ -187,8 +198,7 @@ class Columns:
             if names[0] not in self.inputs:  # else readings that shrink to nothing would fit best
                 log[0][:, at[0] + len(self.work.filter.noise)] *= factor
         log[0][:, at] = values
-        begun = changed(begun, log=log, start=self._start(log, names))
-        return StoredSamples.of(self.work, begun)
+        return changed(begun, log=log, start=self._start(log, names))
 
     def _start(self, log: Array, names: Sequence[str]) -> FilterState:
         """Return the start with other columns: an initial state that is made of readings moves."""
@@ -237,6 +247,20 @@ class Columns:
         return dict(zip(observed.names, observed.units, strict=True)).get(name, "")
 
     @property
+    def pairs(self) -> Iterator[tuple[str, str]]:
+        """Columns that may have been exchanged: of another kind they have nothing in common."""
+        boundary = self.work.filter.problem.model.boundary_values
+        states = set(self.places) - set(self.inputs)
+        states |= {value.name for value in boundary if isinstance(value, Channel)}
+        for pair in combinations(self.places, 2):
+            first, second = (self.column(name) for name in pair)
+            if not len(first) or not len(second):
+                continue
+            apart = first.min() > second.max() or second.min() > first.max()
+            if not apart or states.issuperset(pair):
+                yield pair
+
+    @property
     def interval(self) -> float:
         """The usual time between samples."""
         return float(np.median(np.diff(self.state.log[0, :, 0])))
@@ -281,6 +305,8 @@ def likely_columns(columns: Columns, least: float) -> list[Cause]:
 
     None where the misfit is less than `least` times the noise.
     """
+    if columns.work.filter.moves:
+        return _likely_filtered(columns, least)
     samples, search = columns.samples(), _Trials(columns)
     found = search.refitted(samples)
     if found is None:
@@ -401,17 +427,8 @@ class _Trials:
         return replace(one, residuals=residuals, slopes=one.slopes * ratio[:, :, None])
 
     def _exchanged(self, base: _Fit) -> Iterator[tuple[float, Error]]:
-        columns, boundary = self.columns, self.columns.work.filter.problem.model.boundary_values
-        states = set(columns.places) - set(columns.inputs)
-        states |= {value.name for value in boundary if isinstance(value, Channel)}
-        for pair in combinations(columns.places, 2):
-            first, second = (columns.column(name) for name in pair)
-            if not len(first) or not len(second):
-                continue
-            # Columns of another kind have nothing in common.
-            apart = first.min() > second.max() or second.min() > first.max()
-            if apart and not states.issuperset(pair):
-                continue
+        columns = self.columns
+        for pair in columns.pairs:
             error = Error("exchange", pair)
             if self._only_sensors(error):
                 one: Passed | None = self._seen(base, error)
@@ -473,6 +490,91 @@ class _Trials:
             change = more - fit.one.residuals
         _, theta = fit.freed(change / h)
         return replace(error, size=self._bounded(error.kind, error.names[0], error.size + theta))
+
+
+def _likely_filtered(columns: Columns, least: float) -> list[Cause]:
+    """Return the same where unknowns move, so that a filter has to follow the samples.
+
+    Offsets and gains are known from the innovations. A lag is looked for in steps that double.
+    """
+    e = _innovations(columns, columns.state)
+    if e is None:
+        return []
+    noise = _noise(e)
+    misfit = float(np.nansum(e**2)) - noise
+    if not misfit > least * noise:
+        return []
+
+    def share(error: Error) -> float:
+        found = _innovations(columns, columns.corrected(error))
+        return -np.inf if found is None else 1.0 - (float(np.nansum(found**2)) - noise) / misfit
+
+    units = (
+        Error("unit", (name,), unit=number)
+        for name in columns.places
+        for number, unit in enumerate(UNITS)
+        if unit.expected and unit.expected == columns.unit(name)
+    )
+    exchanged = (Error("exchange", pair) for pair in columns.pairs)
+    kept = [(share(error), error) for error in chain(units, exchanged)]
+    longest = int(LONGEST * columns.state.log.shape[1])
+    lags = [_Lag(name, columns.interval, longest, share) for name in columns.places]
+    lags = sorted(lags, key=lambda lag: -lag.of(lag.first))[: TRIED["lag"]]
+    kept += [lag.best for lag in lags if lag.of(lag.first) > SLIGHT_LAG]
+    kept = sorted((one for one in kept if one[0] > SOME), key=lambda one: -one[0])[:NAMED]
+    return [_cause(columns, error, found) for found, error in kept]
+
+
+@dataclass(frozen=True, eq=False)
+class _Lag:
+    """How late a column may be, in whole samples."""
+
+    name: str
+    interval: float
+    longest: int  # samples
+    share: Callable[[Error], float]  # of the misfit that an error explains
+    known: dict[int, float] = field(default_factory=dict)
+
+    def error(self, count: int) -> Error:
+        """Return the error of a column that is so many samples late."""
+        return Error("lag", (self.name,), count * self.interval)
+
+    def of(self, count: int) -> float:
+        """Return the share that such an error explains."""
+        if count not in self.known:
+            self.known[count] = self.share(self.error(count)) if count else 0.0
+        return self.known[count]
+
+    @property
+    def first(self) -> int:
+        """One sample, late or early, whichever explains more."""
+        return max((-1, 1), key=self.of)
+
+    @property
+    def best(self) -> tuple[float, Error]:
+        """The error that explains most, looked for in steps that double, and then halve."""
+        best = self.first
+        while abs(2 * best) <= self.longest and self.of(2 * best) > self.of(best):
+            best *= 2
+        step = abs(best) // 2
+        while step:
+            best = max((best - step, best, best + step), key=self.of)
+            step //= 2
+        return self.of(best), self.error(best)
+
+
+def _innovations(columns: Columns, state: SensitivityState) -> Array | None:
+    """Return normalised innovations of stored samples, (samples, sensors); None if a step fails."""
+    work, x = columns.work.unaccompanied, unaccompanied(state.start)
+    found = []
+    for interval in intervals_since(state.log, work.filter.problem.channels):
+        x, report = filtered(work, x, interval)
+        if not report.status.ok:
+            return None
+        x = work.filter.relinearised(x)
+        measured = np.isfinite(interval.z1)
+        found.append(np.where(measured, x.innovations.newest[0], np.nan))
+    return np.array(found)
 
 
 def _varied(tried: Sequence[tuple[float, Error]]) -> list[Error]:

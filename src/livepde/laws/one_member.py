@@ -53,7 +53,7 @@ def step_alone(
     return new, report
 
 
-def _filtered(
+def filtered(
     work: SensitivityWork, x: FilterState, interval: Interval
 ) -> tuple[FilterState, Report]:
     """Return the filter after a sample, linear about its reference."""
@@ -73,7 +73,7 @@ def _assimilated(
     work: SensitivityWork, state: SensitivityState, interval: Interval
 ) -> tuple[SensitivityState, Report]:
     """Return one member after a sample, iterated where that is due."""
-    x, report = _filtered(work, state.now, interval)
+    x, report = filtered(work, state.now, interval)
     if not report.status.ok:
         return state, report
     span = work.filter.span(interval)
@@ -112,7 +112,7 @@ def _iterated(
         # The level is a variance, hence twice the exponent: noise TEMPER^temper times as large.
         begin = changed(before, level=before.level * TEMPER ** (2 * temper), kept=kept)
         if temper:
-            x, _ = _filtered(work, begin, interval)
+            x, _ = filtered(work, begin, interval)
             if guards.within_reach(x.da - begin.da)[0]:
                 return levelled(x, temper), tempered
         start, length = interval.at(interval.t0), interval.t1 - interval.t0
@@ -125,7 +125,7 @@ def _iterated(
         found = _converged(work, window, interval, guards.iterations)
         if found is not None:
             return levelled(found, temper), replace(tempered or Diagnostics(), iterated=1.0)
-    return _filtered(work, before, interval.silent)[0], Diagnostics(held=1.0)
+    return filtered(work, before, interval.silent)[0], Diagnostics(held=1.0)
 
 
 def _converged(
@@ -136,17 +136,17 @@ def _converged(
     filter_, searching, start = work.filter, work.unaccompanied, unaccompanied(window.start)
     for _ in range(most):
         last, q = window, next_reference(filter_, window)
-        x, report = _filtered(searching, placed(filter_, replace(window, start=start), q), interval)
+        x, report = filtered(searching, placed(filter_, replace(window, start=start), q), interval)
         if np.count_nonzero(x.screened.refused):
             # The gate may use with the errors of the discretisation what it refuses without.
             searching, start = work, window.start
-            x, report = _filtered(work, placed(filter_, window, q), interval)
+            x, report = filtered(work, placed(filter_, window, q), interval)
         if not report.status.ok:
             return None
         window = replace(window, now=x, reference=q)
         if distance(filter_, window) <= AGREED:
             # Once more about the same reference, now with ledger and discretisation errors.
-            x, report = _filtered(work, placed(filter_, last, q), interval)
+            x, report = filtered(work, placed(filter_, last, q), interval)
             return x if report.status.ok else None
     return None
 
@@ -224,7 +224,7 @@ def _most_likely(
         if number in tried:
             found = _likelihood(searching, jumps, x, known[number:])
             score, best = max((score, best), (found, number))
-        x, report = _filtered(searching if number >= tried[0] else work.unaccompanied, x, interval)
+        x, report = filtered(searching if number >= tried[0] else work.unaccompanied, x, interval)
         x = work.filter.relinearised(x)
         if not report.status.ok:
             break
@@ -237,7 +237,7 @@ def _likelihood(
     """Return the logarithm of the likelihood of all samples if the unknowns jump now."""
     x = work.filter.inflated(x, jumps.size, work.jumping)
     for interval in intervals:
-        x, report = _filtered(work, x, interval)
+        x, report = filtered(work, x, interval)
         x = work.filter.relinearised(x)
         if not report.status.ok:
             return -np.inf
@@ -274,7 +274,7 @@ def _watched(
         before = _most_likely(work, jumps, state.older, known, guess)
         x, status = changed(work.filter.relinearised(state.older), kept=new.now.kept), Status()
         for earlier in known[:before]:
-            x, found = _filtered(work, x, earlier)
+            x, found = filtered(work, x, earlier)
             x, status = work.filter.relinearised(x), found.status
             if not status.ok:
                 break

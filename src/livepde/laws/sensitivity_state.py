@@ -132,8 +132,7 @@ class SensitivityWork:
     @cached_property
     def tried(self) -> int:
         """Samples that are kept for trials of columns, where these are not those of a fit; or 0."""
-        moving = self.fades or self.filter.moves
-        if self.refit is None or self.filter.judge is None or moving or not self.window:
+        if self.refit is None or self.filter.judge is None or self.fades or not self.window:
             return 0
         return self.refit.window
 
