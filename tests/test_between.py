@@ -403,7 +403,7 @@ def test_a_log_of_changes_is_joined_with_what_held_before() -> None:
     log = {"h": np.array([1.0, 0.0, 1.0]), "m": np.array([3.0, 4.0, 5.0])}
     changes = tabulated(np.array([2.0, 12.5, 20.0]), log, HELD, CLOCK)
     between = {"hold": "hold", "mean": "next"}
-    found = join_tables([sensors, changes], 1.0, ["a"], ["a"], "here", between)  # type: ignore[arg-type]
+    found = join_tables([sensors, changes], 1.0, ["a"], ["a"], "here", between, together=True)  # type: ignore[arg-type]
     np.testing.assert_array_equal(found.t, [10.0, 11.0, 12.0, 12.5, 13.0, 14.0, 15.0, 20.0])
     k = [found.names.index(name) for name in ("a", "hold", "mean")]
     np.testing.assert_array_equal(found.values[0, k], [0.0, 1.0, 4.0])
@@ -416,11 +416,23 @@ def test_a_log_whose_last_change_was_before_the_sensors_is_joined() -> None:
     sensors = tabulated(10.0 + np.arange(3.0), {"a": np.arange(3.0)}, {"a": COLUMNS["a"]}, CLOCK)
     hold = {"hold": HELD["hold"]}
     log = tabulated(np.array([2.0, 5.0]), {"h": np.array([1.0, 7.0])}, hold, CLOCK)
-    found = join_tables([sensors, log], 1.0, ["a"], [], "here", {"hold": "hold"})
+    found = join_tables([sensors, log], 1.0, ["a"], [], "here", {"hold": "hold"}, together=True)
     np.testing.assert_array_equal(found.t, sensors.t)
     assert found.values[0, found.names.index("hold")] == 7.0
     with pytest.raises(DataError, match="no time in common"):  # a line ends with its last reading
-        join_tables([sensors, log], 1.0, ["a"], [], "here")
+        join_tables([sensors, log], 1.0, ["a"], [], "here", together=True)
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_readings_before_another_file_of_sensors_are_used_or_counted(together: bool) -> None:
+    """A profile of the start needs all sensors; a pumping test has its first readings in one."""
+    first = tabulated(np.arange(6.0), {"a": np.arange(6.0)}, {"a": COLUMNS["a"]}, CLOCK)
+    other = {"b": Column(("b",))}
+    later = tabulated(2.0 + np.arange(4.0), {"b": np.arange(4.0)}, other, CLOCK)
+    found = join_tables([first, later], 1.0, ["a", "b"], [], "here", together=together)
+    assert len(found.t) == (4 if together else 6)
+    assert found.remarks.get(("early", "a"), 0) == (2 if together else 0)
+    assert np.isfinite(found.values).all() == together
 
 
 def test_a_live_intake_remembers_what_held_before_its_first_sample() -> None:

@@ -547,11 +547,11 @@ T_2 = { role = "sensor", column = "T_2cm", at = "2 cm" }
 """)
     prepared = cases.load("case.toml").prepare()
     assert prepared.origin is not None
-    assert f"{prepared.origin}" == "2026-03-02 08:05:00"
-    np.testing.assert_allclose(prepared.raw.t, [0, 300])
-    np.testing.assert_allclose(prepared.raw.values, [[np.nan, 19], [21, 20]])
+    assert f"{prepared.origin}" == "2026-03-02 08:00:00"
+    np.testing.assert_allclose(prepared.raw.t, [0, 300, 600])
+    np.testing.assert_allclose(prepared.raw.values, [[20, np.nan], [np.nan, 19], [21, 20]])
     skipped = cases.load("case.toml", settings={"channels.T_1.missing": "skip"}).prepare()
-    np.testing.assert_allclose(skipped.raw.values, [[21, 20]])
+    np.testing.assert_allclose(skipped.raw.values, [[20, np.nan], [21, 20]])
     assert skipped.raw.remarks["skipped", "T_1"] == 1
 
 

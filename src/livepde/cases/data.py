@@ -15,9 +15,17 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from livepde.cases.case_channels import columns_of
+from livepde.cases.case_channels import INTERPOLATED, columns_of
 from livepde.cases.case_content import CaseContent, check_options, load_code, own_code
-from livepde.cases.schema import SENSORS, BrokerSpec, CaseSpec, DataSpec, FileSpec, NodesSpec
+from livepde.cases.schema import (
+    SENSORS,
+    BrokerSpec,
+    CaseSpec,
+    DataSpec,
+    FileSpec,
+    InitialSpec,
+    NodesSpec,
+)
 from livepde.dates import since_1970
 from livepde.runs.backlog import Backlog, Retention, Sink
 from livepde.streams import (
@@ -114,8 +122,11 @@ def read_data(case: CaseContent, source: str | Iterable[str] | None) -> DataTabl
 
     needed = [name for name, column in columns.items() if column.needed]
     between = {name: column.between for name, column in columns.items()}
-    where = case.where("data.file")
-    return join_tables(tables, clock.second, case.roles(*SENSORS), needed, where, between)
+    # An initial profile needs a reading of each sensor.
+    initial = case.spec.initial
+    together = isinstance(initial, InitialSpec) and initial.start in INTERPOLATED
+    sensors, where = case.roles(*SENSORS), case.where("data.file")
+    return join_tables(tables, clock.second, sensors, needed, where, between, together=together)
 
 
 def _on_time(

@@ -74,6 +74,8 @@ def _refused(prepared: Prepared) -> list[str]:
         "spike": "{name}: {n} values are spikes. A run rejects them. To use them, set "
         '`channels.{name}.spikes = "keep"`.',
         "begin": "{name}: the first {n} rows have no value. A run leaves them out.",
+        "early": "{name}: the first {n} values are earlier than another file. A run leaves them "
+        "out. Where that file has sensors only, a value of `initial` lets a run use them.",
         "bridged": "{name}: {n} values are missing in long gaps. A run interpolates them. To leave "
         'these rows out, set `channels.{name}.missing = "skip"`.',
         "ended": "{name}: the last {n} rows have no value. A run holds the one before. To end the "

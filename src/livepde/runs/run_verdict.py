@@ -51,6 +51,7 @@ SHORTEST = 20  # values at least to tell whether an estimate wanders
 LEFT_OUT = 0.25  # of a field's mean variance is that of modes that the law leaves out
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
 AFTER = " The state is re-estimated from there on. The unknowns are kept."
+OF_SENSORS = "start", "early"  # kinds of remarks that matter for sensors, too
 INPUT_KINDS = {
     "start": "first values were outliers and count as missing",
     "spike": "spikes were rejected",
@@ -58,6 +59,7 @@ INPUT_KINDS = {
     "bridged": "values in long gaps were interpolated",
     "ended": "values at the end were missing: the last one before them was held",
     "missing": "values were missing: the last one before them, if any, was held",
+    "early": "values were earlier than another file and were left out",
     "begin": "rows at the start, before its first value, were left out",
 }
 
@@ -88,13 +90,13 @@ def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
     Notes: where more than 2 % of the values were held, the verdict of the estimate has a caution.
     """
     found, driving = [], [*channels]
-    # Outliers at the start matter for sensors, too: the initial state may be made of them.
-    others = [name for kind, name in journal.counts if kind == "start"]
+    # What is left out at the start matters for sensors, too: the initial state may be made of it.
+    others = [name for kind, name in journal.counts if kind in OF_SENSORS]
     for name in dict.fromkeys([*driving, *others]):
         counts = {
             kind: n
             for (kind, channel), n in journal.counts.items()
-            if channel == name and (kind == "start" or name in driving)
+            if channel == name and (kind in OF_SENSORS or name in driving)
         }
         parts = [f"{counts[kind]} {text}" for kind, text in INPUT_KINDS.items() if counts.get(kind)]
         if not parts:

@@ -15,6 +15,7 @@ from livepde.linalg import Array
 from livepde.stepping import Between
 from livepde.streams.table import DataTable
 
+EARLY = "early"  # kind of the remark on readings before another file begins
 SAME = 1e-10  # of the whole time: times that differ by less are one moment
 
 
@@ -25,18 +26,21 @@ def join_tables(
     needed: Collection[str],
     where: str,
     between: Mapping[str, Between] | None = None,
+    *,
+    together: bool,
 ) -> DataTable:
     """Merge the rows of several tables in order of time; absent channels are missing values.
 
     The result begins with the first row in which a sensor has a value and before which every
-    table has begun. Other channels without a value in that row have the one that their neighbours
-    give: on a line, or the last or the next one.
+    table with inputs has begun. Other channels without a value in that row have the one that their
+    neighbours give: on a line, or the last or the next one.
 
     `second`: one second in the unit of time.
     `sensors`: channels that are not interpolated.
     `needed`: channels without which a row is left out.
     `where`: name of the data, for messages.
     `between`: channel -> how it behaves between two readings; a line if it is left out.
+    `together`: the tables of sensors must have begun, too.
     Raises `DataError`: some times are dates and some numbers; or the tables have no time in common.
     """
     times, first = _on_one_clock(tables, second, where)
@@ -45,9 +49,10 @@ def join_tables(
     behaviour = between or {}
     holds = [all(behaviour.get(name) == "hold" for name in table.names) for table in tables]
     last = np.where(holds, np.inf, ends)
-    start = starts.max()
-    if last.min() < start:
+    if last.min() < starts.max():
         raise DataError(f"{where}: the files have no time in common; check dates and units.")
+    driving = [together or not {*table.names} <= {*sensors} for table in tables]
+    start = starts[driving].max() if any(driving) else starts.min()
     width = SAME * (ends.max() - starts.min()) or 1.0
     t, joined = _outer_join(tables, times, width)
     names, values = list(joined.columns), joined.to_numpy(copy=True)
@@ -75,6 +80,9 @@ def join_tables(
     t, values = t[begin:][kept], values[begin:][kept]
     lacking = np.isnan(inputs).sum(axis=0).tolist()
     remarks = Counter({("skipped", name): n for name, n in zip(needed, lacking, strict=True)})
+    early = known[:begin].sum(axis=0).tolist()
+    counts = zip(names, early, sensed.tolist(), strict=True)
+    remarks += Counter({(EARLY, name): n for name, n, sensor in counts if sensor})
     remarks = sum((Counter(table.remarks) for table in tables), remarks)  # drops counts of zero
     if first is None:
         return DataTable(t, values, tuple(names), origin=None, remarks=remarks)
