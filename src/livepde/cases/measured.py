@@ -133,7 +133,8 @@ def measured(
 def unit_in(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
     """Return the unit in the name of a column; empty if none can be converted to `unit`."""
     for given in filter(None, (pattern.search(name) for pattern in patterns)):
-        for text in (given[1], re.sub(r"(?<=[A-Za-z])(?=\d)", "^", given[1])):  # m3/h, m^3/h
+        powers = re.sub(r"(?<=[A-Za-z])(?=\d)", "^", given[1])  # m3/h is m^3/h
+        for text in (given[1], powers, powers.replace("_", "/")):  # L_s is L/s
             with suppress(CaseError):
                 conversion(text, unit, name)
                 return text
