@@ -476,3 +476,23 @@ def test_an_initial_time_long_before_the_samples_changes_no_course_in_time():
         return errors["alpha"].high
 
     assert upper(1e6 - 1000.0) == pytest.approx(upper(1e6), rel=0.05)
+
+
+@pytest.mark.parametrize("options", [{}, pytest.param({"refit": None}, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("what", ["noisy", "silent"])
+def test_the_noise_of_a_sensor_is_no_error_of_the_model(what, options):
+    """One is eight times as noisy as stated; or all are by five times, and two have one reading."""
+    clean = truth(6)
+    rng = np.random.default_rng(7)
+    if what == "noisy":
+        z = clean + 0.08 * rng.standard_normal(clean.shape) * [0.0, 1.0, 0.0]
+    else:
+        z = clean + 0.05 * rng.standard_normal(clean.shape)
+        z[:40, 1:] = z[41:, 1:] = np.nan
+    verdict = innovations_of(z, **options)
+    assert verdict.errors is not None
+    assert verdict.errors.misfit == pytest.approx(1.0, abs=0.2)
+    assert verdict.errors.misfit <= 1.001 * max(verdict.errors.sensors.values())
+    assert verdict.level != "do not trust"
+    noise = [finding.subject for finding in verdict.findings if finding.what == "noise"]
+    assert noise == (["T_5"] if what == "noisy" else [""])

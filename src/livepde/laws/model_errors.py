@@ -48,6 +48,7 @@ from livepde.verdict.evidence import (
     averaged,
     averaged_causes,
     levels,
+    weighted_median,
 )
 from livepde.verdict.model_errors import Allowed, ModelErrors
 
@@ -500,16 +501,16 @@ def model_errors(
     low, high = mixture.interval
     if not np.isfinite([low, high]).all():
         return OVERFLOW
-    level = _level(one.residuals, used)
+    noise = _noise_of_each(one.residuals, used)
     narrow = np.sqrt(model.asked[1] + shift**2)
     base = start.q[0]
     return ModelErrors(
-        misfit=_rms(one.residuals[used]) / level,
+        misfit=_rms((one.residuals / noise)[used]),
         of_signal=_of_signal(samples.readings, one.residuals, used),
         sensors={
-            name: _rms(column[there]) / math.sqrt(_variance(column[there]))
-            for name, column, there in zip(
-                samples.filter.problem.observed.names, one.residuals.T, used.T, strict=True
+            name: _rms(column[there]) / float(own)
+            for name, column, there, own in zip(
+                samples.filter.problem.observed.names, one.residuals.T, used.T, noise, strict=True
             )
             if there.any()
         },
@@ -542,19 +543,20 @@ def errors_of_innovations(
     low, high = mixture.interval
     if not np.isfinite([low, high]).all():
         return OVERFLOW
-    noise = np.sqrt(x.level[0]) * filter_.noise
-    size = np.sqrt(squares / np.maximum(count, 1.0))
-    level, there = np.sqrt(levels(ledger)[0]), count > 0.0
-    typical = float(np.median(level[there]))
+    there = count > 0.0
+    count, squares, level = (part[there] for part in (count, squares, levels(ledger)[0]))
     known = filter_.estimate(x)[0]
     # Noise that is larger than stated is no error of the model.
-    plain = np.hypot(max(typical, 1.0) * np.linalg.norm(Phi @ x.C[0].T, axis=1), shift)
-    signal = _rms(ranges[there] / math.sqrt(12.0))  # of readings that fill their range
-    names = filter_.problem.observed.names
+    typical = max(weighted_median(level, count), 1.0)
+    plain = np.hypot(math.sqrt(typical) * np.linalg.norm(Phi @ x.C[0].T, axis=1), shift)
+    span = ranges[there] / (np.sqrt(x.level[0]) * filter_.noise[there])
+    signal = math.sqrt((count * span**2).sum() / 12.0)  # of readings that fill their range
+    each = np.sqrt(squares / count / level)
+    names = np.array(filter_.problem.observed.names)[there].tolist()
     return ModelErrors(
-        misfit=_rms(size[there]) / typical,
-        of_signal=_rms((size * noise)[there]) / signal if signal > 0.0 else math.inf,
-        sensors={names[k]: float(size[k] / level[k]) for k in np.flatnonzero(there)},
+        misfit=math.sqrt((squares / level).sum() / count.sum()),
+        of_signal=math.sqrt(squares.sum()) / signal if signal > 0.0 else math.inf,
+        sensors=dict(zip(names, each.tolist(), strict=True)),
         unknowns=tuple(_allowed(filter_, x, (known + low, known + high), plain, std)),
     )
 
@@ -700,13 +702,25 @@ def linear_model(
 def _level(residuals: Array, used: Mask) -> float:
     """Return the noise that successive residuals show, over the noise that is stated.
 
-    That of the median sensor: so the weights of the sensors stay those of the estimate.
+    That of the median reading: so the weights of the sensors stay those of the estimate, and one
+    that has hardly a reading counts for little.
     """
-    found = [_variance(column[there]) for column, there in _columns(residuals, used)]
-    return math.sqrt(float(np.median(found)))
+    found = [(_variance(column[there]), there.sum()) for column, there in _columns(residuals, used)]
+    return math.sqrt(weighted_median(*np.transpose(found)))
 
 
-def _variance(residuals: Array) -> float:
+def _noise_of_each(residuals: Array, used: Mask) -> Array:
+    """Return the noise that successive residuals of each sensor show, over the stated one.
+
+    Few readings are taken to have the noise of the others. NaN for a sensor without one.
+    """
+    usual, found = _level(residuals, used) ** 2, np.full(residuals.shape[1], np.nan)
+    for k in np.flatnonzero(used.any(axis=0)):
+        found[k] = math.sqrt(_variance(residuals[used[:, k], k], usual))
+    return found
+
+
+def _variance(residuals: Array, usual: float = 1.0) -> float:
     """Return the variance that successive residuals of a sensor show, over the stated one."""
     squares = 0.5 * float((np.diff(residuals) ** 2).sum())
-    return max((squares + SHRINK) / (len(residuals) - 1 + SHRINK), LEAST_LEVEL)
+    return max((squares + SHRINK * usual) / (len(residuals) - 1 + SHRINK), LEAST_LEVEL)

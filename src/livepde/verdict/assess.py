@@ -33,6 +33,7 @@ from livepde.verdict.evidence import (
     mean_squares,
     quiet,
     unsuspicious,
+    weighted_median,
 )
 from livepde.verdict.findings import (
     FEWEST,
@@ -59,6 +60,7 @@ from livepde.verdict.sentences import (
 PRIOR = 1e-4  # probability of an estimate as far from its prior, drawn from it
 LARGER = 1.5  # times the stated noise that is worth a note
 SMALLER = 0.5
+NOISIER = 3.0  # times the noise of the other sensors
 FAR = 3.0  # standard deviations between a sensor that stands still and its prediction
 REFUSED = 0.02  # share of the readings that a gate refuses
 MENDED = 128  # samples of a new window after which a fault may count as mended
@@ -405,12 +407,20 @@ def _records(at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
 def _noise(at: Position) -> Iterator[Finding]:
     """Return notes on noise that is not as stated: intervals and tests do not depend on it."""
     ratio = np.sqrt(levels(at.ledger)[0])
-    typical = float(np.median(ratio))
+    count = at.ledger.noise[0, 0]
+    if not count.any():
+        return
+    typical = weighted_median(ratio, count)
     if typical > LARGER or typical < SMALLER:
         small = FINDINGS["noise, small"].filled(share=f"{100.0 * typical:.2g} %")
         large = FINDINGS["noise, large"].filled(ratio=typical)
         text, _ = small if typical < SMALLER else large
         yield Finding("noise", "note", text, evidence=typical)
+    worst = int(np.argmax(ratio))
+    if ratio[worst] > NOISIER * max(typical, 1.0):
+        name, factor = at.sensors[worst], float(ratio[worst])
+        text, remedy = FINDINGS["noise, sensor"].filled(name=name, ratio=factor)
+        yield Finding("noise", "note", text, name, factor, remedy=remedy)
 
 
 def _stuck(at: Position) -> Iterator[Finding]:

@@ -317,6 +317,13 @@ def levels(ledger: Ledger) -> Array:
     return found
 
 
+def weighted_median(values: Array, weights: Array) -> float:
+    """Return the median of values that count as often as their weights say."""
+    order = np.argsort(values)
+    share = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(share, 0.5 * share[-1])])
+
+
 def mean_squares(ledger: Ledger) -> Array:
     """Return mean squares of the whitened innovations, 1 if as stated, (windows, sensors)."""
     count, _, squares, *_ = ledger.noise

@@ -140,6 +140,10 @@ FINDINGS: dict[str, Sentence] = {
     "noise, large": Sentence(
         "Residual scatter is {ratio:.2g} times the configured noise: `noise` may be too small."
     ),
+    "noise, sensor": Sentence(
+        "Residuals of {name} scatter {ratio:.2g} times more than its configured noise.",
+        "Check this sensor, or increase its `noise`.",
+    ),
     "noise, found": Sentence(
         "The noise is {ratio:.2g} times the first guess. Without `refit` the first samples keep "
         "the weight of the guess, and the intervals are too narrow.",
