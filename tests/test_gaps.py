@@ -310,8 +310,8 @@ def test_a_finished_file_is_interpolated_and_the_run_says_so(tmp_path):
         writer, (_, driven) = run_batch(prepared, folder, write, stack, quiet=True)
         _, _, _, notes = concluded(prepared, prepared.identifier, driven, writer, draw=False)
     assert (
-        "Input left: 1 spikes were rejected, 3 missing values were interpolated, 1 missing values "
-        "were replaced by the last one." in notes
+        "Input left: 1 spikes were rejected, 3 missing values were interpolated, 1 values were "
+        "missing: the last one before them, if any, was held." in notes
     )
     found = runs.open(folder).dataset
     alpha, std = float(found["alpha"][-1]), float(found["alpha_std"][-1])

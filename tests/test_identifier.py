@@ -63,7 +63,7 @@ def frozen(ident):
         ((*sample(d=1.0),), lp.errors.SampleError, "unknown channel 'd'"),
         ((0.1, [1.0, 2.0], {"cold": 1.0}), lp.errors.SampleError, "unknown input 'cold'"),
         ((*sample(heat=np.nan),), lp.errors.MissingInputError, "'heat' has no value"),
-        ((*sample(t=-1.0),), lp.errors.TimeOrderError, "not later"),
+        ((*sample(t=-1.0),), lp.errors.TimeOrderError, "before the initial time t0"),
         ((*sample(t=np.nan),), lp.errors.SampleError, "time"),
         ((*sample(t="noon"),), lp.errors.SampleError, "time"),
     ],

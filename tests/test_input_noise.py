@@ -9,7 +9,7 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde import cases
-from livepde.laws.noise_rows import ROWS
+from livepde.laws.noise_rows import PAUSE_ROWS, ROWS
 from livepde.stepping import Alexander2, ImplicitEuler
 
 H, STEPS = 0.01, 40
@@ -73,7 +73,7 @@ def test_the_uncertainty_of_the_state_is_that_of_all_readings(flux, scheme, tole
     for k, value in enumerate(inputs):
         one.step(H * k, {name: value})
     factor = one.observed.G @ one._latent_belief().u_factor
-    assert factor.shape[1] <= 2 + ROWS
+    assert factor.shape[1] <= 2 + ROWS + PAUSE_ROWS
     ratio = np.sqrt((factor**2).sum(axis=1) / square)
     assert ratio[1] == pytest.approx(1.0, rel=tolerance)
     near = 1.0 if flux or isinstance(scheme, ImplicitEuler) else 1.25

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,15 @@ import pandas as pd
 import pytest
 from factories import short_rod
 
+import livepde as lp
 from livepde import cases
 from livepde.cases.case import Prepared
 from livepde.cases.measured import measured
 from livepde.cases.new_case import channels_in
 from livepde.cases.remedies import after_gaps, start_missed, with_settings
 from livepde.cli.check import _refused
-from livepde.errors import CaseError
-from livepde.models import EQUATIONS
+from livepde.errors import CaseError, DataError, SampleError, TimeOrderError
+from livepde.models import EQUATIONS, heat
 from livepde.runs import input_findings
 from livepde.verdict import Cause, Finding, Verdict
 
@@ -135,3 +137,35 @@ def test_a_unit_at_the_end_of_a_name_is_that_of_the_sensor(tmp_path):
     assert given["T_12cm_degF"]["unit"] == "degF"
     assert "unit" not in given["T_20cm"]
     assert "unit" not in given["T_in"]
+
+
+@pytest.mark.parametrize(
+    "column",
+    [
+        pd.date_range("2025-01-01", periods=3),
+        pd.to_timedelta([1, 2, 3], unit="s"),
+        pd.Series([1.0 + 2.0j, 1.0, 2.0]),
+        np.array([1.0 + 2.0j, 1.0, 2.0]),
+    ],
+    ids=["dates", "durations", "complex", "complex array"],
+)
+def test_what_is_no_number_is_no_reading(column):
+    rod = heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": 0.0})
+    identifier = lp.Identifier(rod, lp.Points({"T": 0.5}, noise=0.01), u0=1.0)
+    table = pd.DataFrame({"T": column}, index=[0.1, 0.2, 0.3])
+    with pytest.raises(SampleError, match="column 'T' must contain numbers only"):
+        identifier.run(table)
+
+
+def test_a_compressed_file_is_named(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_bytes(gzip.compress(b"time,T\n0,1\n1,2\n"))
+    with pytest.raises(DataError, match="is compressed: unpack it first"):
+        measured(path, "s")
+
+
+def test_a_sample_before_the_initial_time_names_it():
+    rod = heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": 0.0})
+    identifier = lp.Identifier(rod, lp.Points({"T": 0.5}, noise=0.01), u0=1.0)
+    with pytest.raises(TimeOrderError, match="is before the initial time t0"):
+        identifier.step(-0.5, [1.0])

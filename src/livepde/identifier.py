@@ -469,6 +469,10 @@ class Identifier(Shown):
             t = number(t, "time t")
             if math.isnan(t):
                 raise SampleError("time t is NaN; give the time of the sample.")
+        if t < self._t and not self._samples:
+            raise TimeOrderError(
+                f"the sample at t = {t!r} is before the initial time t0 = {self._t!r}: set `t0`."
+            )
         if t < self._t or (t == self._t and self._samples):
             raise TimeOrderError(
                 f"the sample at t = {t!r} is not later than the last one at t = {self._t!r}: "

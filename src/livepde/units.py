@@ -201,9 +201,13 @@ def _expected(unit: str, given: str) -> str:
     if not unit:
         return "expected a number without a unit"
     if re.search(r"[A-Za-z][0-9]", given):
-        return f"write powers as in '{unit}'" if "^" in unit else f"expected one as '{unit}'"
+        return (
+            f"write powers as in '{unit}'" if "^" in unit else f"expected a unit such as '{unit}'"
+        )
     others = next((kind for kind in KINDS if unit in kind), (unit,))
-    return f"expected one as {' or '.join(filter(None, (', '.join(others[:-1]), others[-1])))}"
+    return (
+        f"expected a unit such as {' or '.join(filter(None, (', '.join(others[:-1]), others[-1])))}"
+    )
 
 
 def _pint() -> Any:

@@ -473,7 +473,7 @@ def _noise(case: CaseContent, spec: SensitivitySpec) -> float | str | None:
         return case.positive(spec.noise, case.equation.state.unit, "law.noise")
     if case_channels.noise_of(case) is None:
         if spec.noise == "auto":
-            text = "got 'auto', which begins with a guess: give every sensor its noise."
+            text = "'auto' scales a first guess: state the `noise` of every sensor as that guess."
             raise case.error("law.noise", text)
         raise case.missing(
             "law.noise",

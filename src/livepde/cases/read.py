@@ -326,7 +326,9 @@ def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) 
                         f"{path[0]}.{part}={{ ... }})"
                     )
                 if not isinstance(here.get(part), dict):
-                    here[part] = {}
+                    # initial = "interpolate" is short for initial.from = "interpolate".
+                    whole = here is changed and part == "initial" and part in here
+                    here[part] = {"from": here[part]} if whole else {}
                 here = here[part]
             if value is not None:
                 here[path[-1]] = value

@@ -163,16 +163,16 @@ class Columns:
         log[0, first:, 1 : 1 + wild.shape[1]][wild] = np.nan
         return replace(self, state=changed(self.state, log=log))
 
-    def samples(self, error: Error | None = None) -> StoredSamples:
-        """Return the samples, with the columns of an error corrected."""
-        return StoredSamples.of(self.work, self.state if error is None else self.corrected(error))
+    def samples(self, error: Error | None = None, *, anew: bool = False) -> StoredSamples:
+        """Return the samples, with the columns of an error corrected.
+
+        `anew`: a fit of them begins at the prior mean, else at the last fit.
+        """
+        state = self.state if error is None else self.corrected(error)
+        return StoredSamples.of(self.work, changed(state, now=self.state.start) if anew else state)
 
     def corrected(self, error: Error) -> SensitivityState:
-        """Return the member with the columns of an error corrected.
-
-        A fit of its samples begins at the prior mean if the error is not small.
-        """
-        begun = self.state if error.numbers else changed(self.state, now=self.state.start)
+        """Return the member with the columns of an error corrected."""
         log, names = self.state.log.copy(), error.names
         at = [self.places[name] for name in names]
         values = log[0][:, at]
@@ -198,7 +198,7 @@ class Columns:
             if names[0] not in self.inputs:  # else readings that shrink to nothing would fit best
                 log[0][:, at[0] + len(self.work.filter.noise)] *= factor
         log[0][:, at] = values
-        return changed(begun, log=log, start=self._start(log, names))
+        return changed(self.state, log=log, start=self._start(log, names))
 
     def _start(self, log: Array, names: Sequence[str]) -> FilterState:
         """Return the start with other columns: an initial state that is made of readings moves."""
@@ -460,13 +460,27 @@ class _Trials:
     def _only_sensors(self, error: Error) -> bool:
         return not set(error.names) & set(self.columns.inputs)
 
+    def _end(self, error: Error, *, anew: bool) -> _Fit | None:
+        """Return where a fit with a corrected column ends."""
+        found = self.refitted(self.columns.samples(error, anew=anew))
+        return None if found is None else _Fit.about(found.best)
+
     def fitted(self, error: Error) -> tuple[float, Error] | None:
-        """Return the cost of a fit with a corrected column, and the error, its size improved."""
-        for _ in range(ROUNDS):
-            found = self.refitted(self.columns.samples(error))
-            if found is None:
+        """Return the cost of a fit with a corrected column, and the error, its size improved.
+
+        It begins at the last fit, which may be far off with the right columns, or at the prior
+        mean, whichever ends better.
+        """
+        ends = [(self._end(error, anew=anew), anew) for anew in (False, True)]
+        fit, anew = min(
+            ((end, anew) for end, anew in ends if end is not None),
+            key=lambda one: one[0].cost,
+            default=(None, False),
+        )
+        for number in range(ROUNDS):
+            fit = self._end(error, anew=anew) if number else fit
+            if fit is None:
                 return None
-            fit = _Fit.about(found.best)
             cost, used = fit.cost, error
             if not error.numbers:
                 break

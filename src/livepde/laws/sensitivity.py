@@ -163,6 +163,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     def __post_init__(self) -> None:
         stated = isinstance(self.noise, int | float) and np.isfinite(self.noise) and self.noise > 0
+        gate: Any = self.gate  # None is no gate elsewhere
         kinds = (("refit", Refit), ("jumps", Jumps), ("guards", Guards), ("shadows", Shadows))
         parts = [(getattr(self, name), name, kind) for name, kind in kinds]
         for holds, name, rule in (
@@ -173,7 +174,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 (part is None or isinstance(part, kind), name, f"a {kind.__name__}, or None")
                 for part, name, kind in parts
             ),
-            (self.gate > 0, "gate", "positive"),
+            (isinstance(gate, int | float) and gate > 0, "gate", "positive"),
             (self.gate_patience >= 1, "gate_patience", ">= 1"),
             (self.verdict in (True, False, "cheap"), "verdict", "True, 'cheap' or False"),
         ):

@@ -36,6 +36,7 @@ END = "end"  # of a file that is read
 LOOK = 100_000  # characters that are looked at to say how a file is written
 TOA5 = "TOA5"  # first cell of the title line of loggers by Campbell
 UNDER = 2  # most lines of labels under a header: units and kinds of values
+GZIP = b"\x1f\x8b"
 BOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # how workbooks begin: .xlsx and .ods, .xls
 
 
@@ -180,8 +181,11 @@ def _check_text(path: Path) -> None:
     if stat.S_ISCHR(path.stat().st_mode):
         raise DataError(f"{path} is a device, not a file. Specify a file.")
     with path.open("rb") as file:
-        if file.read(4).startswith(BOOKS):
-            raise DataError(f"{path} is a workbook, not text: save its sheet as 'CSV UTF-8'.")
+        first = file.read(4)
+    if first.startswith(BOOKS):
+        raise DataError(f"{path} is a workbook, not text: save its sheet as 'CSV UTF-8'.")
+    if first.startswith(GZIP):
+        raise DataError(f"{path} is compressed: unpack it first, as with 'gunzip'.")
 
 
 def _check_header(

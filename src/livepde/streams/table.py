@@ -277,6 +277,9 @@ def tabulated(
     def numbers(name: str, use: Any) -> Array:
         given = values[name]
         try:
+            # NumPy would count a date in nanoseconds, and drop an imaginary part.
+            if getattr(getattr(given, "dtype", None), "kind", "") in ("m", "M", "c"):
+                raise TypeError
             if hasattr(given, "iloc"):  # of pandas, where a missing value may be no float
                 given = given.to_numpy(dtype=float, na_value=np.nan)
             column: Array = np.asarray(given, dtype=float)

@@ -256,11 +256,15 @@ def theory_report(
     Raises
     ------
     ConfigurationError
-        The stream holds fewer than two samples.
+        The stream holds fewer than two samples, or the gain is not constant.
     """
     items = [sample_of(item) for item in samples]
     if len(items) < 2:
         raise ConfigurationError(f"theory: needs at least two samples; got {len(items)}.")
+    if getattr(identifier.law, "gain", 1.0) == "auto":
+        raise ConfigurationError(
+            "theory: the paper's quantities are those of a constant gain; give a number for `gain`."
+        )
     if window is None:
         window = max((items[-1].t - items[0].t) / 20.0, 1e-12)
     tracker = OnlineTracker(identifier, window, noise)
