@@ -38,6 +38,16 @@ class Shown(ABC):
         return f"<b>{html.escape(title)}</b><table>{cells}</table>"
 
 
+def in_percent(share: float) -> str:
+    """Return a share in per cent, with two digits and no exponent.
+
+    >>> in_percent(0.0234), in_percent(0.997), in_percent(2.5)
+    ('2.3 %', '100 %', '250 %')
+    """
+    size = 100.0 * share
+    return f"{size:.0f} %" if abs(size) >= 99.5 else f"{size:.2g} %"
+
+
 def listed(names: Iterable[str]) -> str:
     """Return names in one line, the first ones of many.
 

@@ -17,6 +17,7 @@ from livepde.identifier import Identifier
 from livepde.laws import Belief
 from livepde.linalg import Array
 from livepde.model import Model
+from livepde.showing import in_percent
 from livepde.verdict import FLAT
 
 # Largest remaining share of the prior standard deviation of a well-determined unknown.
@@ -103,7 +104,7 @@ class Identifiability:
         ]
         found += [
             f"Of {', '.join(d.weights)}, the data identify only the combination {d}, in prior "
-            f"standard deviations. Its standard deviation is {100.0 * d.left:.2g} % of the prior's."
+            f"standard deviations. Its standard deviation is {in_percent(d.left)} of the prior's."
             for d in self.directions
         ]
         found += [

@@ -31,6 +31,7 @@ from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.linalg.member_arrays import changed
+from livepde.showing import in_percent
 from livepde.verdict import Cause, channel_setting
 from livepde.verdict.directions import boundary_lifts
 from livepde.verdict.sentences import LIKELY, amount_of, estimating, table_of
@@ -625,7 +626,7 @@ def _cause(columns: Columns, error: Error, share: float) -> Cause:
             amount = amount_of(abs(size), columns.unit(first))
             values |= {"amount": amount, "side": "high" if side else "low"}
         case "gain":
-            values |= {"share": f"{100.0 * abs(size):.2g} %", "side": "large" if side else "small"}
+            values |= {"share": in_percent(abs(size)), "side": "large" if side else "small"}
         case "lag":
             lag = amount_of(abs(size), problem.model.time_unit)
             values |= {"amount": lag, "side": "late" if side else "early"}

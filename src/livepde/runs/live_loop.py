@@ -706,8 +706,9 @@ class Live:
         if level != before.level:
             first = verdict.sentences[0] if verdict.sentences else "no problems detected"
             message = f"{level}: {first.removeprefix('Not judged: ')}"
-            # Each sound run begins as not judged, and is trusted then: that is no warning.
-            self._tell("verdict", message, harmless=level == LEVELS[0])
+            # Each sound run begins as not judged, and is trusted then: that is no warning. Finished
+            # data end with another verdict, on all of them.
+            self._tell("verdict", message, harmless=level == LEVELS[0] or not self.waits)
 
     def _keep_verdict(self, looked: Looks) -> None:
         """Make a verdict the current one, which all readers see."""

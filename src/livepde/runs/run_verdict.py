@@ -18,7 +18,7 @@ from livepde.laws.verdict import step_findings
 from livepde.linalg import Array
 from livepde.plots.style import note, prior_left
 from livepde.records import STATUS_CODES, field_names, scalars
-from livepde.runs.summary import digits, jumps, shown
+from livepde.runs.summary import digits, jumps
 from livepde.streams.oddities import FACTORS, clock_leaps, unit_factor
 from livepde.verdict import (
     FLAT,
@@ -373,13 +373,11 @@ def verdict_table(found: Verdict) -> Table:
             finding.severity,
             finding.what,
             finding.subject or "–",
-            shown(finding.evidence, ".2g"),
-            finding.measure,
             "; ".join(cause.text for cause in finding.causes[:2]) or "–",
         )
         for finding in found.findings[:MOST]
     ]
-    columns = ("severity", "finding", "subject", "evidence", "measure", "likely causes")
+    columns = ("severity", "finding", "subject", "likely causes")
     promise = PROMISES[found.level]
     if found.level == "caution" and found.errors is not None:
         promise += ": use the intervals with model errors"

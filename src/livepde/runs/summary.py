@@ -17,6 +17,7 @@ from livepde.frames import estimates, model_errors, relative_error
 from livepde.plots.style import modes_told, note, prior_left
 from livepde.records import NORMAL_95, field_names, refused_readings, scalars, used_errors
 from livepde.runs.journal import Journal
+from livepde.showing import in_percent
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -391,11 +392,11 @@ def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:
         others, words = _traded(data, label), STATES[state]
         if others and state != "pinned":
             words += f", correlated with {', '.join(others)}"
-        rows.append((label, _share(left), words))
+        rows.append((label, in_percent(left), words))
     for name in field_names(data):
         if f"{name}_modes" in data:
             told, count, left = modes_told(data, name)
-            rows.append((name, _share(left), f"{told:.1f} of {count} modes determined"))
+            rows.append((name, in_percent(left), f"{told:.1f} of {count} modes determined"))
     return Table("Identifiability", ("unknown", "std. dev. / prior", "state"), rows)
 
 
@@ -410,10 +411,6 @@ def determination(attrs: Mapping[Any, Any], value: float, left: float) -> str:
     moves = "prior_std" not in attrs  # only numbers without an evolution have one prior to compare
     known = InformationGain("", left, bound=bounds[0] if bounds else math.nan, moves=moves)
     return "moves" if moves and known.verdict == "partly" else known.verdict
-
-
-def _share(left: float) -> str:
-    return f"{100 * left:.0f} %" if left >= 1.0 else f"{100 * left:.2g} %"
 
 
 def _traded(data: xr.Dataset, label: str) -> list[str]:

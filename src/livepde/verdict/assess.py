@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from livepde.linalg import Array
+from livepde.showing import in_percent
 from livepde.verdict.directions import (
     DRIFT,
     FIXED,
@@ -330,7 +331,7 @@ def _words(direction: ScoreDirection, size: float, at: Position) -> Sentence:
             rate = amount_of(abs(amount) / DRIFT, direction.unit)
             values["rate"] = f"{'+' if more else '-'}{rate}"
         case "gain" | "channel":
-            share = f"{100.0 * abs(amount):.2g} %"
+            share = in_percent(abs(amount))
             values |= {"share": share, "side": "large" if more else "small"}
         case "lag":
             time = amount_of(abs(amount), at.time_unit)
@@ -412,7 +413,7 @@ def _noise(at: Position) -> Iterator[Finding]:
         return
     typical = weighted_median(ratio, count)
     if typical > LARGER or typical < SMALLER:
-        small = FINDINGS["noise, small"].filled(share=f"{100.0 * typical:.2g} %")
+        small = FINDINGS["noise, small"].filled(share=in_percent(typical))
         large = FINDINGS["noise, large"].filled(ratio=typical)
         text, _ = small if typical < SMALLER else large
         yield Finding("noise", "note", text, evidence=typical)

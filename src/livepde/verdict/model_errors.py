@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
+from livepde.showing import in_percent
+
 Rank: TypeAlias = Literal["trusted", "caution", "do not trust"]
 
 FAILED = 5.0  # misfit over noise, and ...
@@ -68,7 +70,7 @@ class Allowed:
         unit = f" {self.unit}" if self.unit else ""
         off = f"error up to {self.effect:.2g} times its value"
         if self.effect < 1.0:
-            off = f"error up to {100.0 * self.effect:.2g} %"
+            off = f"error up to {in_percent(self.effect)}"
         return f"{self.label} is between {self.low:.4g} and {self.high:.4g}{unit} ({off})"
 
 
