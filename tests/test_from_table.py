@@ -263,12 +263,13 @@ def test_without_that_input_another_unknown_is_taken(here):
 def test_graded_meshes_where_the_equation_wants_them(here, name):
     found = begun("time_s,a\n0,1\n1,1\n", equation=name)
     assert found["mesh"]["spacing"] == "geometric"
+    assert found["initial"].startswith("?")  # a line between sensors is no state around a well
     if name != "pumping_test":
         return
     filled = {"mesh.from": "0.1 m", "mesh.to": "900 m", "options.b": "10 m", "law.noise": "1 cm"}
     filled |= {f"unknowns.k.{key}": "1e-4 m/s" for key in ("prior", "std")}
     filled |= {f"unknowns.Ss.{key}": "1e-5 1/m" for key in ("prior", "std")}
-    filled |= {"channels.a.at": "9 m", "inputs.Q": "36 m^3/h"}
+    filled |= {"channels.a.at": "9 m", "inputs.Q": "36 m^3/h", "initial": 0}
     told = "where 'pumping_test' changes most. Set `mesh.spacing = 'geometric'`"
     for spacing, expected in (("geometric", False), ("uniform", True)):
         case = cases.load("mine/case.toml", settings={**filled, "mesh.spacing": spacing})
@@ -490,7 +491,7 @@ FILES = {"mesh.from": "3 cm", "mesh.to": "1 m", "law.noise": "0.1 K", "options.H
 FILES |= {"options.T0": "20 degC", "channels.T_15cm.role": "validation"}
 FILES |= {"unknowns.k.prior": "2 W/(m K)", "unknowns.k.std": "1 W/(m K)"}
 FILES |= {"unknowns.R_b.prior": "0.1 m K/W", "unknowns.R_b.std": "0.1 m K/W"}
-FILES |= {"options.rho_c": "2e6 J/(m^3 K)"}
+FILES |= {"options.rho_c": "2e6 J/(m^3 K)", "initial": "20 degC"}
 
 
 def two_tables() -> list[str]:

@@ -156,6 +156,8 @@ def _top(table: Measured, equation: Equation, inputs: set[str]) -> Iterator[str]
     if equation.components:
         parts = dict.fromkeys(equation.components, _open(unit))
         yield from _inline("initial", parts, equation.state.text)
+    elif equation.spacing == "geometric":  # around a well, where a line between sensors is no state
+        yield _told(toml_line("initial", _open(unit)), f"{equation.state.text} at rest")
     elif equation.dimension > 1:
         yield _told(toml_line("initial", _open(unit)), f"{equation.state.text} at the start")
     else:

@@ -187,8 +187,9 @@ def _transformed(
     elif not np.isfinite(bounds).all():
         raise case.error(key, f"transform='logit' needs two finite bounds; got {bounds}.")
     if not low < median < high:
-        text = f"prior {median} is outside the range of transform='{transform}'; move it "
-        raise case.error(key, text + "inside the bounds.")
+        text = f"prior {median} is outside the range of transform='{transform}': it must be between"
+        text += f" {low:g} and {high:g}. To allow other values, remove `transform`."
+        raise case.error(key, text)
     return (fem.LogNormal if transform == "log" else fem.LogitNormal)(median, std, (low, high))
 
 

@@ -30,7 +30,7 @@ SIZED = ("boundary", "channel", "drift", "flux", "lag", "loss", "source")
 STATED = ("factor", "late")  # keys of a channel whose stated value a cause does not replace
 MISSED = 5.0  # times the noise that the first readings may miss a stated start
 JUMPED = "Jumps are allowed already: check the model and the data for another cause."
-NO_SETTING = "This case has no setting to estimate it."
+NO_SETTING = "No key of this case does that."
 
 
 def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
