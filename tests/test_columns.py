@@ -98,9 +98,10 @@ FAULTS: dict[str, tuple[Any, str, str]] = {
 }
 
 
-def run(
+def begun(
     columns: dict[str, Any], between: Any = None, parts: Any = None, **options: Any
-) -> lp.Result:
+) -> tuple[lp.Identifier, list[Any]]:
+    """Return an identifier before its first sample, and the samples."""
     mesh = lp.interval(0.0, LENGTH, 40)
     ends = {"left": lp.Channel("TC1"), "right": lp.Channel("TC5")}
     model = lp.Model(
@@ -118,6 +119,11 @@ def run(
         (float(t), {name: columns[name][k] for name in PLACES}, {n: columns[n][k] for n in names})
         for k, t in enumerate(columns["t"])
     ]
+    return identifier, samples
+
+
+def run(columns: dict[str, Any], **options: Any) -> lp.Result:
+    identifier, samples = begun(columns, **options)
     return identifier.run(samples)
 
 
@@ -292,16 +298,24 @@ def test_an_early_boundary_is_no_late_sensor_and_the_search_ends(tmp_path: Path)
     assert last.fit.passes < 50  # 205 where each of eleven searches is followed to its end
 
 
+def walk(folder: Path, fault: Fault, rows: int, **settings: Any) -> Any:
+    """Return the prepared case of a walk with a wrong column, and so many rows of the table."""
+    examples = Path(__file__).parents[1] / "examples" / "first_hour"
+    shutil.copy(examples / f"{fault.walk}.toml", folder)
+    case = load(folder / f"{fault.walk}.toml", settings=settings)
+    columns = {name: str(item.column) for name, item in case.spec.channels.items()}
+    header, table, _ = TABLES[fault.walk](1)
+    save(folder / f"{fault.walk}.csv", header, with_fault(fault, header, table, columns)[:rows])
+    return case.prepare()
+
+
+EXCHANGED = Fault("heater", ("T_10", "T_60"), "exchanged")
+
+
 @pytest.mark.slow
 def test_exchanged_sensors_that_contradict_all_are_found_from_the_start(tmp_path: Path):
     """The gate takes such columns for a disturbance, after which the stored state is wrong."""
-    folder = Path(__file__).parents[1] / "examples" / "first_hour"
-    shutil.copy(folder / "heater.toml", tmp_path)
-    header, rows, _ = TABLES["heater"](1)
-    first, second = (header.index(name) for name in ("T_10mm", "T_60mm"))
-    rows[:, [first, second]] = rows[:, [second, first]]
-    save(tmp_path / "heater.csv", header, rows)
-    prepared = load(tmp_path / "heater.toml").prepare()
+    prepared = walk(tmp_path, EXCHANGED, 501)
     last = prepared.identifier.run(prepared.stream).last
     assert prepared.identifier._state.trial.shape[1] > 0  # there was a disturbance
     found = [finding.causes[0] for finding in last.verdict.findings if finding.causes]
@@ -311,23 +325,19 @@ def test_exchanged_sensors_that_contradict_all_are_found_from_the_start(tmp_path
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "fault",
+    ("fault", "noise"),
     [
-        Fault("furnace", ("T_cold",), "fahrenheit"),
-        pytest.param(Fault("furnace", ("T_2", "T_4"), "exchanged"), marks=pytest.mark.long),
-        pytest.param(Fault("furnace", ("T_2",), "late", 30.0), marks=pytest.mark.long),
+        (Fault("furnace", ("T_cold",), "fahrenheit"), ""),
+        pytest.param(Fault("furnace", ("T_cold",), "fahrenheit"), "auto", marks=pytest.mark.long),
+        pytest.param(Fault("furnace", ("T_2", "T_4"), "exchanged"), "", marks=pytest.mark.long),
+        pytest.param(Fault("furnace", ("T_2",), "late", 30.0), "", marks=pytest.mark.long),
     ],
     ids=str,
 )
-def test_wrong_columns_are_named_where_an_unknown_moves(fault: Fault, tmp_path: Path):
+def test_wrong_columns_are_named_where_an_unknown_moves(fault: Fault, noise: str, tmp_path: Path):
     """A furnace with an unknown flux that moves: samples are filtered, not fitted, again."""
-    folder = Path(__file__).parents[1] / "examples" / "first_hour"
-    shutil.copy(folder / "furnace.toml", tmp_path)
-    case = load(tmp_path / "furnace.toml")
-    columns = {name: str(item.column) for name, item in case.spec.channels.items()}
-    header, rows, _ = TABLES["furnace"](1)
-    save(tmp_path / "furnace.csv", header, with_fault(fault, header, rows, columns)[:400])
-    prepared = case.prepare()
+    settings = {"law.noise": "auto"} if noise else {}
+    prepared = walk(tmp_path, fault, 400, **settings)
     verdict = prepared.identifier.run(prepared.stream).last.verdict
     first = next(finding.causes[0] for finding in verdict.findings if finding.causes)
     kinds = {"fahrenheit": "unit", "exchanged": "exchange", "late": "lag"}
@@ -335,3 +345,32 @@ def test_wrong_columns_are_named_where_an_unknown_moves(fault: Fault, tmp_path: 
     assert first.share > 0.9
     if fault.kind == "late":
         assert first.size == pytest.approx(60.0, rel=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", [EXCHANGED, Fault("furnace", ("T_cold",), "fahrenheit")], ids=str)
+def test_samples_for_trials_outlive_a_restart(fault: Fault, tmp_path: Path):
+    prepared = walk(tmp_path, fault, 120)
+    first, second = prepared.identifier, load(prepared.case.path).prepare().identifier
+    for number, sample in enumerate(prepared.stream):
+        expected = first.step(sample.t, sample.z, sample.inputs)
+        if number > 60:
+            found = second.step(sample.t, sample.z, sample.inputs)
+        if number == 60:
+            second.restore(first.dump())
+    assert first._state.trial.shape[1] > 60
+    np.testing.assert_array_equal(first._state.trial, second._state.trial)
+    np.testing.assert_array_equal(found.q, expected.q)
+    each = [one._settled(last).verdict for one, last in ((first, expected), (second, found))]
+    assert each[0].sentences == each[1].sentences
+
+
+@pytest.mark.parametrize("since", [60, 150])
+def test_columns_that_were_right_for_long_are_not_wrong_from_the_start(since: int):
+    """All sensors are another unit from some sample on, which is a disturbance."""
+    _, columns = bar(3)
+    wrong = {name: np.where(np.arange(COUNT) < since, z, z + 30.0) for name, z in columns.items()}
+    identifier, samples = begun(columns | {name: wrong[name] for name in PLACES})
+    identifier.run(samples)
+    first = float(identifier._state.trial[0, 0, 0])
+    assert first == 0.0 if since == 60 else first >= STEP * since

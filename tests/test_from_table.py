@@ -556,6 +556,26 @@ T_2 = { role = "sensor", column = "T_2cm", at = "2 cm" }
     assert skipped.raw.remarks["skipped", "T_1"] == 1
 
 
+def test_a_late_sensor_begins_no_run_before_its_stated_state(here):
+    Path("a.csv").write_text("t,T_1cm,T_2cm\n0,20,20\n10,21,20\n20,22,21\n30,23,22\n")
+    Path("case.toml").write_text("""
+equation = "heat"
+initial = 20
+mesh = { from = 0, to = "10 cm", cells = 10 }
+data = { file = "a.csv", time = "t", time_unit = "s" }
+unknowns.alpha = { prior = 1e-5, std = 1e-5 }
+law = { noise = 0.1 }
+boundary.left = 20
+[channels]
+T_1 = { role = "sensor", column = "T_1cm", at = "1 cm" }
+T_2 = { role = "sensor", column = "T_2cm", at = "2 cm", late = "10 s" }
+""")
+    raw = cases.load("case.toml").prepare().raw
+    np.testing.assert_allclose(raw.t, [0, 10, 20, 30])
+    np.testing.assert_allclose(raw.values, [[20, 20], [21, 21], [22, 22], [23, np.nan]])
+    assert raw.remarks["early", "T_2"] == 1
+
+
 @pytest.mark.parametrize(
     ("files", "channel", "told"),
     [

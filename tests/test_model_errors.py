@@ -12,7 +12,7 @@ import pytest
 import scipy
 
 import livepde as lp
-from livepde.laws.model_errors import SMALL, ErrorColumns
+from livepde.laws.error_columns import SMALL, ErrorColumns
 from livepde.laws.stored_samples import StoredSamples
 from livepde.verdict import (
     Allowed,
@@ -286,6 +286,7 @@ UNFITTED = {
     "not stored": {"refit": None},
     "window": {"refit": lp.Refit(window=60)},
     "fades": {"memory": 50.0},
+    "not guarded": {"refit": None, "guards": None},
 }
 
 
@@ -298,29 +299,33 @@ def test_a_sound_run_without_a_fit_has_hardly_a_wider_interval(why):
     assert verdict.level == "trusted"
     assert verdict.errors is not None
     assert verdict.errors.misfit == pytest.approx(1.0, abs=0.15)
+    assert 0.0 < verdict.errors.of_signal < 0.2
     (one,) = verdict.errors.unknowns
     assert one.low < 0.12 < one.high
     assert one.wider < 1.3
 
 
 @pytest.mark.parametrize("why", ["moves", *OTHERS])
-@pytest.mark.parametrize("wrong", ["source", "gain"])
+@pytest.mark.parametrize("wrong", ["source", "gain", "lag"])
 def test_an_interval_of_innovations_allows_for_errors_of_process_and_sensors(why, wrong):
     z = truth(3, ("source", 0.06)) if wrong == "source" else truth(3).copy()
     if wrong == "gain":
-        z[:, 1] *= 1.15
+        z[:, 0] *= 1.15
+    elif wrong == "lag":
+        z[3:, 0] = truth(3)[:-3, 0]
     verdict = innovations_of(z, **UNFITTED[why])
     assert verdict.level != "trusted"
     assert verdict.errors is not None
     (one,) = verdict.errors.unknowns
     assert one.low < 0.12 < one.high
-    assert one.wider > 1.3
-    ends_away = abs(one.plain_low - 0.12), abs(one.plain_high - 0.12)
-    if not one.plain_low < 0.12 < one.plain_high:  # it reaches out to the side of the truth
-        nearer = (
-            one.plain_low - one.low if ends_away[0] < ends_away[1] else one.high - one.plain_high
-        )
-        assert nearer > 0.0
+    if wrong == "source":
+        return
+    # An unknown that moves takes up a part, and its plain interval is wide. The other one is wider
+    # on the side of the truth.
+    assert (one.plain_low < 0.12 < one.plain_high) == (why == "moves")
+    below, above = one.plain_low - one.low, one.high - one.plain_high
+    assert max(below, above) > 0.0
+    assert (below > above) == (one.value > 0.12)
 
 
 def numbers(estimate: lp.Estimate) -> Any:

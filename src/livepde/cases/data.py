@@ -122,9 +122,11 @@ def read_data(case: CaseContent, source: str | Iterable[str] | None) -> DataTabl
 
     needed = [name for name, column in columns.items() if column.needed]
     between = {name: column.between for name, column in columns.items()}
-    # An initial profile needs a reading of each sensor.
+    # An initial profile needs a reading of each sensor. Readings that are late in their table come
+    # before its start once they are corrected: a stated state is not that of their time.
     initial = case.spec.initial
-    together = isinstance(initial, InitialSpec) and initial.start in INTERPOLATED
+    profile = isinstance(initial, InitialSpec) and initial.start in INTERPOLATED
+    together = profile or bool(delays(case))
     sensors, where = case.roles(*SENSORS), case.where("data.file")
     return join_tables(tables, clock.second, sensors, needed, where, between, together=together)
 

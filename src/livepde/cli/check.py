@@ -18,6 +18,7 @@ from livepde.cli.options import CaseArgument, CodeOption, DataOption, SetOption,
 from livepde.cli.printing import CHECK_FAILED, extent, print_table, terminal
 from livepde.runs import Table, sampling_findings
 from livepde.samples import by_name
+from livepde.showing import in_percent
 from livepde.stepping import ForwardStage
 from livepde.streams import DataTable
 from livepde.streams.oddities import sentinels, switches
@@ -74,8 +75,8 @@ def _refused(prepared: Prepared) -> list[str]:
         "spike": "{name}: {n} values are spikes. A run rejects them. To use them, set "
         '`channels.{name}.spikes = "keep"`.',
         "begin": "{name}: the first {n} rows have no value. A run leaves them out.",
-        "early": "{name}: the first {n} values are earlier than another file. A run leaves them "
-        "out. Where that file has sensors only, a value of `initial` lets a run use them.",
+        "early": "{name}: the first {n} values are earlier than other data that a run needs at its "
+        "start. A run leaves them out.",
         "bridged": "{name}: {n} values are missing in long gaps. A run interpolates them. To leave "
         'these rows out, set `channels.{name}.missing = "skip"`.',
         "ended": "{name}: the last {n} rows have no value. A run holds the one before. To end the "
@@ -138,8 +139,8 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
             item.name,
             f"{item.prior:.3g}",
             f"{item.posterior:.3g}",
-            _percent(item.left),
-            *([_percent(late[item.name])] if item.name in late else []),
+            in_percent(item.left),
+            *([in_percent(late[item.name])] if item.name in late else []),
             item.unit,
             "not identifiable" if item.not_identifiable else "",
         )
@@ -159,16 +160,14 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
     return [*unidentified, *found.sentences]
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.{2 if share < 0.995 else 3}g} %"
-
-
 def _show_advice(console: Console, prepared: Prepared) -> None:
     """Print where one more sensor would help most."""
     found = advise(prepared, prepared.stream)
     unit = prepared.case.equation.length_unit
     at = ", ".join(f"{x:.3g}" for x in found.position)
-    rows = [(name, _percent(left), _percent(found.then[name])) for name, left in found.now.items()]
+    rows = [
+        (name, in_percent(left), in_percent(found.then[name])) for name, left in found.now.items()
+    ]
     title = f"One more sensor helps most at {at} {unit}".rstrip()
     columns = ("unknown", "std. dev. / prior", "with the sensor")
     print_table(console, Table(title, columns, rows))

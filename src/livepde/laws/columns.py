@@ -27,7 +27,7 @@ from livepde.laws.history import intervals_since
 from livepde.laws.one_member import filtered
 from livepde.laws.policies import Refit
 from livepde.laws.refit import WILD, Found, near_most, near_neighbours, refitted
-from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
+from livepde.laws.sensitivity_state import MOST_TRIED, SensitivityState, SensitivityWork
 from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.linalg.member_arrays import changed
@@ -36,7 +36,6 @@ from livepde.verdict import Cause, channel_setting
 from livepde.verdict.directions import boundary_lifts
 from livepde.verdict.sentences import LIKELY, amount_of, estimating, table_of
 
-MOST_ROWS = 600  # samples that are looked at, from the start of the stored ones
 FEWEST_ROWS = 40
 MOST_WORK = 4e8  # coefficients of states that all passes may compute
 PASSES = 6  # over the samples that a fit may take
@@ -53,9 +52,11 @@ SETTLED = 0.02  # relative change of a size that is none
 # Of the misfit, and of the noise: within the smaller one nothing is left to explain, and the error
 # with fewer numbers is likelier.
 CLOSE, SLIGHT = 0.05, 0.2
-# Where unknowns move: passes of a filter at most, the share of a misfit that is worth a word, and
-# how many such errors are named.
-MOST_FILTERED, SOME, NAMED = 60, 0.1, 3
+# Where unknowns move: samples that a filter follows in a pass, and in all passes; the share of a
+# misfit that is worth a word, and how many such errors are named.
+MOST_FOLLOWED, MOST_STEPS = 300, 20_000
+SOME, NAMED = 0.1, 3
+LAGS = 16  # passes of a search for a longer lag, at most
 SLIGHT_LAG = 0.02  # share that a lag of one sample has to explain before longer ones are tried
 TEMPERATURES = ("degC", "degF", "K")
 
@@ -135,15 +136,15 @@ class Columns:
         log = state.log[:, int(state.window[0]) :]
         log = log[:, np.isfinite(log[0, :, 0])]
         # At two places: three errors of each input, and all exchanges with an input.
-        passes = 2 * len(inputs) * (3 + len(names) + len(inputs))
+        passes, most = 2 * len(inputs) * (3 + len(names) + len(inputs)), MOST_TRIED
         passes += PASSES * ROUNDS * sum(TRIED.values())
-        most = MOST_ROWS
-        if work.filter.moves:
-            passes, most = MOST_FILTERED, MOST_ROWS // 2
+        if work.filter.moves:  # units, exchanges, and lags of one sample and of more
+            passes = len(places) * (5 + len(places) // 2) + LAGS * TRIED["lag"]
+            most = min(MOST_FOLLOWED, MOST_STEPS // passes)
         each = problem.model.X.dim * (1 + work.filter.reduction.size)
         most = min(most, int(MOST_WORK / (passes * each)))
         if most < FEWEST_ROWS:
-            return "the mesh is too large to fit that often"
+            return "the mesh is too large, or the columns are too many, to try each"
         rows = min(log.shape[1], most)
         if rows < FEWEST_ROWS:
             return f"fewer than {FEWEST_ROWS} samples are stored"
@@ -164,13 +165,14 @@ class Columns:
         log[0, first:, 1 : 1 + wild.shape[1]][wild] = np.nan
         return replace(self, state=changed(self.state, log=log))
 
-    def samples(self, error: Error | None = None, *, anew: bool = False) -> StoredSamples:
+    def samples(self, error: Error | None = None, *, from_prior: bool = False) -> StoredSamples:
         """Return the samples, with the columns of an error corrected.
 
-        `anew`: a fit of them begins at the prior mean, else at the last fit.
+        A fit of them begins at the last fit, or at the prior mean.
         """
         state = self.state if error is None else self.corrected(error)
-        return StoredSamples.of(self.work, changed(state, now=self.state.start) if anew else state)
+        begun = changed(state, now=self.state.start) if from_prior else state
+        return StoredSamples.of(self.work, begun)
 
     def corrected(self, error: Error) -> SensitivityState:
         """Return the member with the columns of an error corrected."""
@@ -461,9 +463,9 @@ class _Trials:
     def _only_sensors(self, error: Error) -> bool:
         return not set(error.names) & set(self.columns.inputs)
 
-    def _end(self, error: Error, *, anew: bool) -> _Fit | None:
+    def _end(self, error: Error, *, from_prior: bool) -> _Fit | None:
         """Return where a fit with a corrected column ends."""
-        found = self.refitted(self.columns.samples(error, anew=anew))
+        found = self.refitted(self.columns.samples(error, from_prior=from_prior))
         return None if found is None else _Fit.about(found.best)
 
     def fitted(self, error: Error) -> tuple[float, Error] | None:
@@ -472,14 +474,12 @@ class _Trials:
         It begins at the last fit, which may be far off with the right columns, or at the prior
         mean, whichever ends better.
         """
-        ends = [(self._end(error, anew=anew), anew) for anew in (False, True)]
-        fit, anew = min(
-            ((end, anew) for end, anew in ends if end is not None),
-            key=lambda one: one[0].cost,
-            default=(None, False),
-        )
+        ends = {prior: self._end(error, from_prior=prior) for prior in (False, True)}
+        costs = {prior: np.inf if end is None else end.cost for prior, end in ends.items()}
+        from_prior = costs[True] < costs[False]
+        fit = ends[from_prior]
         for number in range(ROUNDS):
-            fit = self._end(error, anew=anew) if number else fit
+            fit = self._end(error, from_prior=from_prior) if number else fit
             if fit is None:
                 return None
             cost, used = fit.cost, error
@@ -580,8 +580,11 @@ class _Lag:
 
 def _innovations(columns: Columns, state: SensitivityState) -> Array | None:
     """Return normalised innovations of stored samples, (samples, sensors); None if a step fails."""
-    work, x = columns.work.unaccompanied, unaccompanied(state.start)
-    found = []
+    # A noise that is found would grow with a misfit, and hide it.
+    work = replace(
+        columns.work.unaccompanied, options=replace(columns.work.options, adaptive=False)
+    )
+    x, found = unaccompanied(state.start), []
     for interval in intervals_since(state.log, work.filter.problem.channels):
         x, report = filtered(work, x, interval)
         if not report.status.ok:

@@ -432,13 +432,12 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             return state, told, usual
         if len(span.t0) > 1:
             usual = usual & span.together
-        parts: dict[str, Any] = {}
+        scale = state.scale.add(span.z1, span.z1 - told.predicted)
+        parts: dict[str, Any] = {"scale": scale.without_refused(state.scale, x.screened.refused)}
         if (guards := self.guards) is not None:
             far = np.abs(x.da - before.da) > guards.reach
             if np.count_nonzero(far):
                 usual = usual & ~far.any(axis=1)
-            scale = state.scale.add(span.z1, span.z1 - told.predicted)
-            parts["scale"] = scale.without_refused(state.scale, x.screened.refused)
             # Ranges are at least as large as the noise, so that smaller innovations cannot run
             # away: most samples are spared the exact test.
             if told.worst > guards.runaway:

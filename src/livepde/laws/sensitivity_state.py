@@ -22,6 +22,8 @@ from livepde.linalg.member_arrays import changed, take, where, zeros
 from livepde.records import refusal
 from livepde.stepping import Span
 
+MOST_TRIED = 600  # samples that are kept for trials of columns
+EARLY = 100  # samples after which a disturbance is no column that was wrong from the start
 SMOOTHED = 64  # samples that are smoothed again where unknowns move, at most
 LEAST = 32  # rows that a log is shortened by: a copy for each sample would cost more
 NEVER = np.iinfo(np.int64).max  # number of samples at which nothing is due any more
@@ -96,10 +98,6 @@ class SensitivityWork:
         """True if the stored samples determine constant unknowns alone, so that they are fitted."""
         return not (self.fades or self.filter.moves or self.filter.problem.input_noise)
 
-    def trial_start(self, state: SensitivityState) -> FilterState:
-        """Return the filter before the samples that are kept for trials of columns at first."""
-        return state.start if self.fits else state.trial_start
-
     def tried_samples(self, state: SensitivityState) -> SensitivityState:
         """Return one member with its samples for trials of columns as those to be fitted."""
         start = state.trial_start
@@ -131,10 +129,10 @@ class SensitivityWork:
 
     @cached_property
     def tried(self) -> int:
-        """Samples that are kept for trials of columns, where these are not those of a fit; or 0."""
+        """Number of samples that are kept for trials of columns beside those of a fit; 0: none."""
         if self.refit is None or self.filter.judge is None or self.fades or not self.window:
             return 0
-        return self.refit.window
+        return min(self.refit.window, MOST_TRIED)
 
     @cached_property
     def back(self) -> int:
@@ -339,9 +337,9 @@ def stored(
             parts |= {"fork": Fork.none(now), "due": state.assimilated}
         log = kept
     parts["log"] = log
-    disturbed = anchored is not None and bool((taken & anchored).any())
-    if len(state) == 1 and (not work.fits or disturbed or state.trial.shape[1]):
-        parts |= _trial(work, state, now, span)
+    if work.tried and len(state) == 1:
+        disturbed = anchored is not None and bool(anchored[0])
+        parts |= _trial(work, state, now, span, disturbed=disturbed)
     if work.window:
         parts["assimilated"] = state.assimilated + (taken & span.present)
     # After a pause the state is another one, too.
@@ -365,24 +363,27 @@ def stored(
 
 
 def _trial(
-    work: SensitivityWork, state: SensitivityState, now: FilterState, span: Span
+    work: SensitivityWork, state: SensitivityState, now: FilterState, span: Span, *, disturbed: bool
 ) -> dict[str, Any]:
     """Return the fields of the samples for trials of columns of one member, after one more.
 
-    Where constant unknowns are fitted, trials need those before a disturbance: wrong columns are
-    one, and what begins after it is wrong as well.
+    Where constant unknowns are fitted, the samples of the fit serve as well, unless a disturbance
+    comes early: it may be a wrong column, and then the state after it is wrong, too.
     """
-    if not work.tried:
-        return {}
     before, start = state.trial, state.trial_start
     if not before.shape[1]:
-        before, start = state.log[:, int(state.window[0]) :], work.trial_start(state)
-    if before.shape[1] and not before[0, -1, 0] < span.t1:  # it is taken again
+        before = state.log[:, int(state.window[0]) :]
+        if work.fits:
+            if not (disturbed and before.shape[1] <= EARLY):
+                return {}
+            start = state.start
+    full = before.shape[1] >= work.tried
+    if full or (before.shape[1] and not before[0, -1, 0] < span.t1):  # or it is taken again
         return {}
     trial = added(before, span, np.ones(1, dtype=bool), now.parts)
-    if not (now.driven.pause[0] or trial.shape[1] > work.tried):
+    if not now.driven.pause[0]:
         return {"trial": trial, "trial_start": start}
-    if work.fits:  # the samples of the fit serve as well
+    if work.fits:
         return {"trial": trimmed(trial, trial.shape[1]), "trial_start": zeros(now)}
     return {"trial": trimmed(trial, trial.shape[1] - 1), "trial_start": now}
 

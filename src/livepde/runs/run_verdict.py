@@ -59,7 +59,7 @@ INPUT_KINDS = {
     "bridged": "values in long gaps were interpolated",
     "ended": "values at the end were missing: the last one before them was held",
     "missing": "values were missing: the last one before them, if any, was held",
-    "early": "values were earlier than another file and were left out",
+    "early": "first values were earlier than other data and were left out",
     "begin": "rows at the start, before its first value, were left out",
 }
 

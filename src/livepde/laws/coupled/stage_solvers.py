@@ -53,7 +53,7 @@ from livepde.linalg import (
 from livepde.linalg.solvers import check_finite
 
 LARGE = 4000  # unknowns u and q together, from which a matrix that is not banded goes by blocks
-TOLERANCE = 1e-4  # of GMRES, relative to the first approximation: Newton goes on from there
+TOLERANCE = 1e-4  # of GMRES, relative to the first approximation, which Newton then improves
 ITERATIONS = 60  # each keeps a vector
 RESOLVED = 1e-10  # of u and q: smaller updates by GMRES are as good as none
 ONE_SIGN = 1.1  # sum of sizes over size of sums, of entries that have one sign nearly everywhere
@@ -533,7 +533,7 @@ class BlockJacobian:
         padded = np.zeros(size + terms.auxiliary)
         padded[:size] = b
         first = approximate.whole(padded)
-        # u and q count the same, unless one of them hardly moves: that is rounding.
+        # u and q count the same, unless the change of one is rounding.
         found = (float(np.linalg.norm(part)) for part in (first[:n], first[n:size]))
         sizes = [max(pair) or 1.0 for pair in zip(found, self.least, strict=True)]
         scale = np.repeat(1.0 / np.array(sizes), [n, len(first) - n])

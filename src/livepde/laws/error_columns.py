@@ -1,0 +1,357 @@
+"""Answers of the process to errors of the model, along the stored samples.
+
+Errors of amplitude one are sources, losses, flows, conductivities that vary, boundary values, and
+unknowns that change. Their answers p follow by one implicit Euler step between two samples,
+
+    M (p' - p)/h + (B + A q)' p' = load(u),
+
+which is exact enough for an error of which neither place nor size is known.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from livepde.fem import dot, grad
+from livepde.laws.filter_state import PAUSE
+from livepde.laws.stored_samples import Passed, StoredSamples
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.stepping import ForwardStage
+from livepde.verdict.directions import (
+    Load,
+    Now,
+    boundary_lifts,
+    flux_loads,
+    force,
+    later,
+    scaled_channel,
+)
+
+MOST_WORK = 1e8  # coefficients of answers that a pass may compute
+MOST_STEPS = 500  # Euler steps of an answer; with more of them intervals move by less than 2 %
+MOST_UNKNOWNS = 4  # that may jump or drift
+STARTS = (0.25, 0.5, 0.75)  # of the run, where something is switched on or changes
+PLACES = (0.2, 0.4, 0.6, 0.8)  # of the length, where a contact may resist
+STEP = 0.01  # of a difference: prior standard deviations of an unknown, share of a channel
+NARROW = 0.03  # of the length: a contact
+ROUNDING = 1e-11  # share of its terms, below which an effect is none: it would be scaled to one
+
+
+class Answer(NamedTuple):
+    """A shape of error of the process, with columns that differ by their course in time."""
+
+    # What it is: "source", "conductivity", "flow", "loss", "boundary", "late boundary", "flux",
+    # "channel", "contact", "initial", "unknown"; and its channel, boundary or unknown.
+    kind: str
+    subject: str = ""
+    mode: float = 0.0  # number of its shape in space
+    # Its load, its boundary values, and its value at the start, (n,); None for zero.
+    load: Load | Array | None = None
+    lift: Load | Array | None = None
+    start: Array | None = None
+
+
+class Course(NamedTuple):
+    """Courses in time of an answer: number of columns, and their values at a share of the run."""
+
+    size: int
+    at: Callable[[float], Array]
+
+
+def hats(count: int) -> Course:
+    """Return hat functions on the run."""
+    nodes = np.arange(count) / (count - 1)
+    return Course(count, lambda s: np.maximum(1.0 - np.abs(s - nodes) * (count - 1), 0.0))
+
+
+ALWAYS = Course(1, lambda s: np.ones(1))
+SWITCHED = Course(1 + len(STARTS), lambda s: np.array([1.0, *(float(s > one) for one in STARTS)]))
+CHANGES = Course(1 + len(STARTS), lambda s: np.array([s, *(float(s > one) for one in STARTS)]))
+
+
+class _Numbers(NamedTuple):
+    """How many shapes in space and time the families have."""
+
+    source: tuple[int, int]
+    conductivity: tuple[int, int]
+    flow: tuple[int, int]
+    noise: int
+
+
+FULL = _Numbers((6, 17), (5, 9), (3, 9), 17)
+SMALL = _Numbers((4, 9), (3, 3), (2, 3), 9)
+
+
+class ErrorColumns:
+    """Errors that a model and its sensors can have."""
+
+    def __init__(self, samples: StoredSamples, numbers: _Numbers) -> None:
+        self.samples, self.numbers = samples, numbers
+        problem = samples.filter.problem
+        self.model, self.observed = problem.model, problem.observed
+        vertices = np.asarray(self.model.mesh.p)
+        self.low, self.high = vertices.min(axis=1), vertices.max(axis=1)
+        self.answers: list[tuple[Answer, Course]] = [*self._sources(), *self._initial()]
+        self.answers += [*self._boundaries(), *self._unknowns()]
+        single = self.model.state_space.single and not len(self.model.algebraic)
+        if single and not next(iter(self.model.state_space.fields.values())).vector:
+            self.answers += [*self._operators(), *self._fluxes()]
+        # Number of the first column of each answer, and of all columns of the process.
+        sizes = (course.size for _, course in self.answers)
+        *self.first, self.count = itertools.accumulate(sizes, initial=0)
+
+    @cached_property
+    def _powers(self) -> list[tuple[float, tuple[int, ...]]]:
+        """Half waves along each axis of the shapes, the longest waves first, with their number.
+
+        Waves of one length have one number, their mean: it depends on no order of the axes.
+        """
+        span, most = self.high - self.low, max(max(one) for one in self.numbers[:3])
+        some = [
+            (round(float(np.sum((np.array(one) * span.max() / span) ** 2)), 9), one)
+            for one in itertools.product(range(most + 1), repeat=len(span))
+        ]
+        some.sort(key=lambda one: (one[0], [-part for part in one[1]]))
+        found: list[tuple[float, tuple[int, ...]]] = []
+        for _, group in itertools.groupby(some, key=lambda one: one[0]):
+            same = [powers for _, powers in group]
+            found += [(len(found) + 0.5 * (len(same) - 1), powers) for powers in same]
+        return found
+
+    def _mode(self, number: int) -> Callable[[Any], Any]:
+        """Return a product of cosines over the box of the domain, the longest waves first."""
+        low, span, (_, powers) = self.low, self.high - self.low, self._powers[number]
+
+        def shape(x: Any) -> Any:
+            found = 1.0
+            for axis, power in enumerate(powers):
+                found = found * np.cos(power * np.pi * (x[axis] - low[axis]) / span[axis])
+            return found
+
+        return shape
+
+    def _sources(self) -> Iterator[tuple[Answer, Course]]:
+        """Iterate over sources: of a family, and switched on at some time."""
+        model, (modes, times) = self.model, self.numbers.source
+        for name, block in model.state_space.fields.items():
+            if block.vector:
+                continue
+            for k in range(modes):
+                u = model.state_space.interpolate({name: self._mode(k)})
+                load = np.asarray(model.mass @ (u - model.state_space.prior))
+                yield Answer("source", name, self._powers[k][0], load), hats(times)
+                if k == 0:
+                    yield Answer("switched", name, load=load), SWITCHED
+
+    def _initial(self) -> Iterator[tuple[Answer, Course]]:
+        free = self.model.X.free
+        for name, block in self.model.state_space.fields.items():
+            if block.vector:
+                continue
+            for k in range(2):
+                u = self.model.state_space.interpolate({name: self._mode(k)})
+                yield Answer("initial", name, start=u * free), ALWAYS
+
+    def _boundaries(self) -> Iterator[tuple[Answer, Course]]:
+        model, lifts = self.model, boundary_lifts(self.model)
+        for name, lift in lifts.items():
+            yield Answer("boundary", name, lift=lift), ALWAYS
+            if name in model.channels:
+                yield Answer("late boundary", name, lift=_late(lift, name)), ALWAYS
+        for name in model.channels:
+            if name not in lifts:
+                yield Answer("channel", name, load=_scaled(model, name)), ALWAYS
+
+    def _fluxes(self) -> Iterator[tuple[Answer, Course]]:
+        for name, load in flux_loads(self.model).items():
+            yield Answer("flux", name, load=load), ALWAYS
+
+    def _unknowns(self) -> Iterator[tuple[Answer, Course]]:
+        reduction = self.samples.filter.reduction
+        for label, place in reduction.stay[:MOST_UNKNOWNS]:
+            load = _changed(self.model, reduction.Phi[:, place])
+            yield Answer("unknown", label, load=load), CHANGES
+
+    def _operators(self) -> Iterator[tuple[Answer, Course]]:
+        """Iterate over flows, losses, and conductivities that vary in space and with the state."""
+        model, (modes, times) = self.model, self.numbers.conductivity
+        # A contact stops what is conducted, not what a flow carries. A flow is looked for in linear
+        # equations only.
+        stage = ForwardStage(model)
+        places = PLACES if stage.symmetric or not stage.keeps else ()
+
+        def stiffness(shape: Callable[[Any], Any]) -> Any:
+            return model.bilinear(lambda u, v, x: shape(x) * dot(grad(u), grad(v)))
+
+        for k in range(1, 1 + modes):
+            load = _minus(stiffness(self._mode(k)))
+            yield Answer("conductivity", "", self._powers[k][0], load), hats(times)
+        plain = stiffness(self._mode(0))
+        yield Answer("state", load=_by_state(plain)), ALWAYS
+        for axis, (low, span) in enumerate(zip(self.low, self.high - self.low, strict=True)):
+            halves = stiffness(_halves(axis, low + 0.5 * span))
+            yield Answer("layer", "xyz"[axis], load=_minus(halves)), ALWAYS
+            wide = max(NARROW, 1.5 * float(model.mesh.param()) / span)
+            for place in places:
+                matrix = stiffness(_band(axis, low + place * span, wide * span))
+                yield Answer("contact", "xyz"[axis], load=_minus(matrix)), ALWAYS
+        modes, times = self.numbers.flow
+        axes = len(self.low)
+        for k in range(axes * math.ceil(modes / axes)):  # along each axis as many
+            axis, number = k % axes, k // axes
+            load = _minus(self._flow(axis, self._mode(number)))
+            yield Answer("flow", "", axes * self._powers[number][0], load), hats(times)
+            if number == 0:
+                yield Answer("steady flow", "xyz"[axis], load=load), ALWAYS
+        yield Answer("loss", load=_lost(model.mass)), SWITCHED
+
+    def _flow(self, axis: int, shape: Callable[[Any], Any]) -> Any:
+        return self.model.bilinear(lambda u, v, x: shape(x) * grad(u)[axis] * v)
+
+    def followed(self, one: Passed) -> tuple[Array, list[Array], Array]:
+        """Return the readings of all answers, states at samples, and predicted readings.
+
+        Shapes (samples, sensors, columns), (n,) for each sample, and (samples, sensors).
+        """
+        samples, model = self.samples, self.model
+        stage, spans = ForwardStage(model), samples.spans
+        steps = max(len(spans), 1)
+        work = steps * self.count * model.X.dim
+        stride = max(math.ceil(work / MOST_WORK), math.ceil(steps / MOST_STEPS))
+        begin, first, end = (float(t) for t in (spans[0].start, spans[0].t1, spans[-1].t1))
+        # Courses in time are those of the samples: the first may come long after t0.
+        late = max(begin, first - PAUSE * (end - first) / steps)
+        p = np.zeros((self.count, model.X.dim))
+        for column, (answer, _) in zip(self.first, self.answers, strict=True):
+            if answer.start is not None:
+                p[column] = answer.start
+        found = np.full((len(spans), self.observed.size, self.count), np.nan)
+        largest = np.abs(p).max(axis=1)
+        states: list[Array] = []
+        predicted = np.empty(found.shape[:2])
+        last = begin
+        for number, (x, span) in enumerate(zip(samples.along(one), spans, strict=True)):
+            states.append(x.u[0])
+            predicted[number] = samples.filter.sensors.observe(x, span.end)[0][0]
+            t, q = float(span.t1), x.q[0]
+            due = (number + 1) % stride == 0 or number + 1 == len(spans) or number == 0
+            if due:
+                moment = span.end.member(0)
+                now = Now(x.u[0], q, moment, rates=_rates(span))
+                if t > last:
+                    share = max(0.5 * (t + last) - late, 0.0) / (end - late)
+                    p = self._advanced(stage, p, now, t - last, share)
+                    largest = np.maximum(largest, np.abs(p).max(axis=1))
+                    last = t
+                H, _ = self.observed.jacobian(now.u, model.latent.value(q), moment)
+                found[number] = np.asarray(H @ p.T)
+        times = np.array([float(span.t1) for span in spans])
+        # By symmetry some answers do not reach the sensors.
+        found = _filled(found, times)
+        for column, most in enumerate(largest):
+            found[:, :, column] = beyond_rounding(found[:, :, column], most)
+        return found, states, predicted
+
+    def _advanced(self, stage: ForwardStage, p: Array, now: Now, h: float, share: float) -> Array:
+        """Return the answers a time h later, shape (columns, n)."""
+        loads, lifts = np.zeros_like(p), np.zeros_like(p)
+        for first, (answer, course) in zip(self.first, self.answers, strict=True):
+            own, weights = slice(first, first + course.size), course.at(share)[:, None]
+            if answer.load is not None:
+                load = answer.load(now) if callable(answer.load) else answer.load
+                loads[own] = weights * load
+            if answer.lift is not None:
+                lift = answer.lift(now) if callable(answer.lift) else answer.lift
+                lifts[own] = weights * lift
+        return later(stage, p, now, h, loads, lifts)
+
+
+def _halves(axis: int, middle: float) -> Callable[[Any], Any]:
+    """Return a shape that tells two layers apart, the same from either side but for its sign."""
+    return lambda x: np.where(x[axis] > middle, 0.5, -0.5)
+
+
+def _band(axis: int, place: float, wide: float) -> Callable[[Any], Any]:
+    return lambda x: np.maximum(1.0 - np.abs(x[axis] - place) / wide, 0.0)
+
+
+def beyond_rounding(values: Array, terms: Array) -> Array:
+    """Return values, or zeros where all of them are rounding of the terms they are sums of.
+
+    The average over errors scales each column to the size of the noise: one of rounding alone, as
+    that of a flow across a state that does not vary along it, would count as an error.
+    """
+    largest, of = (float(np.fmax.reduce(np.abs(one), axis=None)) for one in (values, terms))
+    return np.zeros_like(values) if math.isfinite(of) and largest <= ROUNDING * of else values
+
+
+def _minus(matrix: Any) -> Load:
+    size = abs(matrix)
+    return lambda now: beyond_rounding(-(matrix @ now.u), size @ np.abs(now.u))
+
+
+def _by_state(stiffness: Any) -> Load:
+    """Return the load of a conductivity that varies with the state about its mean."""
+    bent = _minus(0.5 * stiffness)
+    return lambda now: bent(now._replace(u=(now.u - now.u.mean()) ** 2))
+
+
+def _lost(mass: Any) -> Load:
+    size = abs(mass)
+    return lambda now: beyond_rounding(-(mass @ (now.u - now.u.mean())), size @ np.abs(now.u))
+
+
+def _late(lift: Array, name: str) -> Load:
+    return lambda now: -now.rates.get(name, 0.0) * lift
+
+
+def _scaled(model: Model, name: str) -> Load:
+    """Return the load of a channel that is larger by its own size."""
+
+    def load(now: Now) -> Array:
+        more = scaled_channel(model, name, now, STEP) / STEP
+        return beyond_rounding(more, force(model, now) / STEP)
+
+    return load
+
+
+def _changed(model: Model, direction: Array) -> Load:
+    """Return the derivative of the load by a latent unknown."""
+
+    def load(now: Now) -> Array:
+        ends = (now.q + STEP * direction, now.q - STEP * direction)
+        up, down = (force(model, now._replace(q=q)) for q in ends)
+        return beyond_rounding(up - down, up) / (2.0 * STEP)
+
+    return load
+
+
+def _rates(span: Any) -> dict[str, float]:
+    """Return the change of each input in a unit of time over an interval."""
+    h = float(span.t1 - span.start)
+    if not h > 0.0:
+        return {}
+    change = np.broadcast_to((span.inputs1 - span.inputs0) / h, (1, len(span.channels)))[0]
+    return dict(zip(span.channels, change.tolist(), strict=True))
+
+
+def _filled(values: Array, times: Array) -> Array:
+    """Return values along axis 0 with straight lines where they are NaN."""
+    known = np.isfinite(values[:, 0, 0]) if values.size else np.ones(len(values), dtype=bool)
+    if known.all():
+        return values
+    flat = values.reshape(len(values), -1)
+    places = np.interp(times, times[known], np.arange(known.sum()))
+    low = np.floor(places).astype(int)
+    high = np.minimum(low + 1, known.sum() - 1)
+    share = (places - low)[:, None]
+    some = flat[known]
+    found: Array = (1.0 - share) * some[low] + share * some[high]
+    return found.reshape(values.shape)
