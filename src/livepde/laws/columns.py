@@ -264,6 +264,17 @@ class Columns:
                 yield pair
 
     @property
+    def without_size(self) -> Iterator[Error]:
+        """Errors that have no size: other units that are known, and exchanges."""
+        for name in self.places:
+            expected = self.unit(name)
+            for number, unit in enumerate(UNITS):
+                if unit.expected and unit.expected == expected:
+                    yield Error("unit", (name,), unit=number)
+        for pair in self.pairs:
+            yield Error("exchange", pair)
+
+    @property
     def interval(self) -> float:
         """The usual time between samples."""
         return float(np.median(np.diff(self.state.log[0, :, 0])))
@@ -524,14 +535,7 @@ def _likely_filtered(columns: Columns, least: float) -> list[Cause]:
         found = _innovations(columns, columns.corrected(error))
         return -np.inf if found is None else 1.0 - (float(np.nansum(found**2)) - noise) / misfit
 
-    units = (
-        Error("unit", (name,), unit=number)
-        for name in columns.places
-        for number, unit in enumerate(UNITS)
-        if unit.expected and unit.expected == columns.unit(name)
-    )
-    exchanged = (Error("exchange", pair) for pair in columns.pairs)
-    kept = [(share(error), error) for error in chain(units, exchanged)]
+    kept = [(share(error), error) for error in columns.without_size]
     longest = int(LONGEST * columns.state.log.shape[1])
     lags = [_Lag(name, columns.interval, longest, share) for name in columns.places]
     lags = sorted(lags, key=lambda lag: -lag.of(lag.first))[: TRIED["lag"]]

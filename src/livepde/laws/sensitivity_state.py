@@ -337,14 +337,13 @@ def stored(
             parts |= {"fork": Fork.none(now), "due": state.assimilated}
         log = kept
     parts["log"] = log
-    if work.tried and len(state) == 1:
-        disturbed = anchored is not None and bool(anchored[0])
-        parts |= _trial(work, state, now, span, disturbed=disturbed)
     if work.window:
         parts["assimilated"] = state.assimilated + (taken & span.present)
     # After a pause the state is another one, too.
     pause = now.driven.pause
     begun = taken & (pause if anchored is None else pause | anchored)
+    if work.tried and len(state) == 1:
+        parts |= _trial(work, state, now, span, disturbed=bool(begun[0] & ~pause[0]))
     if work.window and np.count_nonzero(begun):
         parts |= _windows_from(state, now, log.shape[1] - 1, begun)
     # Two earlier filters suffice: every `back` samples the newer one becomes the older one, and the

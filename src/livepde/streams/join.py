@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +11,7 @@ import pandas as pd
 
 from livepde.dates import origin_at, since_1970
 from livepde.errors import DataError
-from livepde.linalg import Array
+from livepde.linalg import Array, Mask
 from livepde.stepping import Between
 from livepde.streams.table import DataTable
 
@@ -45,12 +45,8 @@ def join_tables(
     """
     times, first = _on_one_clock(tables, second, where)
     starts, ends = np.transpose([(t[0], t[-1]) for t in times])
-    # What holds until the next reading continues after the last one.
     behaviour = between or {}
-    holds = [all(behaviour.get(name) == "hold" for name in table.names) for table in tables]
-    last = np.where(holds, np.inf, ends)
-    if last.min() < starts.max():
-        raise DataError(f"{where}: the files have no time in common; check dates and units.")
+    _check_overlap(tables, starts, ends, behaviour, where)
     driving = [together or not {*table.names} <= {*sensors} for table in tables]
     start = starts[driving].max() if any(driving) else starts.min()
     width = SAME * (ends.max() - starts.min()) or 1.0
@@ -78,17 +74,33 @@ def join_tables(
     values[begin:][np.ix_(states, ~held)] = np.nan
     kept |= states
     t, values = t[begin:][kept], values[begin:][kept]
-    lacking = np.isnan(inputs).sum(axis=0).tolist()
-    remarks = Counter({("skipped", name): n for name, n in zip(needed, lacking, strict=True)})
-    early = known[:begin].sum(axis=0).tolist()
-    counts = zip(names, early, sensed.tolist(), strict=True)
-    remarks += Counter({(EARLY, name): n for name, n, sensor in counts if sensor})
-    remarks = sum((Counter(table.remarks) for table in tables), remarks)  # drops counts of zero
+    remarks = _counted("skipped", needed, np.isnan(inputs))
+    remarks += _counted(EARLY, joined.columns[sensed], known[:begin, sensed])
+    remarks = sum((Counter(table.remarks) for table in tables), remarks)
     if first is None:
         return DataTable(t, values, tuple(names), origin=None, remarks=remarks)
     return DataTable(
         t - t[0], values, tuple(names), origin=origin_at(first + t[0] / second), remarks=remarks
     )
+
+
+def _check_overlap(
+    tables: Sequence[DataTable],
+    starts: Array,
+    ends: Array,
+    between: Mapping[str, Between],
+    where: str,
+) -> None:
+    """Refuse tables without a time in common; what holds continues after its last reading."""
+    holds = [all(between.get(name) == "hold" for name in table.names) for table in tables]
+    if np.where(holds, np.inf, ends).min() < starts.max():
+        raise DataError(f"{where}: the files have no time in common; check dates and units.")
+
+
+def _counted(kind: str, names: Iterable[str], marked: Mask) -> Counter[tuple[str, str]]:
+    """Return how many rows of each column are marked, (rows, columns), where any is."""
+    counts = zip(names, marked.sum(axis=0).tolist(), strict=True)
+    return Counter({(kind, name): n for name, n in counts if n})
 
 
 def not_late(
