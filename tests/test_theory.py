@@ -178,6 +178,13 @@ def test_the_norm_of_a_part_with_a_flux_is_that_of_the_law():
     assert gaps[-1] < 0.03
 
 
+def test_norms_over_a_subdomain_take_integrands():
+    model = excited(8)
+    observed = observe(model, SENSORS["subdomain"])
+    with pytest.raises(ConfigurationError, match="give an integrand"):
+        _ = dg.Spaces(model, observed, VX=model.mass).observed_part
+
+
 SENSORS = {
     "subdomain": lp.Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.8)),
     "points": lp.Points([0.2, 0.5, 0.61]),
@@ -189,7 +196,7 @@ SENSORS = {
 @pytest.mark.parametrize("name", SENSORS)
 def test_constants_hold_for_every_vector(name):
     model = excited(12, ElementLineHermite())
-    spaces = dg.Spaces(model, observe(model, SENSORS[name]))
+    spaces = dg.Spaces(model, observe(model, SENSORS[name]), VX=_weighted, V=_rough)
     q = model.parameter_space.interpolate(excited_q)
     u = model.initial(lambda x: excited_u(x, 0.0))
     c = dg.constants(spaces, q, [u])
@@ -222,6 +229,14 @@ def operators_of(spaces):
     model, split = spaces.model, spaces.split
     forms = StageForms(model, split, spaces.M_op, spaces.N_op, 1.0)
     return forms.pull, sp.diags_array(model.X.free) @ forms.hidden, forms.tests
+
+
+def _weighted(u, v, x):
+    return u * v + (1 + x[0]) * lp.dot(lp.grad(u), lp.grad(v))
+
+
+def _rough(u, v, x):
+    return u * v + lp.dot(lp.grad(u), lp.grad(v)) + lp.fem.ddot(lp.fem.hess(u), lp.fem.hess(v))
 
 
 @pytest.mark.slow
@@ -412,6 +427,8 @@ def test_noise_size_is_the_mean_over_draws():
     for name in ("X", "VX", "V"):
         mean = np.sqrt(np.mean([getattr(n, name) ** 2 for n in draws]))
         assert getattr(expected, name) == pytest.approx(mean, rel=0.1)
+    u = model.initial(lambda x: np.sin(np.pi * x[0]))
+    assert dg.noise_size(spaces, std, matrix, u).V > expected.V
     with pytest.raises(ConfigurationError, match="3 standard deviations"):
         dg.noise_size(spaces, std[:3], matrix)
 
@@ -450,6 +467,8 @@ def test_gramian_of_a_constant_state_is_that_of_one_matrix():
     assert found.windows == 2
     gram = found.modes.T @ model.Q.gram @ found.modes / 9.0
     assert gram == pytest.approx(np.eye(len(found.strength)), abs=1e-8)
+    latest = excitation.spectrum(accumulated(excitation, [u] * 5, 0.1), latest=True)
+    assert latest.strength[0] == pytest.approx(0.2 * norm * 3.0, rel=1e-9)
 
 
 @pytest.mark.slow
@@ -461,11 +480,12 @@ def test_what_is_not_observed_is_not_pinned():
     spectrum = excitation.spectrum(accumulated(excitation, states, 0.05))
     full = dg.Excitation(dg.Spaces(model, observe(model, lp.Full())), 0.25)
     whole = full.spectrum(accumulated(full, states, 0.05))
-    assert spectrum.strength[-1] < 1e-7 * spectrum.strength[0]
+    assert spectrum.epsilon < 1e-7 * spectrum.strength[0]
     assert 0 < spectrum.pinned() < whole.pinned()
     values = model.parameter_space.fields["q"].at_vertices @ spectrum.modes[:, 0]
     x = model.state.mesh.p[0]
     assert np.abs(values[x < 0.5]).max() > np.abs(values[x > 0.7]).max()
+    assert np.all(np.diff(spectrum.error_bounds(0.25, 0.1)) >= 0)
 
 
 def test_excitation_of_many_parameters_by_lanczos(monkeypatch):
@@ -473,10 +493,10 @@ def test_excitation_of_many_parameters_by_lanczos(monkeypatch):
     spaces = dg.Spaces(model, observe(model, lp.Full()))
     states = [model.initial(lambda x, t=t: excited_u(x, t)) for t in 0.05 * np.arange(4)]
     dense = dg.Excitation(spaces, 0.15)
-    expected = dense.spectrum(accumulated(dense, states, 0.05))
+    expected = dense.spectrum(accumulated(dense, states, 0.05), latest=True)
     monkeypatch.setattr(excitation_module, "DENSE", 0)
-    monkeypatch.setattr(excitation_module, "STRONGEST", 4)
-    found = dense.spectrum(accumulated(dense, states, 0.05))
+    few = dg.Excitation(spaces, 0.15, count=4)
+    found = few.spectrum(accumulated(few, states, 0.05))
     assert found.strength == pytest.approx(expected.strength[:4], rel=1e-6)
 
 
@@ -504,6 +524,7 @@ def test_excitation_refuses():
     with pytest.raises(ConfigurationError, match="no window of length 1 is complete"):
         excitation.spectrum(excitation.init())
     assert dg.Spectrum(np.zeros(0), np.zeros((2, 0)), 0).pinned() == 0
+    assert dg.Spectrum(np.zeros(0), np.zeros((2, 0)), 0).epsilon == 0.0
 
 
 # --- links and interpolation ----------------------------------------------------------------------

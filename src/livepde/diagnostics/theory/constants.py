@@ -41,8 +41,10 @@ class Spaces:
     model, observed
         The process, and its bound observation (`identifier.observed`).
     M_op, N_op
-        Integrands (u, v, x) of M and N, (MN1) and (MN2), as in the law. The norms are those of M
-        and N themselves, for which c_M = C_M = c_N = C_N = 1.
+        Integrands (u, v, x) of M and N, (MN1) and (MN2), as in the law.
+    VX, V
+        Integrands of other squared norms for both parts; default those of M and N themselves, for
+        which c_M = C_M = c_N = C_N = 1.
 
     Examples
     --------
@@ -63,6 +65,8 @@ class Spaces:
     observed: Observed
     M_op: Any = h1_form
     N_op: Any = h1_form
+    VX: Any = None
+    V: Any = None
 
     @classmethod
     def of(cls, model: Model, observed: Observed, law: Any) -> Spaces:
@@ -112,34 +116,64 @@ class Spaces:
 
     @cached_property
     def _parts(self) -> tuple[Part, Part]:
-        X = self.model.X
-        if self._regions is None:  # ranges of R and P
-            seen, hidden = self.bases
-            free = sp.diags_array(X.free)
-            R, P = (sp.csr_array(matrix @ free) for matrix in (self.split.R, self.split.P))
-            M, N = (self.model.bilinear(form) for form in (self.M_op, self.N_op))
-            return (
-                Part(X, seen, hidden, sp.csr_array(R.T @ M), R),
-                Part(X, hidden, seen, sp.csr_array(P.T @ N), P),
+        operators = self._of(self.M_op), self._of(self.N_op)
+        if operators[0] is None or operators[1] is None:
+            raise ConfigurationError("Spaces: M_op and N_op must be integrands (u, v, x).")
+        M, N = operators[0][0], operators[1][1]
+        VX = self._of(self.VX) or (M, N)
+        V = self._of(self.V) or (None, None)
+        if self._regions is None:
+            return self._projected(M, N, VX, V)
+        return self._integrated(M, N, VX, V)
+
+    def _of(self, form: Any) -> tuple[sp.csr_array, sp.csr_array] | None:
+        """Return the matrices of an integrand for the observed and for the unobserved part."""
+        if form is None:
+            return None
+        if self._regions is None:
+            given: Any = form
+            matrix = sp.csr_array(given) if sp.issparse(form) else self.model.bilinear(form)
+            return matrix, matrix
+        if sp.issparse(form):
+            raise ConfigurationError(
+                "Spaces: with a Subdomain norms are integrals over omega and over the rest: give "
+                "an integrand (u, v, x) in place of a matrix."
             )
-        # Functions on omega and on its complement; both own the interface.
-        spaces = [self._on(mass) for mass in self._divided(*self._masses)]
-        operators = self._integrated(self.M_op)[0], self._integrated(self.N_op)[1]
-        smooth = self._integrated(h1_form)
+        inside, outside = (self.model.bilinear(form, cells) for cells in self._regions)
+        return self._divided(inside, outside)
+
+    def _projected(
+        self, M: sp.csr_array, N: sp.csr_array, VX: Pair, V: tuple[Any, Any]
+    ) -> tuple[Part, Part]:
+        """Return the parts as ranges of R and P, for sensors without a subdomain."""
+        X = self.model.X
+        seen, hidden = self.bases
+        free = sp.diags_array(X.free)
+        R, P = (sp.csr_array(matrix @ free) for matrix in (self.split.R, self.split.P))
+        return (
+            Part(X, seen, hidden, sp.csr_array(R.T @ M), VX[0], V[0], R),
+            Part(X, hidden, seen, sp.csr_array(P.T @ N), VX[1], V[1], P),
+        )
+
+    def _integrated(
+        self, M: sp.csr_array, N: sp.csr_array, VX: Pair, V: tuple[Any, Any]
+    ) -> tuple[Part, Part]:
+        """Return the parts as functions on omega and on its complement; both own the interface."""
+        X, regions = self.model.X, self._regions or ()
+        inside, outside = self._masses
+        masses = self._divided(inside, outside)
+        spaces = [self._on(mass) for mass in masses]
+        smooth = self._divided(*(self.model.bilinear(h1_form, cells) for cells in regions))
         parts = []
-        for k in (0, 1):
+        for k, operator in enumerate((M, N)):
             own, other = spaces[k], spaces[1 - k]
             reach = np.flatnonzero((own.free < 1) | (other.free > 0))
             tests = HilbertSpace(X.gram, own.name, reach)
             basis = sp.csr_array(sp.eye_array(X.dim, format="csr")[:, own.free > 0])
             nothing = sp.csr_array((X.dim, 0))
             border = Border(own, tests, smooth[k])
-            parts.append(Part(own, basis, nothing, operators[k], border=border))
+            parts.append(Part(own, basis, nothing, operator, VX[k], V[k], border=border))
         return parts[0], parts[1]
-
-    def _integrated(self, form: Any) -> Pair:
-        """Return the matrices of an integrand on the observed and on the unobserved part."""
-        return self._divided(*(self.model.bilinear(form, cells) for cells in self._regions or ()))
 
     @cached_property
     def _regions(self) -> tuple[IntArray, IntArray] | None:
@@ -215,7 +249,7 @@ def constants(
         Q in L-infinity, the paper's choice. For large models it is found by alternating
         maximisation from random starts, a value from sampling.
     c_M, C_M, c_N, C_N
-        1, in the norms of `Spaces`.
+        Extreme eigenvalues of M and N in VX and V.
     embeddings, ratios
         See `Constants`; the ratios are Kantorovich's bounds.
 
@@ -268,6 +302,10 @@ def constants(
     return Constants(
         L_C=lipschitz,
         C_A=float(np.sqrt(gain)) * max(*norms, reach * bound),
+        c_M=seen.coercivity(),
+        C_M=seen.boundedness(),
+        c_N=hidden.coercivity(),
+        C_N=hidden.boundedness(),
         observed_ratio=seen.ratio(),
         hidden_ratio=hidden.ratio(),
         sampled=tuple(sampled),

@@ -107,6 +107,8 @@ class TwinTracker:
         operators.
     gain, damping
         Those of the law: ||e||_Q^2 is divided by the gain, and the rule gives theta.
+    reconstruct
+        Function z -> u_alpha as used by the law; default that of the observation.
 
     Raises
     ------
@@ -129,6 +131,7 @@ class TwinTracker:
         spaces: Spaces,
         gain: float | Literal["auto"] = 1.0,
         damping: Damping | None = None,
+        reconstruct: Callable[[Array], Array] | None = None,
     ) -> None:
         model = twin.model
         if gain == "auto":
@@ -145,6 +148,7 @@ class TwinTracker:
         self.spaces = spaces
         self.gain = gain
         self.damping = damping
+        self.reconstruct = reconstruct
         self.errors: list[Errors] = []
         self._last: tuple[float, Array] | None = None
 
@@ -154,7 +158,10 @@ class TwinTracker:
         exact, split = twin.u(estimate.t), spaces.split
         boundary = twin.model.impose(np.zeros(len(exact)), Moment(estimate.t))
         z = spaces.observed.linearised(np.asarray(z, dtype=float), estimate.u)
-        u_alpha = spaces.observed.reconstruct(z, boundary=boundary).u
+        if self.reconstruct is not None:
+            u_alpha = self.reconstruct(z)
+        else:
+            u_alpha = spaces.observed.reconstruct(z, boundary=boundary).u
         error = estimate.u - exact
         # Estimate and truth have the same Dirichlet values, so the error lies in the tangent space.
         # The data error d is defined for the free coefficients, hence without the boundary values.
@@ -383,14 +390,17 @@ def stopping_time(errors: Sequence[Errors], c: Constants) -> float:
 
 
 def noise_size(
-    spaces: Spaces, std: Array, reconstruction: Array | sp.csr_array | None = None
+    spaces: Spaces,
+    std: Array,
+    reconstruction: Array | sp.csr_array | None = None,
+    u_alpha: Array | None = None,
 ) -> Norms:
-    """Return the root mean square of the propagated noise G_alpha eta in X, VX~ and V~.
+    """Return the root mean square of the data error d in X, VX~ and V~ from a noise level.
 
-    The data error is d = G_alpha eta + (G_alpha G - R) u*, with the regularisation error of the
-    exact state as its second part. Beyond 2000 sensors the mean is over 32 fixed random vectors,
-    with a relative standard error of at most 1/8, which decreases with the number of independent
-    coefficients that contribute.
+    d = G_alpha eta + (G_alpha G - R) u*: the propagated noise, and the regularisation error of the
+    exact state. The second part is estimated by applying G_alpha G - R to u_alpha. Beyond 2000
+    sensors the first is the mean over 32 fixed random vectors, with a relative standard error of at
+    most 1/8, which decreases with the number of independent coefficients that contribute.
 
     Parameters
     ----------
@@ -399,6 +409,8 @@ def noise_size(
     reconstruction
         Matrix of G_alpha, shape (n, sensors); default G^+. Raw nodal noise is about 1/h^2 times
         larger in V~ than in X, so without smoothing T* is reached immediately.
+    u_alpha
+        Reconstruction of the sample, shape (n,); None: omit the second part.
     """
     matrix = spaces.split.inverse if reconstruction is None else reconstruction
     if matrix.shape[1] != len(std):
@@ -411,6 +423,9 @@ def noise_size(
         factor = matrix @ (std[:, None] * signs) / np.sqrt(PROBES)
     else:
         factor = (matrix.toarray() if sp.issparse(matrix) else np.asarray(matrix)) * std
+    if u_alpha is not None:
+        lost = matrix @ (spaces.observed.G @ u_alpha) - u_alpha
+        factor = np.column_stack([factor, lost])
     return spaces.observed_part.root_mean_square(factor)
 
 

@@ -19,9 +19,8 @@ from livepde.spaces import HilbertSpace
 
 # Number of entries of a block of states, which bounds the size of temporary arrays.
 ENTRIES = 5_000_000
-# Number of parameters up to which the Gramian is stored as a matrix, and of modes beyond.
+# Number of parameters up to which the Gramian is stored as a matrix.
 DENSE = 1000
-STRONGEST = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +42,30 @@ class Spectrum:
     modes: Array
     windows: int
 
+    @property
+    def epsilon(self) -> float:
+        """Constant epsilon_0 of asspof; for a field it tends to zero with the mesh size."""
+        return float(self.strength[-1]) if len(self.strength) else 0.0
+
     def pinned(self, share: float = 1e-2) -> int:
         """Return the number of modes with at least `share` of the strongest excitation."""
         if not len(self.strength) or self.strength[0] <= 0:
             return 0
         return int((self.strength >= share * self.strength[0]).sum())
+
+    def error_bounds(self, window: float, rate: float) -> Array:
+        """Return 2 gamma_0 ||d~||_X / epsilon for each mode, as in th:parameter_noisesmooth.
+
+        The theorem bounds the error of q by it in the limit only under the link conditions
+        (cond:link, see `link`), which do not hold for a data error that does not vanish. Without
+        them it is a scale, not a bound.
+
+        A mode whose bound exceeds its size in Q (1: the prior standard deviation, for gain 1) is
+        not determined by data whose error changes at that rate.
+        """
+        tiny = np.finfo(float).tiny
+        bounds: Array = 2.0 * window * rate / np.maximum(self.strength, tiny)
+        return bounds
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +111,8 @@ class Excitation:
         so it should be shorter than the periods of the excitation.
     gain
         Gain of the law.
+    count
+        Number of modes that are computed for more than 1000 parameters.
 
     Examples
     --------
@@ -112,6 +132,7 @@ class Excitation:
     spaces: Spaces
     window: float
     gain: float = 1.0
+    count: int = 20
 
     def __post_init__(self) -> None:
         if not self.window > 0:
@@ -170,10 +191,11 @@ class Excitation:
             return np.hstack([self._gramian(integral, x[:, k : k + width]) for k in starts])
         return integral.T @ self.spaces.observed_part.projected(integral @ x)
 
-    def spectrum(self, state: ExcitationState) -> Spectrum:
-        """Return the spectrum of all whole windows so far.
+    def spectrum(self, state: ExcitationState, *, latest: bool = False) -> Spectrum:
+        """Return the spectrum of all whole windows so far, or of the latest one.
 
-        Beyond 1000 parameters only the 20 strongest modes of the latest window, by Lanczos.
+        All modes are computed up to 1000 parameters; beyond, the `count` strongest of the latest
+        window by Lanczos.
 
         Raises
         ------
@@ -191,9 +213,11 @@ class Excitation:
         free = np.flatnonzero(Q.free)
         gram = sp.csr_array(Q.tangent_gram[free][:, free] / self.gain)
         if state.gram is not None:
-            total = state.gram[np.ix_(free, free)]
+            m = Q.dim
+            total = self._gramian(integral, np.eye(m)) if latest else state.gram
+            total = total[np.ix_(free, free)]
             values, vectors = eigh(0.5 * (total + total.T), gram.toarray())
-            windows = state.windows
+            windows = 1 if latest else state.windows
         else:
 
             def apply(x: Array) -> Array:
@@ -202,7 +226,7 @@ class Excitation:
                 return self._gramian(integral, full)[free]
 
             space = HilbertSpace(gram)
-            values, vectors = lanczos(apply, space.dual, space.riesz, len(free), STRONGEST)
+            values, vectors = lanczos(apply, space.dual, space.riesz, len(free), self.count)
             windows = 1
         modes = np.zeros((Q.dim, len(values)))
         order = np.argsort(values)[::-1]

@@ -302,7 +302,6 @@ def _constants(tracker: OnlineTracker, tables: list[Table], notes: list[str]) ->
         return None
     how = dict.fromkeys(DEFINITIONS, "an eigenvalue")
     how |= dict.fromkeys(("C_A", "observed_ratio", "hidden_ratio"), "a bound")
-    how |= dict.fromkeys(("c_M", "C_M", "c_N", "C_N"), "1 in these norms")
     how |= dict.fromkeys(c.sampled, "estimated from below, by sampling")
     rows = [
         (name, float(getattr(c, name)), text, label, how[name])

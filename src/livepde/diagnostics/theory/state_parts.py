@@ -23,6 +23,17 @@ Images: TypeAlias = Sequence[tuple[HilbertSpace, sp.csr_array]]  # regions of X,
 DENSE = 400
 
 
+def _columns(apply: Map) -> Map:
+    """Return a linear map of vectors extended to matrices, column by column."""
+
+    def mapped(x: Array) -> Array:
+        if x.ndim == 1:
+            return apply(x)
+        return np.column_stack([apply(column) for column in x.T])
+
+    return mapped
+
+
 def lanczos(
     top: Map, bottom: Map, bottom_inverse: Map, size: int, count: int = 1, tolerance: float = 0.0
 ) -> tuple[Array, Array]:
@@ -39,6 +50,23 @@ def lanczos(
         operators[0], k=count, M=operators[1], Minv=operators[2], v0=start, tol=tolerance
     )
     return values, vectors
+
+
+def largest_eigenvalue(top: Map, bottom: Map, bottom_inverse: Map | None, size: int) -> float:
+    """Return the largest eigenvalue of top x = lambda bottom x, both symmetric, bottom > 0.
+
+    By functions of vectors and of matrices; the inverse is needed for Lanczos only, in large
+    problems.
+    """
+    if size == 0:
+        return 0.0
+    if size <= DENSE or bottom_inverse is None:
+        one = np.eye(size)
+        A, B = top(one), bottom(one)
+        values = eigh(0.5 * (A + A.T), 0.5 * (B + B.T), eigvals_only=True)
+    else:
+        values, _ = lanczos(top, bottom, bottom_inverse, size, tolerance=1e-8)
+    return max(float(values[-1]), 0.0)
 
 
 def _root(x: Array, y: Array) -> float:
@@ -83,7 +111,7 @@ class Part:
     """One part of the state, observed or unobserved, with its norms.
 
     ||v||_VX^2 = (M v, v), and ||v||_V is the norm in X of the function M v, for M of (MN1) ||D v''
-    - v|| over omega: in these norms c_M = C_M = c_N = C_N = 1.
+    - v|| over omega, unless other forms are given.
 
     On a subdomain the functional M v has a second part: the flux D grad v through the boundary of
     omega, which is not represented by a function of X. An element of the paper's V~ has no flux.
@@ -102,6 +130,8 @@ class Part:
         has no columns if the two are orthogonal in X.
     operator
         Matrix of M, or N, from coefficients to dual vectors, shape (n, n).
+    VX, V
+        Matrices of the squared norms; V None: the norm of M.
     projection
         R, or P, for sensors without a subdomain: it maps a state to this part.
     border
@@ -114,6 +144,8 @@ class Part:
         basis: sp.csr_array,
         rest: sp.csr_array,
         operator: sp.csr_array,
+        VX: sp.csr_array,
+        V: sp.csr_array | None,
         projection: sp.csr_array | None = None,
         border: Border | None = None,
     ) -> None:
@@ -121,32 +153,39 @@ class Part:
         self.basis = basis
         self.rest = rest
         self.size = int(basis.shape[1])
-        self._operator = operator
+        self._tested = operator
+        self._VX = VX
+        self._V = V
         self._projection = projection
         self._border = border
 
     def norms(self, v: Array) -> Norms:
         """Return the three norms of this part of a state, coefficients of shape (n,)."""
-        return self.root_mean_square(v)
+        own = self._own(v)
+        if not self.size:
+            return Norms()
+        if self._V is not None:
+            V = _root(own, self._V @ own)
+        else:
+            image = self._represented(self._tested @ own)
+            V = _root(image, self.space.gram @ image)
+        return Norms(self._X(own), _root(own, self._VX @ own), V)
 
     def stage_norms(self, v: Array) -> Norms:
         """Return the norms used by a damping rule within a stage, in the order of `norms`."""
         own = self._own(v)
         if not self.size:
             return Norms()
-        dual = self._operator @ own
+        dual = self._tested @ own
         tests = self.space if self._border is None else self._border.tests
-        pairs = (own, self.space.gram @ own), (own, dual), (dual, tests.riesz(dual))
-        return Norms(*(_root(*pair) for pair in pairs))
+        return Norms(self._X(own), _root(own, self._VX @ own), _root(dual, tests.riesz(dual)))
 
     def root_mean_square(self, factor: Array) -> Norms:
         """Return sqrt(E ||v||^2) in the three norms, for v of covariance factor @ factor.T."""
         own, gram = self._own(factor), self.space.gram
-        if not self.size:
-            return Norms()
-        dual = self._operator @ own
-        image = self._represented(dual)
-        pairs = (own, gram @ own), (own, dual), (image, gram @ image)
+        left = own if self._V is not None else self._represented(self._tested @ own)
+        V = gram @ left if self._V is None else self._V @ own
+        pairs = ((own, gram @ own), (own, self._VX @ own), (left, V))
         return Norms(*(_root(np.ravel(a), np.ravel(b)) for a, b in pairs))
 
     def projected(self, dual: Array) -> Array:
@@ -159,6 +198,9 @@ class Part:
     def _own(self, v: Array) -> Array:
         return v if self._projection is None else self._projection @ v
 
+    def _X(self, v: Array) -> float:
+        return _root(v, self.space.gram @ v)
+
     def _represented(self, dual: Array) -> Array:
         """Return the Riesz representative of a functional on the part, without the flux."""
         if self._border is None:
@@ -167,27 +209,37 @@ class Part:
 
     # --- matrices on the basis -------------------------------------------------------------------
 
+    def _on_basis(self, matrix: sp.csr_array) -> sp.csr_array:
+        return sp.csr_array(self.basis.T @ matrix @ self.basis)
+
     @cached_property
     def gram_X(self) -> sp.csr_array:
         """Gram matrix of (v, w)_X on the basis."""
-        return sp.csr_array(self.basis.T @ self.space.gram @ self.basis)
+        return self._on_basis(self.space.gram)
 
     @cached_property
     def gram_VX(self) -> sp.csr_array:
-        """Gram matrix of (v, w)_VX on the basis: (M v, w)_X."""
-        image = sp.csr_array(self.basis.T @ (self._operator @ self.basis))
-        return sp.csr_array(0.5 * (image + image.T))
+        """Gram matrix of (v, w)_VX on the basis."""
+        return self._on_basis(self._VX)
 
     @cached_property
-    def inverse_VX(self) -> Map:
-        """Inverse of `gram_VX`."""
-        return HilbertSpace(self.gram_VX).riesz
+    def operator(self) -> sp.csr_array:
+        """Symmetric part of (M v, w)_X on the basis."""
+        image = sp.csr_array(self.basis.T @ (self._tested @ self.basis))
+        return sp.csr_array(0.5 * (image + image.T))
+
+    def image(self, x: Array) -> Array:
+        """Return the X-Gram product of M: x -> E^T M^T X^{-1} M E x."""
+        dual = self._tested @ (self.basis @ x)
+        result: Array = self.basis.T @ (self._tested.T @ self.space.riesz(dual))
+        return result
 
     def gram_V(self, x: Array) -> Array:
-        """Return (x, .)_V on the basis: E^T M^T X^{-1} M E x."""
-        dual = self._operator @ (self.basis @ x)
-        result: Array = self.basis.T @ (self._operator.T @ self.space.riesz(dual))
-        return result
+        """Return (x, .)_V on the basis."""
+        if self._V is not None:
+            result: Array = self.basis.T @ (self._V @ (self.basis @ x))
+            return result
+        return self.image(x)
 
     @cached_property
     def schur(self) -> Map:
@@ -198,16 +250,35 @@ class Part:
         mixed = sp.csr_array(self.rest.T @ self.space.gram @ self.basis)
         return lambda x: self.gram_X @ x - mixed.T @ other.riesz(mixed @ x)
 
+    @cached_property
+    def inverse_V(self) -> Map:
+        """Inverse of `gram_V`."""
+        if self._V is not None:
+            return HilbertSpace(self._on_basis(self._V)).riesz
+        # On the basis gram_V is M S^{-1} M with the Schur complement S of X.
+        own = HilbertSpace(self.operator)
+        return lambda x: own.riesz(self.schur(own.riesz(x)))
+
     # --- constants -------------------------------------------------------------------------------
 
     def embedding_V_VX(self) -> float:
         """Constant C of ||v||_VX <= C ||v||_V."""
-        return self._in_V(self.gram_VX.__matmul__)
+        top = self._largest(lambda x: self.gram_VX @ x, self.gram_V, self.inverse_V)
+        return float(np.sqrt(top))
 
     def embedding_VX_X(self) -> float:
         """Constant C of ||v||_X <= C ||v||_VX."""
-        top, bottom = self.gram_X, self.gram_VX
-        return float(np.sqrt(self._largest(top.__matmul__, bottom.__matmul__, self.inverse_VX)))
+        return float(np.sqrt(self._sparse(self.gram_X, self.gram_VX)))
+
+    def coercivity(self) -> float:
+        """Constant c of (M v, v)_X >= c ||v||_VX^2; 1 if VX is the norm of M itself."""
+        return 1.0 / self._sparse(self.gram_VX, self.operator) if self.size else 1.0
+
+    def boundedness(self) -> float:
+        """Constant C of ||R M v||_X <= C ||v||_V; 1 if V is the norm of M itself."""
+        if not self.size:
+            return 1.0
+        return float(np.sqrt(self._largest(self.image, self.gram_V, self.inverse_V)))
 
     def lipschitz(self, images: Images) -> float:
         """Largest ||J v||_X / ||v||_V for the Jacobian J of C(q, .).
@@ -222,7 +293,7 @@ class Part:
                 total += jacobian.T @ space.riesz(jacobian @ v)
             return self.basis.T @ total
 
-        return self._in_V(image)
+        return float(np.sqrt(self._largest(image, self.gram_V, self.inverse_V)))
 
     def ratio(self) -> float:
         """Upper bound of ||v||_V ||v||_X / ||v||_VX^2, which is 1/c_int of (interpol).
@@ -233,31 +304,26 @@ class Part:
         """
         if not self.size:
             return 1.0
+        own = HilbertSpace(self.operator)
 
         def inverse_schur(x: Array) -> Array:
             return self.basis.T @ self.space.riesz(self.basis @ x)
 
-        M = self.gram_VX.__matmul__
-        top = self._largest(M, self.schur, inverse_schur)
-        least = 1.0 / self._largest(self.schur, M, self.inverse_VX)
-        coupling = self._largest(self.gram_X.__matmul__, self.schur, inverse_schur)
-        return float(np.sqrt(coupling) * (least + top) / (2.0 * np.sqrt(least * top)))
+        top = self._largest(lambda x: self.operator @ x, self.schur, inverse_schur)
+        least = 1.0 / self._largest(self.schur, lambda x: self.operator @ x, own.riesz)
+        coupling = self._largest(lambda x: self.gram_X @ x, self.schur, inverse_schur)
+        bound = np.sqrt(coupling) * (least + top) / (2.0 * np.sqrt(least * top))
+        if self._V is not None:
+            image_inverse = _columns(lambda x: own.riesz(self.schur(own.riesz(x))))
+            bound *= np.sqrt(self._largest(self.gram_V, self.image, image_inverse))
+        # The last factor is the reciprocal of the least quotient ||v||_VX^2 / (M v, v)_X.
+        return float(bound / (1.0 / self._sparse(self.operator, self.gram_VX)))
 
-    def _in_V(self, top: Map) -> float:
-        """Return the root of the largest quotient of a quadratic form and ||v||_V^2."""
-        # On the basis gram_V is M S^{-1} M with the Schur complement S of X.
-        inverse = self.inverse_VX
-        value = self._largest(top, self.gram_V, lambda x: inverse(self.schur(inverse(x))))
-        return float(np.sqrt(value))
+    def _largest(self, top: Map, bottom: Map, bottom_inverse: Map | None) -> float:
+        return largest_eigenvalue(top, bottom, bottom_inverse, self.size)
 
-    def _largest(self, top: Map, bottom: Map, bottom_inverse: Map) -> float:
-        """Return the largest eigenvalue of top x = lambda bottom x, both symmetric, bottom > 0."""
-        if self.size == 0:
-            return 0.0
-        if self.size <= DENSE:
-            one = np.eye(self.size)
-            A, B = top(one), bottom(one)
-            values = eigh(0.5 * (A + A.T), 0.5 * (B + B.T), eigvals_only=True)
-        else:
-            values, _ = lanczos(top, bottom, bottom_inverse, self.size, tolerance=1e-8)
-        return max(float(values[-1]), 0.0)
+    def _sparse(self, top: sp.csr_array, bottom: sp.csr_array) -> float:
+        inverse = HilbertSpace(bottom) if self.size else None
+        return self._largest(
+            lambda x: top @ x, lambda x: bottom @ x, inverse.riesz if inverse else None
+        )
