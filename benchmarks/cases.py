@@ -50,8 +50,8 @@ the first run of each case.
 
 **What to expect of measurements.** No model of a field is exact, and a long record shows it. Then
 the verdict is `caution` and not `trusted`: use the interval with model errors. `do not trust` says
-that this interval is too wide to use, or that the fit failed. `livepde compare` then tests the
-likely causes. Its recommendation stands below each case on measurements.
+that no such interval is narrow enough to use, or that the fit failed. `livepde compare` then tests
+the likely causes. Its recommendation stands below each case on measurements.
 
 Experiments of the paper and of examples have [their own page](experiments.md). Written by
 `python -m benchmarks cases --gallery docs/gallery --compared 6`.

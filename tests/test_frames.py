@@ -123,7 +123,7 @@ SHEET = Frame(flat=True)
 )
 def test_verdict_and_intervals_do_not_depend_on_the_frame(frame: Frame, other: Frame):
     one, two = ended(frame), ended(other)
-    assert one.verdict.level == two.verdict.level == "do not trust"
+    assert one.verdict.level == two.verdict.level == "caution"
     shown = [
         [
             (finding.what, finding.subject, *[(each.kind, each.subject) for each in finding.causes])

@@ -422,6 +422,19 @@ def test_the_level_follows_from_fit_and_effect(of, doubted, level):
     assert sum(finding.what == "effect" for finding in more.findings) == (level != "trusted")
 
 
+def test_one_unknown_that_is_too_uncertain_leaves_the_others_their_use():
+    wide, narrow = errors(0.8, 9.0), Allowed("c", "", 1.0, 0.8, 1.3, 0.99, 1.01, 12.0)
+    misfit = Finding("misfit", "do not trust", "Model misfit.")
+    both = ModelErrors(2.0, 0.01, {"T": 2.0}, (*wide.unknowns, narrow))
+    verdict = Verdict.of([misfit]).with_errors(both)
+    assert verdict.level == "caution"
+    assert both.remedy == "Use these intervals, but not that of k: too wide to use."
+    assert both.remedy in verdict.sentences[0]
+    alone = Verdict.of([misfit]).with_errors(wide)
+    assert alone.level == "do not trust"
+    assert "These intervals are too wide to use." in alone.sentences[0]
+
+
 def test_a_doubted_run_without_unknowns_of_the_model_is_not_trusted():
     offset = Allowed("T.offset", "K", 0.0, -0.1, 0.1, -0.1, 0.1, 1.0, of_sensor=True)
     misfit = Finding("misfit", "do not trust", "Model misfit.")

@@ -289,12 +289,14 @@ def _estimates(data: xr.Dataset, labels: Sequence[str]) -> Table:
             _interval(row[f"{kind}low"], row[f"{kind}high"], row["std"]) for kind in ("", "model_")
         )
         # The wider interval comes first. The plain one tells the standard deviation, too.
-        cells = (value, allowed if differ else deviation, plain)
-        rows.append((label, *cells, row["unit"]))
+        zero = row["model_low"] <= 0.0 <= row["model_high"]  # relative to it an error says nothing
+        wide = (allowed, "–" if zero else in_percent(row["effect"])) if differ else (deviation,)
+        rows.append((label, value, *wide, plain, row["unit"]))
         if "reference" in row:
             error = shown(100 * row["error"], ".2g", " %")
             rows[-1] += (shown(row["reference"], ".5g"), error)
-    columns = ("unknown", "value", "with model errors" if differ else "± std. dev.", "95 %", "unit")
+    beside = ("with model errors", "error up to") if differ else ("± std. dev.",)
+    columns = ("unknown", "value", *beside, "95 %", "unit")
     title = f"Estimates{_first_order(data, labels)}"
     if "reference" not in known:
         return Table(title, columns, rows)

@@ -52,6 +52,11 @@ class Allowed:
         size = max(abs(self.value), abs(self.plain_low), abs(self.plain_high))
         return off / size if size > 0.0 else math.inf
 
+    @property
+    def usable(self) -> bool:
+        """Whether the interval is narrow enough to use."""
+        return self.effect <= USELESS
+
     def about(self, value: float, plain_low: float, plain_high: float) -> Allowed:
         """Return a later estimate with an interval that is as much wider than the plain one."""
 
@@ -141,10 +146,11 @@ class ModelErrors:
             return "do not trust"
         if not self.asked:  # no unknown of which an effect could be harmless
             return "caution" if doubted else "trusted"
-        wide = [one.effect for one in self.asked if one.wider > WIDER]
+        wide = max((one.effect for one in self.asked if one.wider > WIDER), default=0.0)
         if not doubted:
-            return "caution" if max(wide, default=0.0) > HIDDEN else "trusted"
-        if max(wide, default=0.0) > USELESS:
+            return "caution" if wide > HIDDEN else "trusted"
+        # One unknown that is too uncertain does not take the value from the others.
+        if wide > USELESS and not any(one.usable for one in self.asked):
             return "do not trust"
         return "trusted" if self.effect <= HARMLESS else "caution"
 
@@ -167,9 +173,14 @@ class ModelErrors:
         """What to do with such intervals."""
         if self.failed:
             return "Do not use the estimates. Find the error in the model or the data first."
-        if self.effect > USELESS:
+        useless = [one.label for one in self.asked if not one.usable]
+        if not useless:
+            return "Use these intervals: the others assume an exact model."
+        if len(useless) == len(self.asked):
             return "These intervals are too wide to use. Find the error first."
-        return "Use these intervals: the others assume an exact model."
+        names = ", ".join(useless[:MOST])
+        more = f" and {len(useless) - MOST} more" if len(useless) > MOST else ""
+        return f"Use these intervals, but not that of {names}{more}: too wide to use."
 
     def to_dict(self) -> dict[str, Any]:
         """Return the value as JSON can hold it."""
