@@ -36,10 +36,12 @@ from livepde.fem.meshes import (
     cells,
     grid,
     hermite,
+    lengths,
     linear,
     quadratic,
     read_mesh,
     rectangle,
+    shares,
     smooth,
 )
 from livepde.fem.priors import (
@@ -103,6 +105,7 @@ __all__ = [
     "hess",
     "ignores",
     "interval",
+    "lengths",
     "line",
     "linear",
     "maximum",
@@ -114,6 +117,7 @@ __all__ = [
     "random_field",
     "read_mesh",
     "rectangle",
+    "shares",
     "smooth",
     "source_density",
     "trace",

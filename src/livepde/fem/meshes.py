@@ -276,6 +276,31 @@ KINDS: dict[Any, tuple[str, list[int]]] = {
 }
 
 
+def shares(mesh: Mesh, axis: int, x: Array) -> Array:
+    """Return where coordinates lie in the box of a mesh along an axis, from 0 to 1.
+
+    In one dimension the cells count, not their length: a graded mesh is fine where the state
+    varies.
+    """
+    nodes = np.sort(mesh.p[axis])
+    if len(mesh.p) > 1:
+        nodes = nodes[[0, -1]]
+    return np.asarray(np.interp(x, nodes, np.linspace(0.0, 1.0, len(nodes))))
+
+
+def lengths(mesh: Mesh, axis: int, x: Array) -> Array:
+    """Return the length of the box along an axis, as the cells at some coordinates measure it.
+
+    In one dimension it is the number of cells times the size of the cell there.
+    """
+    nodes = np.sort(mesh.p[axis])
+    if len(mesh.p) > 1:
+        nodes = nodes[[0, -1]]
+    count = len(nodes) - 1
+    place = np.clip(np.searchsorted(nodes, x) - 1, 0, count - 1)
+    return np.asarray(count * np.diff(nodes)[place])
+
+
 def cells(mesh: Mesh) -> dict[str, Any]:
     """Return vertices of the cells by meshio's cell type, shape (cells, corners).
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from livepde.fem import dot, grad
+from livepde.fem import dot, grad, shares
 from livepde.laws.filter_state import PAUSE
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array
@@ -41,6 +41,7 @@ STARTS = (0.25, 0.5, 0.75)  # of the run, where something is switched on or chan
 PLACES = (0.2, 0.4, 0.6, 0.8)  # of the length, where a contact may resist
 STEP = 0.01  # of a difference: prior standard deviations of an unknown, share of a channel
 NARROW = 0.03  # of the length: a contact
+SAME = 1e-9  # relative difference of weights that are the same
 ROUNDING = 1e-11  # share of its terms, below which an effect is none: it would be scaled to one
 
 
@@ -96,8 +97,7 @@ class ErrorColumns:
         self.samples, self.numbers = samples, numbers
         problem = samples.filter.problem
         self.model, self.observed = problem.model, problem.observed
-        vertices = np.asarray(self.model.mesh.p)
-        self.low, self.high = vertices.min(axis=1), vertices.max(axis=1)
+        self.span = np.ptp(self.model.mesh.p, axis=1)
         self.answers: list[tuple[Answer, Course]] = [*self._sources(), *self._initial()]
         self.answers += [*self._boundaries(), *self._unknowns()]
         single = self.model.state_space.single and not len(self.model.algebraic)
@@ -113,7 +113,7 @@ class ErrorColumns:
 
         Waves of one length have one number, their mean: it depends on no order of the axes.
         """
-        span, most = self.high - self.low, max(max(one) for one in self.numbers[:3])
+        span, most = self.span, max(max(one) for one in self.numbers[:3])
         some = [
             (round(float(np.sum((np.array(one) * span.max() / span) ** 2)), 9), one)
             for one in itertools.product(range(most + 1), repeat=len(span))
@@ -127,12 +127,13 @@ class ErrorColumns:
 
     def _mode(self, number: int) -> Callable[[Any], Any]:
         """Return a product of cosines over the box of the domain, the longest waves first."""
-        low, span, (_, powers) = self.low, self.high - self.low, self._powers[number]
+        mesh, (_, powers) = self.model.mesh, self._powers[number]
 
         def shape(x: Any) -> Any:
-            found = 1.0
+            found: Any = 1.0
             for axis, power in enumerate(powers):
-                found = found * np.cos(power * np.pi * (x[axis] - low[axis]) / span[axis])
+                if power:
+                    found = found * np.cos(power * np.pi * shares(mesh, axis, x[axis]))
             return found
 
         return shape
@@ -187,33 +188,49 @@ class ErrorColumns:
         stage = ForwardStage(model)
         places = PLACES if stage.symmetric or not stage.keeps else ()
 
+        power = _radial(model)
+
         def stiffness(shape: Callable[[Any], Any]) -> Any:
-            return model.bilinear(lambda u, v, x: shape(x) * dot(grad(u), grad(v)))
+            return model.bilinear(lambda u, v, x: x[0] ** power * shape(x) * dot(grad(u), grad(v)))
 
         for k in range(1, 1 + modes):
             load = _minus(stiffness(self._mode(k)))
             yield Answer("conductivity", "", self._powers[k][0], load), hats(times)
         plain = stiffness(self._mode(0))
         yield Answer("state", load=_by_state(plain)), ALWAYS
-        for axis, (low, span) in enumerate(zip(self.low, self.high - self.low, strict=True)):
-            halves = stiffness(_halves(axis, low + 0.5 * span))
+        for axis, span in enumerate(self.span):
+            halves = stiffness(self._halves(axis))
             yield Answer("layer", "xyz"[axis], load=_minus(halves)), ALWAYS
-            wide = max(NARROW, 1.5 * float(model.mesh.param()) / span)
+            cell = 1.0 / model.mesh.nelements
+            if len(self.span) > 1:
+                cell = float(model.mesh.param()) / span
             for place in places:
-                matrix = stiffness(_band(axis, low + place * span, wide * span))
+                matrix = stiffness(self._band(axis, place, max(NARROW, 1.5 * cell)))
                 yield Answer("contact", "xyz"[axis], load=_minus(matrix)), ALWAYS
         modes, times = self.numbers.flow
-        axes = len(self.low)
+        axes = len(self.span)
         for k in range(axes * math.ceil(modes / axes)):  # along each axis as many
             axis, number = k % axes, k // axes
-            load = _minus(self._flow(axis, self._mode(number)))
+            load = _minus(self._flow(axis, power, self._mode(number)))
             yield Answer("flow", "", axes * self._powers[number][0], load), hats(times)
             if number == 0:
                 yield Answer("steady flow", "xyz"[axis], load=load), ALWAYS
-        yield Answer("loss", load=_lost(model.mass)), SWITCHED
+        # Nothing is lost where the state is, in the mean, as it was at the start.
+        amount = np.asarray(model.mass @ model.state_space.interpolate(1.0))
+        rest = float(amount @ self.samples.start.u[0] / amount.sum())
+        yield Answer("loss", load=_lost(model.mass, rest)), SWITCHED
 
-    def _flow(self, axis: int, shape: Callable[[Any], Any]) -> Any:
-        return self.model.bilinear(lambda u, v, x: shape(x) * grad(u)[axis] * v)
+    def _flow(self, axis: int, power: int, shape: Callable[[Any], Any]) -> Any:
+        return self.model.bilinear(lambda u, v, x: x[0] ** power * shape(x) * grad(u)[axis] * v)
+
+    def _halves(self, axis: int) -> Callable[[Any], Any]:
+        """Return a shape that tells two layers apart, from either side with the same size."""
+        mesh = self.model.mesh
+        return lambda x: np.where(shares(mesh, axis, x[axis]) > 0.5, 0.5, -0.5)
+
+    def _band(self, axis: int, place: float, wide: float) -> Callable[[Any], Any]:
+        mesh = self.model.mesh
+        return lambda x: np.maximum(1.0 - np.abs(shares(mesh, axis, x[axis]) - place) / wide, 0.0)
 
     def followed(self, one: Passed) -> tuple[Array, list[Array], Array]:
         """Return the readings of all answers, states at samples, and predicted readings.
@@ -273,13 +290,18 @@ class ErrorColumns:
         return later(stage, p, now, h, loads, lifts)
 
 
-def _halves(axis: int, middle: float) -> Callable[[Any], Any]:
-    """Return a shape that tells two layers apart, the same from either side but for its sign."""
-    return lambda x: np.where(x[axis] > middle, 0.5, -0.5)
+def _radial(model: Model) -> int:
+    """Return the power of the first coordinate that weighs all integrals: 0 where none does.
 
-
-def _band(axis: int, place: float, wide: float) -> Callable[[Any], Any]:
-    return lambda x: np.maximum(1.0 - np.abs(x[axis] - place) / wide, 0.0)
+    It is that in M: 1 for a radius in a plane or around an axis, 2 for one in space.
+    """
+    one = model.state_space.interpolate(1.0)
+    own = np.asarray(model.mass @ one)
+    for power in (1, 2):
+        alike = model.bilinear(lambda u, v, x, power=power: x[0] ** power * u * v) @ one
+        if np.ptp(own * alike.max() - alike * own.max()) <= SAME * alike.max() * own.max():
+            return power
+    return 0
 
 
 def beyond_rounding(values: Array, terms: Array) -> Array:
@@ -303,9 +325,9 @@ def _by_state(stiffness: Any) -> Load:
     return lambda now: bent(now._replace(u=(now.u - now.u.mean()) ** 2))
 
 
-def _lost(mass: Any) -> Load:
+def _lost(mass: Any, rest: float) -> Load:
     size = abs(mass)
-    return lambda now: beyond_rounding(-(mass @ (now.u - now.u.mean())), size @ np.abs(now.u))
+    return lambda now: beyond_rounding(-(mass @ (now.u - rest)), size @ np.abs(now.u))
 
 
 def _late(lift: Array, name: str) -> Load:

@@ -25,6 +25,7 @@ from livepde.laws.refit import plausible
 from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
 from livepde.verdict.directions import (
+    SHIFT,
     sensor_shifts,
     stated_positions,
 )
@@ -77,7 +78,7 @@ def _sensor_columns(
         column[:] = beyond_rounding(column, level)
     rate = np.gradient(change, times, axis=0) if count > 1 else np.zeros_like(predicted)
     problem = samples.filter.problem
-    each = [
+    each: list[tuple[Array, float | Array]] = [
         (np.ones_like(predicted), math.inf),
         (np.broadcast_to(share[:, None], predicted.shape), math.inf),
         (change, MOST_GAIN),
@@ -94,14 +95,14 @@ def _sensor_columns(
             slope[:, k] = beyond_rounding(slope[:, k], terms[:, k])
         vertices = np.asarray(problem.model.mesh.p)[axis]
         low, high = float(vertices.min()), float(vertices.max())
-        each.append((slope, FARTHEST * (high - low)))
+        each.append((slope, FARTHEST / SHIFT * step))
         at = np.zeros(sensors) if positions is None else np.nan_to_num(positions[:, axis])
         common += [(slope * (at - end), FARTHEST) for end in (low, high)]  # depths from either
     for effect, most in each:
         for k in range(sensors):
             own = np.zeros_like(predicted)
             own[:, k] = effect[:, k]
-            yield own, most
+            yield own, float(np.broadcast_to(most, sensors)[k])
     for effect, most in common:
         yield effect, most
 

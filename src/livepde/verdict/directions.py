@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ObservationError
-from livepde.fem import Inputs, Moment, On
+from livepde.fem import Inputs, Moment, On, lengths
 from livepde.linalg import Array, IntArray, row_product
 from livepde.model import Model
 from livepde.observation import CombinedObserved, Observed, Points
@@ -37,7 +37,7 @@ OFFSET = 3.0  # standard deviations of the noise: a direction of amplitude one, 
 DRIFT = 64.0  # ... a drift in so many samples
 GAIN = 0.1  # of the change of a sensor since the start
 LAG = 3.0  # samples
-SHIFT = 0.02  # of the length of the domain
+SHIFT = 0.02  # of the length of the domain, as the cells near a sensor measure it
 JUMP = 0.3  # prior standard deviations of an unknown
 MOST_JUMPS = 8  # coordinates of unknowns that may jump
 MOST_SUMS = 12_000  # numbers in one kind of sum
@@ -286,7 +286,7 @@ class Dictionary:
         amplitudes = {  # of each sensor, with their unit; where room is short the last go first
             "offset": (OFFSET * noise, units),
             "lag": (np.full(sensors, np.nan), none),
-            "position": (np.full(sensors, step), (model.length_unit,) * sensors),
+            "position": (step, (model.length_unit,) * sensors),
             "gain": (np.full(sensors, GAIN), none),
             "drift": (OFFSET * noise, units),
         }
@@ -422,18 +422,24 @@ def _rows_at(observed: Observed, at: Array) -> sp.csr_array:
     return sp.csr_array(sp.vstack(rows))
 
 
-def sensor_shifts(model: Model, observed: Observed) -> tuple[list[sp.csr_array], float]:
-    """Return how readings change if sensors are shifted along each axis, and by how much.
+def usual_shifts(model: Model, at: Array) -> Array:
+    """Return by how much sensors at places (sensors, d) may well be off, (sensors,)."""
+    each = [lengths(model.mesh, axis, column) for axis, column in enumerate(at.T)]
+    return np.asarray(SHIFT * np.max(each, axis=0))
+
+
+def sensor_shifts(model: Model, observed: Observed) -> tuple[list[sp.csr_array], Array]:
+    """Return how readings change if sensors are shifted along each axis, and by how much, (n,).
 
     No axes if no sensor has a position, or only uncertain ones that are estimated anyway; zero for
     single ones.
     """
     at = stated_positions(observed)
     if at is None:
-        return [], np.nan
+        return [], np.full(observed.size, np.nan)
     vertices = np.asarray(model.mesh.p)
     low, high = vertices.min(axis=1), vertices.max(axis=1)
-    step = SHIFT * float((high - low).max())
+    step = usual_shifts(model, at)
     found = []
     for axis in range(at.shape[1]):
         ends, width = [], np.zeros(len(at))
