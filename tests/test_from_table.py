@@ -315,6 +315,11 @@ def test_inputs_and_units_of_another_equation(here):
     Path("mine/case.toml").unlink()
     found = begun("time (min),near 8 m\n0,0\n1,1\n", equation="pumping_test")
     assert found["inputs"] == {"Q": "? m^3/s"}
+    assert "t0" not in found["data"]
+    Path("mine/case.toml").unlink()
+    # At the first row the process has gone on for a while: when did it begin?
+    found = begun("time (min),near 8 m\n2,0.1\n3,0.2\n", equation="pumping_test")
+    assert found["data"]["t0"] == "? min"
 
 
 @pytest.mark.parametrize("name", EQUATIONS)

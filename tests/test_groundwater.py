@@ -7,16 +7,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
+from scipy.integrate import quad
 from scipy.special import erfc, erfcx, exp1
 from skfem import ElementQuad1, MeshQuad
 
 import livepde as lp
+from livepde.cases import load
+from livepde.cases.read import parse
+from livepde.cases.remedies import freed, start_missed, usual_shift
 from livepde.diagnostics import check_model
-from livepde.errors import ModelError
+from livepde.errors import CaseError, ModelError
 from livepde.fem import grid
 from livepde.models import advection_dispersion, groundwater, mobile_immobile, pumping_test
 from livepde.stepping import Advance, Alexander2, simulate
+from livepde.verdict import Cause
 
 ROOT = Path(__file__).parents[1]
 k, Ss, b, Q = 7.6e-4, 2.5e-5, 7.0, 9.1e-3
@@ -65,6 +71,107 @@ def test_drawdown_recovers_when_the_pump_stops():
     late = times[-30:]
     exact = theis(30.0, late, k * b, Ss * b, Q) - theis(30.0, late - stop, k * b, Ss * b, Q)
     assert np.abs(found - exact).max() < 0.02 * Q / (4 * np.pi * k * b)
+
+
+L = 2e-9  # leakance, 1/s: a layer of 16 years
+
+
+def hantush(r: float, t: float) -> float:
+    """Drawdown in a leaky aquifer (Hantush and Jacob 1955): the integral over y = exp(s)."""
+    T, low = k * b, np.log(r**2 * Ss / (4 * k * t))
+    leak = r**2 * L / (4 * T)
+    found, _ = quad(lambda s: np.exp(-np.exp(s) - leak * np.exp(-s)), low, 5.0, limit=200)
+    return float(Q / (4 * np.pi * T) * found)
+
+
+@pytest.mark.slow
+def test_drawdown_in_a_leaky_aquifer_is_that_of_hantush():
+    mesh = lp.interval(0.1, 20_000.0, 180, geometric=True)
+    model = pumping_test(mesh, positive(k), positive(Ss), positive(L), b=b)
+    r, times = [30.0, 90.0, 300.0], np.concatenate([[0.0], np.geomspace(0.05, 1e6, 90)])
+    found = history(model, times, r, lambda t: {"Q": Q})[30:]
+    exact = np.array([[hantush(one, t) for one in r] for t in times[31:]])
+    assert np.abs(found - exact).max() < 0.001 * exact.max()
+
+
+def pumped(folder: Path, **settings: Any) -> Any:
+    """Return a case with readings of a leaky aquifer; the first one comes after 20 minutes."""
+    t = np.geomspace(1200.0, 3e4, 40)
+    rng = np.random.default_rng(1)
+    z = {f"h{r}": [hantush(r, one) for one in t] + rng.normal(0.0, 1e-3, 40) for r in (30, 60, 120)}
+    pd.DataFrame({"t": t, **z, "Q": Q}).to_csv(folder / "test.csv", index=False)
+    sensors = "".join(
+        f'{name} = {{ role = "sensor", column = "{name}", at = {name[1:]}.0 }}\n' for name in z
+    )
+    case = folder / "case.toml"
+    case.write_text(f"""
+equation = "pumping_test"
+initial = 0.0
+options = {{ b = {b} }}
+mesh = {{ from = 0.1, to = 5000.0, cells = 80, spacing = "geometric" }}
+data = {{ file = "test.csv", time = "t" }}
+law.noise = 1e-3
+[unknowns]
+k = {{ prior = 3e-4, std = 6e-4, transform = "log" }}
+Ss = {{ prior = 1e-4, std = 3e-4, transform = "log" }}
+[channels]
+Q = {{ role = "input", column = "Q" }}
+{sensors}""")
+    return load(case, settings={key.replace("__", "."): value for key, value in settings.items()})
+
+
+LEAKY = {"unknowns__leakance": {"prior": 1e-9, "std": 2e-9, "transform": "log"}}
+
+
+@pytest.mark.slow
+def test_the_state_at_rest_is_that_of_the_time_when_pumping_began(tmp_path: Path):
+    def ended(**settings: Any) -> Any:
+        prepared = pumped(tmp_path, **LEAKY, **settings).prepare()
+        return prepared, prepared.identifier.run(prepared.stream).last
+
+    prepared, last = ended(data__t0=0.0)
+    assert last.verdict.level == "trusted"
+    for name, truth in (("k", k), ("Ss", Ss), ("leakance", L)):
+        low, high = last[name].interval()
+        assert low < truth < high
+    # Without the key the aquifer would be at rest at the first row, and the run says so.
+    prepared, last = ended()
+    assert last.verdict.level != "trusted"
+    (found,) = start_missed(prepared, last.verdict)
+    assert "set `data.t0`" in found.remedy
+
+
+def test_a_time_of_the_start_that_cannot_be_is_refused(tmp_path: Path):
+    with pytest.raises(CaseError, match=r"data\.t0: 2000 s is later than the first row"):
+        _ = pumped(tmp_path, data__t0=2000.0).prepare().identifier
+    with pytest.raises(CaseError, match=r"data\.t0: .* interpolated from the first row"):
+        _ = pumped(tmp_path, data__t0=0.0, initial="interpolate").prepare().identifier
+    with pytest.raises(CaseError, match=r"data\.t0: got the date"):
+        _ = pumped(tmp_path, data__t0="2025-04-01").prepare().identifier
+
+
+@pytest.mark.slow
+def test_an_aquifer_that_is_taken_for_confined(tmp_path: Path):
+    prepared = pumped(tmp_path, data__t0=0.0).prepare()
+    last = prepared.identifier.run(prepared.stream).last
+    assert last.verdict.level == "caution"
+    for name, truth in (("k", k), ("Ss", Ss)):
+        one = last.verdict.errors[name]
+        assert one.low < truth < one.high
+    # A place near the well may be off by less than one far away, and a leak can be estimated.
+    assert usual_shift(prepared, "h30") == pytest.approx(
+        0.25 * usual_shift(prepared, "h120"), rel=0.2
+    )
+    (leak,) = freed(prepared, Cause("loss", "", "", size=1e-5))
+    assert leak.startswith("unknowns.leakance=")
+    case = pumped(
+        tmp_path, data__t0=0.0, **{"unknowns__leakance": parse([leak])["unknowns.leakance"]}
+    )
+    again = case.prepare()
+    better = again.identifier.run(again.stream).last
+    assert better.verdict.level == "trusted"
+    low, high = better["leakance"].interval()
+    assert low < L < high
 
 
 def plane(cell: float = 4.0) -> MeshQuad:

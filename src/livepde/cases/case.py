@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ import tomlkit
 from livepde import laws
 from livepde.cases import case_channels
 from livepde.cases.case_content import CaseContent, resolve
-from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of, without_gaps
+from livepde.cases.data import clock_of, read_data, reader_of, time_of, without_gaps
 from livepde.cases.process import conditioned, model_of, process_notes, wall_attributes
 from livepde.cases.read import apply, did_you_mean, read_spec, read_text, read_toml
 from livepde.cases.schema import SENSORS, GradientSpec, SensitivitySpec
@@ -84,7 +85,7 @@ class Prepared:
             case.observation if sensors is None else sensors,
             law,
             u0=self.u0,
-            t0=float(self.first.t),
+            t0=self.t0,
             validation=case.validation,
             ignored=case.ignored,
             scheme=case.scheme,
@@ -93,6 +94,22 @@ class Prepared:
             between=case_channels.between_of(case),
             **self.uncertain(law),
         )
+
+    @cached_property
+    def t0(self) -> float:
+        """Time of the initial state: that of the first sample, or an earlier one."""
+        case, first = self.case, float(self.first.t)
+        stated = time_of(case, "t0", self.origin)
+        if stated is None:
+            return first
+        if stated > first:
+            text = f"{stated:g} {case.equation.time_unit}".rstrip()
+            text = f"{text} is later than the first row; state the time of the initial state"
+            raise case.error("data.t0", f"{text}, or leave out the rows before with `data.start`.")
+        if stated < first and case_channels.interpolates(case):
+            text = "the initial state is interpolated from the first row: leave out t0, or give "
+            raise case.error("data.t0", f"{text}`initial` a value.")
+        return float(stated)
 
     def uncertain(self, law: laws.AnyLaw) -> dict[str, Any]:
         """Return the options of an identifier for noise of inputs and errors of the start."""
@@ -390,10 +407,14 @@ class Case(CaseContent):
         first = next(samples, None)
         if first is None:
             raise DataError(f"{self.path}: the data contain no sample between start and stop.")
-        start = assimilation_start(self, self.clock, data.origin)
+        start = self._assimilated_from(data.origin)
         # A stream can be read only once, so its first sample is put back.
         stream = chain([first], samples) if table is None else data
         return Prepared(self, first, stream, start, data.origin, table)
+
+    def _assimilated_from(self, origin: datetime | None) -> float:
+        start = time_of(self, "assimilate_from", origin)
+        return -math.inf if start is None else float(start)
 
     @property
     def live(self) -> bool:
@@ -425,7 +446,7 @@ class Case(CaseContent):
         DataError
             The sample lacks values needed for the initial state or inputs.
         """
-        start = assimilation_start(self, self.clock, origin)
+        start = self._assimilated_from(origin)
         prepared = Prepared(self, first, (), start, origin, live=live)
         prepared.identifier_with(self.law).step(first.t, first.z)  # raises on missing values
         return prepared

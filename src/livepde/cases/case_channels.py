@@ -316,12 +316,17 @@ def initial_weights(case: CaseContent, first: Sample) -> dict[str, Any]:
     return found
 
 
+def interpolates(case: CaseContent) -> bool:
+    """Return whether the initial state is interpolated from the first readings."""
+    initial = case.spec.initial
+    return isinstance(initial, schema.InitialSpec) and initial.start in INTERPOLATED
+
+
 def _made_of_readings(case: CaseContent) -> bool:
     """Return whether the initial state is made of readings that are uncertain."""
     initial = case.spec.initial
-    if initial is None or isinstance(initial, dict) or len(case.mesh.p) != 1:
-        return False
-    return initial.start in INTERPOLATED and initial.start != EXACT
+    exact = isinstance(initial, schema.InitialSpec) and initial.start == EXACT
+    return interpolates(case) and not exact and len(case.mesh.p) == 1
 
 
 def initial_errors(case: CaseContent, first: Sample) -> tuple[Any, ...]:

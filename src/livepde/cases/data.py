@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from livepde.cases.case_channels import INTERPOLATED, columns_of
+from livepde.cases.case_channels import columns_of, interpolates
 from livepde.cases.case_content import CaseContent, check_options, load_code, own_code
 from livepde.cases.schema import (
     SENSORS,
@@ -23,7 +23,6 @@ from livepde.cases.schema import (
     CaseSpec,
     DataSpec,
     FileSpec,
-    InitialSpec,
     NodesSpec,
 )
 from livepde.dates import since_1970
@@ -124,9 +123,7 @@ def read_data(case: CaseContent, source: str | Iterable[str] | None) -> DataTabl
     between = {name: column.between for name, column in columns.items()}
     # An initial profile needs a reading of each sensor. Readings that are late in their table come
     # before its start once they are corrected: a stated state is not that of their time.
-    initial = case.spec.initial
-    profile = isinstance(initial, InitialSpec) and initial.start in INTERPOLATED
-    together = profile or bool(delays(case))
+    together = interpolates(case) or bool(delays(case))
     sensors, where = case.roles(*SENSORS), case.where("data.file")
     return join_tables(tables, clock.second, sensors, needed, where, between, together=together)
 
@@ -378,20 +375,21 @@ def _measurements(case: CaseContent) -> Path | None:
     return None
 
 
-def assimilation_start(case: CaseContent, clock: Clock, origin: datetime | None) -> float:
-    """Return the model time from which sensors are assimilated."""
-    value = _instant(case, case.spec.data.assimilate_from, "assimilate_from")
-    if value is None:
-        return float(-np.inf)
-    if isinstance(value, float | int):
-        return float(value)
+def time_of(
+    case: CaseContent, key: Literal["assimilate_from", "t0"], origin: datetime | None
+) -> float | None:
+    """Return the model time that a key of `[data]` states; None if it states none."""
+    value = _instant(case, getattr(case.spec.data, key), key)
+    if value is None or isinstance(value, float | int):
+        return value
     if origin is None:
         text = f"got the date {value}; the times of the data are numbers."
-        raise case.error("data.assimilate_from", text)
+        raise case.error(f"data.{key}", text)
+    clock = clock_of(case)
     stamp = clock.stamp(value)
     if stamp is None:
         text = f"got '{value}'; expected a date such as 2025-04-01 12:00."
-        raise case.error("data.assimilate_from", text)
+        raise case.error(f"data.{key}", text)
     return (stamp - since_1970(origin)) * clock.second
 
 

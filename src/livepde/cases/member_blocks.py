@@ -38,7 +38,7 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str
     Their cases differ only in data, initial state and descriptions; their samples have the same
     times.
     """
-    groups: dict[tuple[str, float, bytes], dict[str, Prepared]] = {}
+    groups: dict[tuple[str, float, float, bytes], dict[str, Prepared]] = {}
     settings: dict[Case, str] = {}
     apart: dict[str, str] = {}
     for name, one in members.items():
@@ -54,7 +54,7 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str
             settings[one.case] = one.case.spec.model_dump_json(
                 exclude={**dict.fromkeys(TOLD, True), **unread}
             )
-        key = settings[one.case], one.assimilate_from, one.stream.t.tobytes()
+        key = settings[one.case], one.assimilate_from, one.t0, one.stream.t.tobytes()
         groups.setdefault(key, {})[name] = one
     found = []
     for group in groups.values():
@@ -92,7 +92,7 @@ class MemberBlock:
             case.law,
             list(self.members),
             u0=[member.u0 for member in self._each],
-            t0=float(one.first.t),
+            t0=one.t0,
             validation=case.validation,
             scheme=case.scheme,
             dt_max=case.dt_max,

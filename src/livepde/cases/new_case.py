@@ -108,11 +108,18 @@ def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
     given = {item.name for item in found if item.columns and not item.is_sensor}
     # Noise is a standard deviation, a difference of temperatures: in K.
     noise = _open(equation.state.unit.replace("degC", "K"))
-    told = "missing: far outside the other values; check them" if _missing(table) else ""
+    data, told = _data(table, folder), list[str]()
+    if "missing" in data:
+        told.append("missing: far outside the other values; check them")
+    # Times that are numbers count from an event, which is at rest before the first row.
+    first = table.samples.t[0]
+    if equation.spacing == "geometric" and table.samples.origin is None and first > 0.0:
+        data["t0"] = _open(table.time_unit)
+        told.append("t0: when the process began, at rest")
     lines = [
         *_top(table, equation, given),
         *_inline("mesh", _mesh(equation)),
-        *_inline("data", _data(table, folder), told),
+        *_inline("data", data, "; ".join(told)),
         *_contents(table),
         *_unknowns(equation, given),
         *_constants(found),

@@ -16,13 +16,13 @@ from livepde.laws import SensitivityLaw
 from livepde.linalg import Array
 from livepde.samples import by_name
 from livepde.verdict import Cause, Finding, Severity, Verdict, channel_setting
+from livepde.verdict.directions import stated_positions, usual_shifts
 from livepde.verdict.sentences import ESTIMATED, FINDINGS, LIKELY, amount_of, estimating
 
 if TYPE_CHECKING:
     from livepde.cases.case import Case, Prepared
 
 WIDE = 2.0  # prior standard deviation of what is freed, over the size that was found
-PLACE = 0.01  # of the length of the domain: how far off a sensor of unknown error may be
 KEYS = {kind: key for kind, (_, key) in ESTIMATED.items()}
 """Kind of error of a sensor -> its key in a case; all sensors share one prior of each."""
 # Errors with a size that a fit could find.
@@ -69,9 +69,13 @@ def after_gaps(verdict: Verdict, inputs: Iterable[Finding]) -> Verdict:
 def start_missed(prepared: Prepared, verdict: Verdict) -> list[Finding]:
     """Return the finding of a stated start that the first readings miss, in a doubted run."""
     settings, missed = _initial(prepared), first_miss(prepared)
-    noise = prepared.identifier.observed.noise
+    noise, law = prepared.identifier.observed.noise, prepared.case.law
+    if isinstance(law, SensitivityLaw) and isinstance(law.noise, int | float):
+        noise = np.array([law.noise])
+    # Readings that come later have moved on from the start.
+    late = prepared.t0 < prepared.first.t
     doubted = verdict.level in ("caution", "do not trust")
-    if not (settings and doubted and noise is not None and missed > MISSED * np.median(noise)):
+    if late or not (settings and doubted) or noise is None or missed <= MISSED * np.median(noise):
         return []
     unit = prepared.case.equation.state.unit
     text, remedy = FINDINGS["start, missed"].filled(
@@ -116,7 +120,7 @@ def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     if cause.kind in process:
         return process[cause.kind](prepared, cause)
     if cause.kind in KEYS:
-        return _of_sensor(case, cause)
+        return _of_sensor(prepared, cause)
     if cause.kind == "exchange":
         return _exchanged(case, cause)
     if cause.kind == "initial" and (settings := _initial(prepared)):
@@ -130,8 +134,9 @@ def _adding(name: str, std: float, **keys: float | str) -> str:
     return f"unknowns.{toml_key(name)}={toml_value(known)}"
 
 
-def _of_sensor(case: Case, cause: Cause) -> tuple[str, ...]:
+def _of_sensor(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     """Return the setting of an error of a sensor, with the prior that other sensors state."""
+    case = prepared.case
     key, channels = KEYS[cause.kind], case.roles("sensor")
     channel = channels.get(cause.subject)
     if channel is None:
@@ -143,11 +148,20 @@ def _of_sensor(case: Case, cause: Cause) -> tuple[str, ...]:
     others, size = (getattr(item, key) for item in channels.values()), cause.size
     stated = next((value for value in others if value is not None), None)
     if key == "at_std" and not math.isfinite(size):
-        size = PLACE * float(np.ptp(case.mesh.p, axis=1).max())
+        size = usual_shift(prepared, cause.subject)
     if stated is None and not math.isfinite(size):
         return settings_in(cause.setting)
     given = float(f"{WIDE * abs(size):.2g}") if stated is None else stated
     return (channel_setting(cause.subject, key, toml_value(given)),)
+
+
+def usual_shift(prepared: Prepared, name: str) -> float:
+    """Return half of how far a sensor may well be off; NaN if it has no stated place."""
+    who = prepared.identifier
+    at = stated_positions(who.observed)
+    if at is None:
+        return math.nan
+    return 0.5 * float(usual_shifts(who.model, at)[who.observed.names.index(name)])
 
 
 def _stated(case: Case, cause: Cause) -> tuple[str, ...]:
@@ -219,9 +233,17 @@ def _source(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
 
 
 def _loss(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
-    """Return the settings of a loss to surroundings at the temperature of the first readings."""
+    """Return the settings of a loss to surroundings at the temperature of the first readings.
+
+    That of water is a leakance, which needs no surroundings.
+    """
     case = prepared.case
-    if not (_free(case, "loss") and cause.size > 0.0):
+    if not cause.size > 0.0:
+        return ()
+    if _free(case, "leakance"):
+        size = float(f"{cause.size * prior_of(case, 'Ss') * case.options['b']:.2g}")
+        return (_adding("leakance", size, prior=size, transform="log"),)
+    if not _free(case, "loss"):
         return ()
     size = float(f"{cause.size * _capacity(case):.2g}")
     settings = [_adding("loss", size, prior=size, transform="log")]

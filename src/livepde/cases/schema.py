@@ -187,6 +187,7 @@ class DataSpec(Spec):
     zone: Name = "UTC"
     start: Instant | None = None
     stop: Instant | None = None
+    t0: Instant | None = None
     assimilate_from: Instant | None = None
     every: PositiveInt = 1
     missing: tuple[float, ...] = ()

@@ -14,7 +14,7 @@ from livepde.cases.case import Prepared, load
 from livepde.cases.case_channels import columns_of
 from livepde.cases.data import clock_of, delays
 from livepde.cases.read import parse, settings_in, toml_key, toml_value
-from livepde.cases.remedies import PLACE, first_miss, freed, with_settings
+from livepde.cases.remedies import first_miss, freed, usual_shift, with_settings
 from livepde.dates import since_1970
 from livepde.errors import CaseError
 from livepde.plots.style import modes_told
@@ -449,8 +449,9 @@ def _process(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
 
 def _sensors(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     """Iterate over errors that all sensors may have."""
-    length = float(np.ptp(prepared.case.mesh.p, axis=1).max())
-    for kind, size in (("offset", _usual_error(base)), ("position", PLACE * length)):
+    # All positions share one prior, which is plausible for each of them.
+    shifts = [usual_shift(prepared, name) for name in prepared.case.sensors]
+    for kind, size in (("offset", _usual_error(base)), ("position", min(shifts, default=math.nan))):
         causes = [Cause(kind, name, "", size=size) for name in prepared.case.sensors]
         settings = [setting for cause in causes for setting in freed(prepared, cause)]
         if settings and len(causes) > 1:

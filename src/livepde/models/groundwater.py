@@ -15,13 +15,22 @@ from livepde.model import Model
 from livepde.models.description import Equation, Option, Variable, by_name
 
 
-def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any = None) -> Model:
-    """Return Ss r s_t - (k r s_r)_r = 0 for the drawdown s around a well pumped at Q(t).
+def pumping_test(
+    mesh: Any,
+    k: Unknown,
+    Ss: Unknown,
+    leakance: Unknown | None = None,
+    *,
+    b: float,
+    element: Any = None,
+) -> Model:
+    """Return Ss r s_t - (k r s_r)_r + r leakance s/b = 0 for the drawdown around a well.
 
     At the wall of the well -2 pi r b k s_r = Q, and s = 0 at the far end. For a small well radius
-    and a constant rate this is the problem of Theis (1935), s = Q/(4 pi k b) E1(r^2 Ss/(4 k t)); Q
-    may also change (step tests, recovery): in m^3/s, positive for extraction, it is the input
-    channel "Q". Both unknowns are positive: use `LogNormal`.
+    and a constant rate this is the problem of Theis (1935), s = Q/(4 pi k b) E1(r^2 Ss/(4 k t)),
+    and with a leaky layer above that of Hantush and Jacob (1955). The rate Q may also change (step
+    tests, recovery): in m^3/s, positive for extraction, it is the input channel "Q". The unknowns
+    are positive: use `LogNormal`.
 
     Parameters
     ----------
@@ -32,6 +41,9 @@ def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any =
         Hydraulic conductivity in m/s.
     Ss
         Specific storage in 1/m.
+    leakance
+        Vertical conductivity over thickness of a leaky layer above, in 1/s: the inverse of its
+        resistance. Without it the aquifer is confined.
     b
         Thickness of the aquifer in m; for 1 m the unknowns are transmissivity and storativity.
 
@@ -44,17 +56,27 @@ def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any =
         raise ModelError(f"pumping_test: b, the thickness, must be positive; got {b}.")
     # Quadrature of order four integrates the weight r with elements of first order exactly.
     state = Field(mesh, element or linear(mesh), dirichlet={"right": 0.0}, unit="m", quadrature=4)
+    terms: list[Any] = [
+        lambda q, u, v, x: q.diffusivity * x[0] * dot(grad(u), grad(v)),
+        On("left", lambda q, _, v, x: -x.inputs["Q"] / (2 * pi * b) * q.per_storage * v),
+    ]
+    unknowns = {"k": k, "Ss": Ss}
+    if leakance is not None:
+        unknowns["leakance"] = leakance
+        terms.append(lambda q, u, v, x: q.leaked * x[0] * u * v)
+
+    def coefficients(q: Any) -> dict[str, Any]:
+        found = {"diffusivity": q.k / q.Ss, "per_storage": 1 / q.Ss}
+        return found if leakance is None else {**found, "leaked": q.leakance / (b * q.Ss)}
+
     return Model(
         state,
-        {"k": k, "Ss": Ss},
-        A=[
-            lambda q, u, v, x: q.diffusivity * x[0] * dot(grad(u), grad(v)),
-            On("left", lambda q, _, v, x: -x.inputs["Q"] / (2 * pi * b) * q.per_storage * v),
-        ],
-        coefficients=lambda q: {"diffusivity": q.k / q.Ss, "per_storage": 1 / q.Ss},
+        unknowns,
+        A=terms,
+        coefficients=coefficients,
         M=lambda u, v, x: x[0] * u * v,
         inputs=["Q"],
-        **PUMPING_TEST.about(),
+        **PUMPING_TEST.about(unknowns),
     )
 
 
@@ -180,12 +202,14 @@ def _build_plane(
 
 PUMPING_TEST = Equation(
     name="pumping_test",
-    summary="radial flow to a pumped well in a confined aquifer (Theis)",
-    formula="Ss r s_t = (k r s_r)_r,  -2 pi r b k s_r = Q at the well,  s = 0 far away",
+    summary="radial flow to a pumped well in a confined (Theis) or leaky aquifer",
+    formula="Ss r s_t = (k r s_r)_r - r leakance s/b,  "
+    "-2 pi r b k s_r = Q at the well,  s = 0 far away",
     state=Variable("m", "drawdown"),
     unknowns={
         "k": Variable("m/s", "hydraulic conductivity"),
         "Ss": Variable("1/m", "specific storage"),
+        "leakance": Variable("1/s", "conductivity over thickness of a leaky layer above", True),
     },
     inputs={"Q": Variable("m^3/s", "rate of the well, positive when water is taken out")},
     options={"b": Option("m", "thickness of the aquifer; with 1 m k is T and Ss is S")},

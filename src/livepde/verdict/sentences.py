@@ -200,7 +200,8 @@ FINDINGS: dict[str, Sentence] = {
     ),
     "start, missed": Sentence(
         "The first readings miss the stated initial state by {missed} (root mean square).",
-        "Specify its uncertainty: `{setting}`.",
+        "If the process began before the first row, set `data.t0`. Otherwise specify the "
+        "uncertainty of its start: `{setting}`.",
     ),
     "hold": Sentence(
         'Inputs are held between readings (`between = "hold"` or `"next"`), but vary smoothly. '
