@@ -458,11 +458,15 @@ def _recommendation(run: Run) -> list[str]:
     """Return what `livepde compare` says of a case, as Markdown."""
     if not run.compared:
         return []
-    table = run.compared["tables"][0]
-    shown_table = Table("Compared", table["columns"], table["rows"])
+    shown = [
+        Table(title, table["columns"], table["rows"])
+        for title, table in zip(
+            ("Compared", "Estimates of the variants"), run.compared["tables"], strict=False
+        )
+    ]
     variants = {one["name"]: one for one in run.compared["variants"]}
     best = variants[run.compared["recommended"]]
-    lines = [markdown("", [shown_table], notes=run.compared["notes"])]
+    lines = [markdown("", shown, notes=run.compared["notes"])]
     for label, (_, reference) in run.unknowns.items():
         one = best["estimates"].get(label)
         if one is None or not math.isfinite(reference) or one["low"] is None:

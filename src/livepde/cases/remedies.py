@@ -151,7 +151,13 @@ def _of_sensor(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
         size = usual_shift(prepared, cause.subject)
     if stated is None and not math.isfinite(size):
         return settings_in(cause.setting)
-    given = float(f"{WIDE * abs(size):.2g}") if stated is None else stated
+    given = stated
+    if stated is None:
+        who = prepared.identifier.observed
+        units = {"offset": who.units[who.names.index(cause.subject)].replace("degC", "K")}
+        unit = {**units, "at_std": case.equation.length_unit}.get(key, "")
+        value = f"{WIDE * abs(size):.2g}"
+        given = f"{value} {unit}" if unit else float(value)
     return (channel_setting(cause.subject, key, toml_value(given)),)
 
 

@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.markup import escape
@@ -49,7 +49,6 @@ from livepde.runs import Table
 from livepde.runs.summary import digits, shown
 
 WIDE = 3  # panels beside each other
-COLUMNS = 4  # unknowns of the case in the table of variants; the others have one of their own
 
 
 def compare(
@@ -185,35 +184,31 @@ def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> 
         gained = one.gained(base)
         return math.isnan(gained), -gained if math.isfinite(gained) else 0.0
 
-    labels = list(base.estimates)[:COLUMNS]
-    rows: list[tuple[Any, ...]] = []
-    ended = [one for one in (base, *found) if not one.error]
-    for one in sorted(ended, key=rank):
-        cells = [_interval(one.estimates.get(label)) for label in labels]
-        apart = one.apart(base)
-        rows.append(
-            (
-                one.variant.name + (" *" if one is best else ""),
-                one.level,
-                shown(one.gained(base), "+.1f"),
-                shown(one.misfit, ".2g"),
-                shown(one.validation_error, ".3g"),
-                one.unknowns,
-                f"no: {', '.join(apart)}" if apart else "yes",
-                *cells,
-            )
+    ended = sorted((one for one in (base, *found) if not one.error), key=rank)
+    names = {id(one): one.variant.name + (" *" if one is best else "") for one in ended}
+    rows = [
+        (
+            names[id(one)],
+            one.level,
+            shown(one.gained(base), "+.1f"),
+            shown(one.misfit, ".2g"),
+            shown(one.validation_error, ".3g"),
+            one.unknowns,
         )
-    columns = ("variant", "verdict", "log evidence", "misfit / noise", "validation RMSE")
-    title = "Variants (* recommended; log evidence relative to the case)"
-    tables = [Table(title, (*columns, "unknowns", "overlaps", *labels), rows)]
-    more = [
-        (one.variant.name, label, _interval(known), known.unit)
         for one in ended
-        for label, known in one.estimates.items()
-        if label not in labels
     ]
-    if more:
-        tables.append(Table("Other unknowns", ("variant", "unknown", "95 %", "unit"), more))
+    columns = ("variant", "verdict", "evidence", "/ noise", "validation", "unknowns")
+    tables = [Table("Variants (* recommended)", columns, rows)]
+    labels = dict.fromkeys(label for one in (base, *ended) for label in one.estimates)
+    each, apart = list[tuple[str, ...]](), {id(one): one.apart(base) for one in ended}
+    for label in labels:
+        for one in ended:
+            if (known := one.estimates.get(label)) is not None:
+                named = f"{label} [{known.unit}]" if known.unit else label
+                mark = "apart" if label in apart[id(one)] else ""
+                each.append((named, names[id(one)], *_interval(known), mark))
+    if each:
+        tables.append(Table("Estimates", ("unknown", "variant", "value", "95 %", ""), each))
     failed = [(one.variant.name, one.error) for one in found if one.error]
     if failed:
         tables.append(Table("Variants that failed", ("variant", "reason"), failed))
@@ -242,14 +237,12 @@ def _draw(runs: Sequence[VariantRun], best: VariantRun, target: Path) -> None:
     drawn.savefig(target)
 
 
-def _interval(known: LastEstimate | None) -> str:
-    """Return an estimate with its interval as text, a dash where there is none."""
-    if known is None:
-        return "–"
+def _interval(known: LastEstimate) -> tuple[str, str]:
+    """Return an estimate and its interval as text, a dash where there is none."""
+    value = digits(known.value, known.std)[0]
     if not math.isfinite(known.high - known.low):
-        return digits(known.value, known.std)[0]
-    low, high = (digits(end, known.std)[0] for end in (known.low, known.high))
-    return f"{digits(known.value, known.std)[0]} ({low} to {high})"
+        return value, "–"
+    return value, " to ".join(digits(end, known.std)[0] for end in (known.low, known.high))
 
 
 def _check_target(target: Path, case: Path, force: bool) -> None:
