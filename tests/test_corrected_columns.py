@@ -71,6 +71,24 @@ def test_a_factor_corrects_a_scale(tmp_path):
     np.testing.assert_allclose(found[list(plain.columns)], plain, rtol=1e-12)
 
 
+def test_a_factor_turns_the_sign_of_readings_but_not_of_their_noise(tmp_path):
+    plain = read(short_rod(tmp_path / "plain", ROWS))
+
+    def turned(table: pd.DataFrame) -> None:
+        table["T_10"] *= -1.0
+        table["s"] = 0.1
+
+    path = changed(tmp_path / "turned", turned)
+    settings = {"channels.T_10.factor": -1, "channels.T_10.noise_column": "s"}
+    found = read(path, **settings)
+    np.testing.assert_allclose(found[list(plain.columns)], plain, rtol=1e-12)
+    table = cases.load(path, settings=settings).prepare().raw
+    assert table is not None
+    assert (table.values[:, table.names.index("noise of T_10")] == 0.1).all()
+    with pytest.raises(CaseError, match=r"channels\.T_10\.factor: got 0"):
+        cases.load(path, settings={"channels.T_10.factor": 0})
+
+
 def test_a_source_that_goes_on_has_no_late_columns(tmp_path):
     path = short_rod(tmp_path, ROWS)
     case = cases.load(path, settings={"channels.T_10.late": "5 s"})

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from commands import call
 from scipy.integrate import quad
 from scipy.special import erfc, erfcx, exp1
 from skfem import ElementQuad1, MeshQuad
@@ -118,6 +119,30 @@ Ss = {{ prior = 1e-4, std = 3e-4, transform = "log" }}
 Q = {{ role = "input", column = "Q" }}
 {sensors}""")
     return load(case, settings={key.replace("__", "."): value for key, value in settings.items()})
+
+
+@pytest.mark.slow
+def test_readings_that_move_against_the_prior_are_named(tmp_path: Path):
+    """Heads fall where the drawdown of the model rises."""
+    case = pumped(tmp_path).path
+    code, output = call("check", case, "--set", "data.t0=0")
+    assert code == 0
+    assert "Readings, and their prediction at the prior" in output
+    assert "Check the sign" not in output
+    table = pd.read_csv(tmp_path / "test.csv")
+    table[["h30", "h60", "h120"]] *= -1.0
+    table.to_csv(tmp_path / "test.csv", index=False)
+    code, output = call("check", case, "--set", "data.t0=0")
+    assert code == 0
+    assert "h30, h60, h120: the readings fall where the prior predicts a rise" in output
+    # A run names the rate, which turns all of them, where its steps do not fail.
+    settings = {"data.t0": 0.0, "law.noise": 0.02}
+    prepared = load(case, settings=settings).prepare()
+    verdict = prepared.identifier.run(prepared.stream).last.verdict
+    assert verdict.level == "do not trust"
+    (misfit,) = (one for one in verdict.findings if one.what == "misfit")
+    assert misfit.causes[0].text == "Q may have the opposite sign"
+    assert misfit.causes[0].setting == "channels.Q.factor=-1"
 
 
 LEAKY = {"unknowns__leakance": {"prior": 1e-9, "std": 2e-9, "transform": "log"}}

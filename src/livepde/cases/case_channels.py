@@ -55,7 +55,7 @@ def columns_of(case: CaseContent) -> dict[str, Column]:
             raise case.error(key, "the gradient law does not weight readings: leave it out.")
         if noise in case.spec.channels:
             raise case.error(key, f"another channel is called '{noise}': rename it.")
-        found[noise] = Column((channel.noise_column,), factor, decimal=decimal, noise_of=name)
+        found[noise] = Column((channel.noise_column,), abs(factor), decimal=decimal, noise_of=name)
     return found
 
 

@@ -106,6 +106,21 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
     return replace(found, last=_told(late, linear, last).unknowns)
 
 
+def predicted(prepared: Prepared, samples: Iterable[Sample]) -> tuple[Array, Array]:
+    """Return the first readings, and what the prior predicts of them, shapes (samples, sensors)."""
+    law = SensitivityLaw(
+        modes=1, noise=1.0, refit=None, guards=None, shadows=None, gate=np.inf, verdict=False
+    )
+    who = replace(prepared, assimilate_from=np.inf).identifier_with(law)
+    names, read, apart = who.observed.names, list[Array](), list[Array]()
+    for sample in islice(samples, MOST_SAMPLES):
+        given = by_name(sample.z, ())
+        read.append(np.array([given.get(name, np.nan) for name in names], dtype=float))
+        apart.append(who.step(sample.t, sample.z, sample.inputs).innovation)
+    measured = np.array(read).reshape(-1, len(names))
+    return measured, measured - np.array(apart).reshape(measured.shape)
+
+
 def _told(prepared: Prepared, linear: SensitivityLaw, samples: Iterable[Sample]) -> Preview:
     """Return the posterior after the first of some samples, linearised at the prior."""
     identifier, model = prepared.identifier_with(linear), prepared.case.model

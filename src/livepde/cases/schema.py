@@ -29,6 +29,7 @@ from livepde.cases.values import (
     Instant,
     Name,
     NonNegativeInt,
+    NonzeroFloat,
     Number,
     Pair,
     Point,
@@ -328,7 +329,7 @@ class ChannelSpec(Spec):
     noise: Quantity | None = None
     noise_column: Name | None = None
     unit: str | None = None
-    factor: PositiveFloat | None = None
+    factor: NonzeroFloat | None = None
     late: Quantity | None = None
     offset: Quantity | None = None
     gain: PositiveFloat | None = None

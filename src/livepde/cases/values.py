@@ -121,6 +121,15 @@ def _flat(value: Any) -> Any:
 Quantity: TypeAlias = Annotated[float | str, BeforeValidator(_quantity)]
 Number: TypeAlias = Annotated[float, BeforeValidator(_number)]
 PositiveFloat: TypeAlias = Annotated[Number, Field(gt=0)]
+
+
+def _nonzero(value: float) -> float:
+    if not value:
+        raise ValueError("got 0; expected another number")
+    return value
+
+
+NonzeroFloat: TypeAlias = Annotated[Number, AfterValidator(_nonzero)]
 PositiveInt: TypeAlias = Annotated[int, Field(gt=0), BeforeValidator(_number)]
 NonNegativeInt: TypeAlias = Annotated[int, Field(ge=0), BeforeValidator(_number)]
 Pair: TypeAlias = tuple[Quantity, Quantity]

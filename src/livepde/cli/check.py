@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from livepde.cases import Case, Prepared
 from livepde.cases.data import policy_of, source_text
-from livepde.cases.preview import MOST_SAMPLES, advise, preview
+from livepde.cases.preview import MOST_SAMPLES, advise, predicted, preview
 from livepde.cli.options import CaseArgument, CodeOption, DataOption, SetOption, load_case
 from livepde.cli.printing import CHECK_FAILED, extent, print_table, terminal
 from livepde.runs import Table, sampling_findings
@@ -25,6 +25,8 @@ from livepde.streams.oddities import sentinels, switches
 from livepde.verdict.sentences import LONGER_DATA
 
 MOST_CHANNELS = 40  # rows of the table of channels
+FEWEST = 10  # readings that show how a sensor moves
+OPPOSITE = -0.9  # correlation with the prediction of readings that move the other way
 
 
 def check(
@@ -57,6 +59,7 @@ def check(
         *_sentinels(loaded, samples),
         *_sampling(prepared, samples),
         *_switching(loaded, samples),
+        *_show_predicted(console, prepared),
         *_show_preview(console, prepared),
     ]
     if advised:
@@ -128,6 +131,34 @@ def _switching(case: Case, samples: DataTable) -> list[str]:
         if "between" not in channel.model_fields_set
         and switches(samples.t, samples.values[:, samples.names.index(name)])
     ]
+
+
+def _show_predicted(console: Console, prepared: Prepared) -> list[str]:
+    """Print the readings beside their prediction at the prior; return which move against it."""
+    measured, prior = predicted(prepared, prepared.stream)
+    against: list[str] = []
+    rows: list[tuple[str, ...]] = []
+    for name, own, other in zip(prepared.case.sensors, measured.T, prior.T, strict=True):
+        there = np.isfinite(own) & np.isfinite(other)
+        if not there.any():
+            continue
+        ends = (f"{one[there].min():.4g} to {one[there].max():.4g}" for one in (own, other))
+        rows.append((name, *ends, prepared.case.unit(name)))
+        moves = there.sum() >= FEWEST and min(np.ptp(own[there]), np.ptp(other[there])) > 0.0
+        if moves and np.corrcoef(own[there], other[there])[0, 1] < OPPOSITE:
+            against.append(name)
+    if rows:
+        title = "Readings, and their prediction at the prior"
+        print_table(
+            console, Table(title, ("sensor", "readings", "prior", "unit"), rows[:MOST_CHANNELS])
+        )
+    if not against:
+        return []
+    text = (
+        f"{', '.join(against)}: the readings fall where the prior predicts a rise, or rise where it"
+    )
+    text += " predicts a fall."
+    return [f"{text} Check the sign of these columns and of the inputs: `factor = -1` turns it."]
 
 
 def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:

@@ -22,7 +22,6 @@ from livepde.cases.read import filled, parse, read_text
 from livepde.cases.variants import (
     AS_STATED,
     MOST,
-    LastEstimate,
     Variant,
     VariantRun,
     conclusions,
@@ -46,7 +45,7 @@ from livepde.errors import ConfigurationError, RunError
 from livepde.plots.style import figure_class
 from livepde.progress import watched
 from livepde.runs import Table
-from livepde.runs.summary import digits, shown
+from livepde.runs.summary import digits, interval, shown
 
 WIDE = 3  # panels beside each other
 
@@ -206,7 +205,8 @@ def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> 
             if (known := one.estimates.get(label)) is not None:
                 named = f"{label} [{known.unit}]" if known.unit else label
                 mark = "apart" if label in apart[id(one)] else ""
-                each.append((named, names[id(one)], *_interval(known), mark))
+                value, ends = digits(known.value, known.std)[0], (known.low, known.high)
+                each.append((named, names[id(one)], value, interval(*ends, known.std), mark))
     if each:
         tables.append(Table("Estimates", ("unknown", "variant", "value", "95 %", ""), each))
     failed = [(one.variant.name, one.error) for one in found if one.error]
@@ -235,14 +235,6 @@ def _draw(runs: Sequence[VariantRun], best: VariantRun, target: Path) -> None:
     for ax in axes[len(labels) :]:
         ax.set_visible(False)
     drawn.savefig(target)
-
-
-def _interval(known: LastEstimate) -> tuple[str, str]:
-    """Return an estimate and its interval as text, a dash where there is none."""
-    value = digits(known.value, known.std)[0]
-    if not math.isfinite(known.high - known.low):
-        return value, "–"
-    return value, " to ".join(digits(end, known.std)[0] for end in (known.low, known.high))
 
 
 def _check_target(target: Path, case: Path, force: bool) -> None:

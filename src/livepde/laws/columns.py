@@ -36,7 +36,7 @@ from livepde.verdict import Cause, channel_setting
 from livepde.verdict.directions import boundary_lifts
 from livepde.verdict.sentences import LIKELY, amount_of, estimating, table_of
 
-FEWEST_ROWS = 40
+FEWEST_ROWS, FEWEST_READINGS = 20, 40
 MOST_WORK = 4e8  # coefficients of states that all passes may compute
 PASSES = 6  # over the samples that a fit may take
 ROUNDS = 4  # fits of an error whose size changes from one to the next
@@ -78,6 +78,7 @@ UNITS: tuple[Unit, ...] = (
     Unit("degC", "degF", 1.8, 32.0),
     Unit("K", "degC", 1.0, -273.15),
     Unit("degC", "K", 1.0, 273.15),
+    Unit("", "", -1.0, 0.0),  # counted in the other direction
     *(
         Unit("", "", power, 0.0, times)
         for times in (10.0, 100.0, 1000.0, 60.0, 3600.0, 3.6)
@@ -146,9 +147,11 @@ class Columns:
         if most < FEWEST_ROWS:
             return "the mesh is too large, or the columns are too many, to try each"
         rows = min(log.shape[1], most)
+        log = log[:, :rows].copy()
+        if np.isfinite(log[0, :, 1 : 1 + len(names)]).sum() < FEWEST_READINGS:
+            return f"fewer than {FEWEST_READINGS} readings are stored"
         if rows < FEWEST_ROWS:
             return f"fewer than {FEWEST_ROWS} samples are stored"
-        log = log[:, :rows].copy()
         own = log[0][:, 1 + len(names) : first]
         own[:] = np.where(np.isnan(own), work.filter.noise, own)
         open_gate = replace(work.options, gate=Gate())
@@ -199,7 +202,7 @@ class Columns:
             factor, constant = error.correction
             values = factor * values + constant
             if names[0] not in self.inputs:  # else readings that shrink to nothing would fit best
-                log[0][:, at[0] + len(self.work.filter.noise)] *= factor
+                log[0][:, at[0] + len(self.work.filter.noise)] *= abs(factor)
         log[0][:, at] = values
         return changed(self.state, log=log, start=self._start(log, names))
 
@@ -640,6 +643,8 @@ def _cause(columns: Columns, error: Error, share: float) -> Cause:
         case "unit" if unit_of.name:
             values |= {"unit": unit_of.name, "expected": unit_of.expected}
             values["table"] = table_of(first)
+        case "unit" if factor < 0.0:
+            kind, values["table"] = "sign", table_of(first)
         case "unit":
             kind, large = "factor", factor < 1.0
             values |= {"factor": unit_of.times, "side": "large" if large else "small"}

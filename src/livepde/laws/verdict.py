@@ -162,13 +162,18 @@ def with_discretisation(verdict: Verdict, shadows: ShadowSet | None, s: ShadowSt
 
 def with_columns(verdict: Verdict, columns: Columns | str) -> Verdict:
     """Return a verdict that names the columns of the data which explain a misfit."""
-    if verdict.level in ("trusted", NOT_JUDGED):
+    if verdict.level == "trusted" or not (verdict.judged or _doubted(verdict)):
         return verdict
     if isinstance(columns, str):
         return verdict.with_untested(f"errors of single columns: {columns}")
     # Slow noise is a misfit, too, of which a column may explain a part by chance.
     known = any(finding.what == "misfit" for finding in verdict.findings)
     return verdict.with_causes(likely_columns(columns, 0.0 if known else LARGE))
+
+
+def _doubted(verdict: Verdict) -> bool:
+    """Whether something speaks against a run."""
+    return any(finding.severity != "note" for finding in verdict.findings)
 
 
 def with_errors(verdict: Verdict, work: SensitivityWork, state: SensitivityState) -> Verdict:

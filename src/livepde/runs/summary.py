@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 LAYERS, SURFACES = "wall_layers", "surface_resistance"
 MOST_ROWS = 40
 DIGITS = 15  # of a number
+FINEST = 1000.0  # widths of an interval over its last digit but one
+MOST = 10.0  # times its value that an error is shown as a share
 TOTALS = ("rmse", "innovation_ratio", "jumps", "failed_steps")  # numbers of a run as a whole
 ROLES = ("assimilated", "validation")  # of channels, of which there are totals, too
 IGNORED = "ignored"  # role of channels that are shown and count in no total
@@ -203,10 +205,12 @@ def jumps(data: xr.Dataset) -> list[Jump]:
     return found
 
 
-def _interval(low: float, high: float, std: float) -> str:
-    if not math.isfinite(std) or math.isnan(low):
+def interval(low: float, high: float, std: float) -> str:
+    """Return an interval as text, a dash where it or the standard deviation is not known."""
+    if not math.isfinite(std + high - low):
         return "–"
-    return f"{digits(low, std)[0]} to {digits(high, std)[0]}"
+    size = max(std, (high - low) / FINEST)
+    return f"{digits(low, size)[0]} to {digits(high, size)[0]}"
 
 
 def measures(data: xr.Dataset) -> dict[str, float]:
@@ -286,11 +290,13 @@ def _estimates(data: xr.Dataset, labels: Sequence[str]) -> Table:
     for label, row in known.iterrows():
         value, deviation = digits(row["value"], row["std"])
         plain, allowed = (
-            _interval(row[f"{kind}low"], row[f"{kind}high"], row["std"]) for kind in ("", "model_")
+            interval(row[f"{kind}low"], row[f"{kind}high"], row["std"]) for kind in ("", "model_")
         )
         # The wider interval comes first. The plain one tells the standard deviation, too.
-        zero = row["model_low"] <= 0.0 <= row["model_high"]  # relative to it an error says nothing
-        wide = (allowed, "–" if zero else in_percent(row["effect"])) if differ else (deviation,)
+        # Relative to zero an error says nothing.
+        zero = row["model_low"] <= 0.0 <= row["model_high"]
+        off = in_percent(row["effect"]) if not zero and row["effect"] < MOST else "–"
+        wide = (allowed, off) if differ else (deviation,)
         rows.append((label, value, *wide, plain, row["unit"]))
         if "reference" in row:
             error = shown(100 * row["error"], ".2g", " %")
@@ -317,9 +323,8 @@ def _wall(data: xr.Dataset) -> Table:
             (f"U, {surfaces}", found.U, found.relative_U, "W/(m^2 K)"),
         ):
             std = value * relative
-            ends = (value * math.exp(sign * NORMAL_95 * relative) for sign in (-1.0, 1.0))
-            interval = " to ".join(digits(end, std)[0] for end in ends)
-            rows.append((name, *digits(value, std), interval, unit))
+            low, high = (value * math.exp(sign * NORMAL_95 * relative) for sign in (-1.0, 1.0))
+            rows.append((name, *digits(value, std), interval(low, high, std), unit))
     columns = ("quantity", "value", "± std. dev.", "95 %", "unit")
     return Table("Wall: R = sum of thickness/k, U = 1/(R + surfaces)", columns, rows)
 

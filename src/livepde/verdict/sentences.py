@@ -331,6 +331,10 @@ LIKELY: dict[str, Sentence] = {
         "{name} may be {factor:g} times too {side}, as in another unit",
         "Check the unit of {name}. To correct it, add `factor = {correction}` to {table}.",
     ),
+    "sign": Sentence(
+        "{name} may have the opposite sign",
+        "Check the direction in which {name} counts. To turn it, add `factor = -1` to {table}.",
+    ),
     "exchange": Sentence(
         "the columns {name} and {other} may be exchanged",
         "Exchange the columns {name} and {other}.",
