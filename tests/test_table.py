@@ -14,6 +14,7 @@ import pytest
 
 from livepde.errors import DataError, SampleError, TimeOrderError
 from livepde.streams import Clock, Column, DataTable, Follow, JsonLines, read_csv, read_json_lines
+from livepde.streams.csvfile import header_of, how_written
 from livepde.streams.intake import Intake
 
 COLUMNS = {"T": Column(("a",)), "mean": Column(("a", "b"), factor=2.0, offset=1.0)}
@@ -130,6 +131,31 @@ def test_a_separator_at_the_end_of_a_row_shifts_no_column(csv, text, follow):
         found = [[float(row[name]) for name in ("t", "a", "b")] for row in rows]
     else:
         table = read_csv(path, {"T": Column(("a",)), "S": Column(("b",))}, Clock("t"))
+        found = np.column_stack([table.t, table.values]).tolist()
+    assert found == [[0.0, 1.0, 2.0], [1.0, 3.0, 4.0]]
+
+
+@pytest.mark.parametrize("follow", [False, True])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t a b\n0 1 2\n1 3 4\n",
+        "  t a   b\n 0  1  2\n# stopped\n 1 3  4 \n\n",
+        "# t, a, b\n0 1 2\n1 3 4\n",
+        "# t a b\n0 1 2\n1 3 4\n",
+    ],
+)
+def test_columns_with_blanks_between_them(csv, text, follow):
+    path = csv(text)
+    assert how_written(path).separator == " "
+    assert header_of(path, " ", "utf-8", 0) == ["t", "a", "b"]
+    if follow:
+        with closing(Follow(path, separator=" ")) as source:
+            rows = [row.values for row in source.poll(0.0)]
+        found = [[float(row[name]) for name in ("t", "a", "b")] for row in rows]
+    else:
+        columns = {"T": Column(("a",)), "S": Column(("b",))}
+        table = read_csv(path, columns, Clock("t"), separator=" ")
         found = np.column_stack([table.t, table.values]).tolist()
     assert found == [[0.0, 1.0, 2.0], [1.0, 3.0, 4.0]]
 

@@ -32,6 +32,7 @@ T = TypeVar("T")
 
 UTF_8 = "utf-8-sig"  # with or without a mark at the start, as Excel writes it
 SEPARATORS = ("\t", ";", ",")  # in the order in which they are tried
+BLANK = " "  # a separator that stands for any number of blanks
 END = "end"  # of a file that is read
 LOOK = 100_000  # characters that are looked at to say how a file is written
 TOA5 = "TOA5"  # first cell of the title line of loggers by Campbell
@@ -126,6 +127,28 @@ def read_csv(
     )
 
 
+def rows_of(lines: Iterable[str], separator: str, *, headed: bool = False) -> Iterator[list[str]]:
+    """Iterate over the rows of a text, as lists of their fields; `headed`: below their header.
+
+    >>> list(rows_of(["# time (d), head (m)", " 0.1  -0.040", "# end"], " "))
+    [['time (d)', 'head (m)'], ['0.1', '-0.040'], ['# end']]
+    """
+    if separator != BLANK:
+        yield from csv.reader(lines, delimiter=separator, skipinitialspace=True)
+        return
+    for line in lines:
+        text = line.strip()
+        if not text.startswith("#"):
+            yield text.split()
+        elif headed:
+            yield [text]
+        else:  # a header that is a comment, whose names may have commas between them
+            names = text.lstrip("# ")
+            mark = next((mark for mark in SEPARATORS if mark in names), None)
+            yield [name.strip() for name in names.split(mark)]
+        headed = headed or bool(text)
+
+
 def is_title(cells: Sequence[str]) -> bool:
     """Return whether a first line is the title that some loggers write above the header."""
     return bool(cells) and cells[0].strip() == TOA5
@@ -170,7 +193,7 @@ def header_of(path: Path, separator: str, encoding: str, skip: int) -> list[str]
     _check_text(path)
     try:
         with path.open(newline="", encoding=encoding) as file:
-            rows = csv.reader(islice(file, skip, None), delimiter=separator, skipinitialspace=True)
+            rows = rows_of(islice(file, skip, None), separator)
             return next(below_title(filter(None, rows), list), [])
     except (OSError, UnicodeError, csv.Error) as error:
         raise DataError(f"{path} cannot be read as a CSV file: {error}.") from error
@@ -233,7 +256,7 @@ def how_written(path: str | Path, encoding: str = "", skip: int | None = None) -
     separator = _separator(lines[skip or 0 :])
     if skip is None:
         skip = _titles(lines, separator)
-    found = csv.reader(lines[skip:], delimiter=separator, skipinitialspace=True)
+    found = rows_of(lines[skip:], separator)
     header, *rows = [*below_title(filter(None, found), list)] or [[]]
     cells = [cell for row in rows for cell in row]
     decimal = "," if any(map(has_decimal_comma, cells)) else "."
@@ -261,14 +284,17 @@ def _separator(lines: Sequence[str]) -> str:
     for mark in SEPARATORS:
         if max(multimode(line.count(mark) for line in lines if line.strip()), default=0):
             return mark
-    return ","
+    numbers = [len(line.split()) for line in lines if _all_numbers(line.split())]
+    return BLANK if 2 * len(numbers) > len(lines) and min(numbers) > 1 else ","
+
+
+def _all_numbers(cells: Sequence[str]) -> bool:
+    return bool(cells) and all(number_of(cell.replace(",", "."), ".") is not None for cell in cells)
 
 
 def _titles(lines: Sequence[str], separator: str) -> int:
     """Return how many lines at the start have fewer cells than most, and are no header."""
-    rows = [
-        next(csv.reader([line], delimiter=separator, skipinitialspace=True), []) for line in lines
-    ]
+    rows = [next(rows_of([line], separator), []) for line in lines]
     widths = list(map(_width, rows))
     # A title has fewer cells than most lines; of equally frequent widths the smaller one counts.
     usual = min(multimode(found for found in widths if found), default=0)
@@ -331,7 +357,7 @@ def _cells(
     """
     with path.open(newline="", encoding=encoding) as file:
         whole = chain(islice(file, skip, None), [f"{END}\n"])
-        lines = csv.reader(whole, delimiter=separator, skipinitialspace=True)
+        lines = rows_of(whole, separator)
         written = (one for one in _whole(lines, skip + 1) if one[1])
         numbered = below_title(written, itemgetter(1))
         _, header = next(numbered, (0, []))

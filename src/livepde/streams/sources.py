@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from livepde.errors import DataError
-from livepde.streams.csvfile import UNDER, UTF_8, are_labels, is_title, too_wide
+from livepde.streams.csvfile import UNDER, UTF_8, are_labels, is_title, rows_of, too_wide
 from livepde.streams.growing_file import LONGEST, UTF_16, FilePosition, GrowingFile, Line
 from livepde.streams.table import JSON_LINES, no_file
 
@@ -263,7 +263,7 @@ class Follow(RowSource):
             return json_row(content, token)
         try:
             text = content.decode(self._encoding)
-            found = csv.reader([text], delimiter=self._separator, skipinitialspace=True)
+            found = rows_of([text], self._separator, headed=self._header is not None)
             cells = [cell.strip() for cell in next(found, [""])]
         except (UnicodeError, csv.Error) as error:
             self._labels = 0  # rows have begun
