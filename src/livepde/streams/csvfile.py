@@ -284,8 +284,9 @@ def _separator(lines: Sequence[str]) -> str:
     for mark in SEPARATORS:
         if max(multimode(line.count(mark) for line in lines if line.strip()), default=0):
             return mark
-    numbers = [len(line.split()) for line in lines if _all_numbers(line.split())]
-    return BLANK if 2 * len(numbers) > len(lines) and min(numbers) > 1 else ","
+    rows = [line.split() for line in lines if line.strip() and not line.startswith("#")]
+    numbers = [len(row) for row in rows if _all_numbers(row)]
+    return BLANK if 2 * len(numbers) > len(rows) and min(numbers) > 1 else ","
 
 
 def _all_numbers(cells: Sequence[str]) -> bool:
