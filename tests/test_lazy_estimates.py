@@ -134,7 +134,7 @@ def test_numbers_of_a_record_are_those_of_the_estimate(unknown, law):
         for (label, (value, std)), share in zip(estimate.parameters.items(), left, strict=True):
             ends = interval_ends(label, space.unknown_of(label), value, std)
             wanted += [value, std, *map(float, ends.values()), float(share)]
-        np.testing.assert_array_equal(readout(estimate.belief), wanted)
+        np.testing.assert_array_equal(readout([estimate.belief])[0], wanted)
 
 
 @pytest.mark.long

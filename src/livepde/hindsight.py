@@ -86,7 +86,7 @@ class Hindsight:
             known = problem.physical(belief)
             for k, (_, t, status) in estimates:
                 keeps = k % result.fields_every == 0 or k == count - 1
-                yield result._record(self._estimate(result, t, known, status), keeps)
+                yield from result._records([(self._estimate(result, t, known, status), keeps)])
 
     @staticmethod
     def _estimate(result: Result, t: float, belief: Belief, status: Status) -> Estimate:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,37 +19,40 @@ from livepde.verdict import FLAT, Finding, at_bound, flat
 
 LEVEL = 0.95
 
-Ends: TypeAlias = Callable[[float, float], tuple[float, ...]]
-
 
 class ScalarReadout:
     """Numbers of the scalar unknowns, in the order of `Layout.numbers`.
 
-    The arithmetic equals that of `Belief` and of `Scalar.interval` to the last bit; quantities that
-    do not change between samples are computed once.
+    The arithmetic equals that of `Belief` and of `Scalar.interval` to the last bit; the ends of
+    intervals are computed for many beliefs at once, since a call costs more than its numbers.
     """
 
     def __init__(self, space: FunctionSpace) -> None:
         rows = list(space.labels.values())
         consecutive = bool(rows) and rows == list(range(rows[0], rows[0] + len(rows)))
         self._rows: Any = slice(rows[0], rows[-1] + 1) if consecutive else rows
-        self._ends = [_ends(space.unknown_of(label)) for label in space.labels]
+        self._unknowns = [space.unknown_of(label) for label in space.labels]
         self._prior: tuple[Array | None, list[float]] = (None, [])
 
-    def __call__(self, belief: Belief) -> list[float]:
-        """Return (value, standard deviation, interval ends, share left) of all, concatenated."""
-        if not self._ends:
-            return []
-        values = belief.q[self._rows].tolist()
-        deviations, shares = self._deviations(belief)
-        found: list[float] = []
-        for value, std, ends, share in zip(values, deviations, self._ends, shares, strict=True):
-            found += (value, std, *ends(value, std), share)
-        return found
+    def __call__(self, beliefs: Sequence[Belief]) -> Array:
+        """Return value, standard deviation, interval ends and share left of all, for each belief.
+
+        Concatenated, shape (beliefs, numbers).
+        """
+        if not (self._unknowns and beliefs):
+            return np.empty((len(beliefs), 0))
+        read = [(belief.q[self._rows], *self._deviations(belief)) for belief in beliefs]
+        columns: list[Array] = []
+        # A row for each unknown, in one piece: NumPy may round strided numbers otherwise.
+        rows = (np.array(part).T.copy() for part in zip(*read, strict=True))
+        for unknown, value, std, share in zip(self._unknowns, *rows, strict=True):
+            ends = () if unknown.prior.symmetric else unknown.interval(value, std, LEVEL)
+            columns += (value, std, *ends, share)
+        return np.stack(columns, axis=1)
 
     def _deviations(self, belief: Belief) -> tuple[list[float], list[float]]:
         """Return standard deviations, and their ratios to those of the prior."""
-        factor, nothing = belief.q_factor, [math.nan] * len(self._ends)
+        factor, nothing = belief.q_factor, [math.nan] * len(self._unknowns)
         if factor is None:
             return nothing, nothing
         # Rows of a column-major matrix would be summed in another order, with other rounding.
@@ -72,27 +75,6 @@ class ScalarReadout:
         before = np.linalg.norm(prior[self._rows], axis=1)
         found: list[float] = np.where(before > 0.0, before, np.nan).tolist()
         return found
-
-
-def _ends(unknown: Any) -> Ends:
-    """Return the function from value and standard deviation to interval ends; () if symmetric."""
-    if unknown.prior.symmetric:
-        return lambda value, std: ()
-    if not isinstance(unknown.prior, Normal):
-        return lambda value, std: tuple(map(float, unknown.interval(value, std, LEVEL)))
-    from statistics import NormalDist
-
-    quantile = NormalDist().inv_cdf(0.5 + 0.5 * LEVEL)
-    lower, upper = map(float, unknown.prior.bounds)
-
-    def clipped(value: float, std: float) -> tuple[float, float]:
-        if not math.isfinite(value + quantile * std):
-            low, high = unknown.interval(value, std, LEVEL)
-            return float(low), float(high)
-        low, high = value - quantile * std, value + quantile * std
-        return min(max(low, lower), upper), min(max(high, lower), upper)
-
-    return clipped
 
 
 @dataclass(frozen=True, eq=False)

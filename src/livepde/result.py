@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -384,7 +384,7 @@ class Result(Shown):
 
     def add(self, estimate: Estimate) -> None:
         """Add one estimate."""
-        self.records.append(self._record(estimate, self._keeps))
+        self.records.append(*self._records([(estimate, self._keeps)]))
         self._follow(estimate)
 
     def _announce(self, estimate: Estimate) -> bool:
@@ -409,18 +409,20 @@ class Result(Shown):
         if estimate is not self.last:
             self.last, self._settled = estimate, estimate.belief
 
-    def _record(self, estimate: Estimate, keeps: bool) -> Record:
-        """Return the record of an estimate; `keeps`: with its fields."""
-        return Record(
-            t=estimate.t,
-            numbers=np.array(self._readout(estimate.belief)),
-            innovation=estimate.innovation,
-            validation_error=estimate.validation_error,
-            status=STATUS_CODES.index(estimate.status.code),
-            steps=estimate.steps,
-            notes=estimate.diagnostics.named(),
-            snapshot=self._snapshot(estimate) if keeps else None,
-        )
+    def _records(self, estimates: Sequence[tuple[Estimate, bool]]) -> Iterator[Record]:
+        """Iterate over the records of estimates, each with whether its fields are kept."""
+        numbers = self._readout([estimate.belief for estimate, _ in estimates])
+        for (estimate, keeps), row in zip(estimates, numbers, strict=True):
+            yield Record(
+                t=estimate.t,
+                numbers=row,
+                innovation=estimate.innovation,
+                validation_error=estimate.validation_error,
+                status=STATUS_CODES.index(estimate.status.code),
+                steps=estimate.steps,
+                notes=estimate.diagnostics.named(),
+                snapshot=self._snapshot(estimate) if keeps else None,
+            )
 
     def _snapshot(self, estimate: Estimate) -> Snapshot:
         """Return the fields at the vertices."""
@@ -646,7 +648,7 @@ class Result(Shown):
             snapshot = (
                 None if records.last_snapshot < len(records) - 1 else self._snapshot(self.last)
             )
-            records = records.with_last(np.array(self._readout(self._settled)), snapshot)
+            records = records.with_last(self._readout([self._settled])[0], snapshot)
         if self.last is not None and records.last_snapshot < len(records) - 1:
             # The last fields are part of the dataset, also where `fields_every` has left them out.
             last = self._snapshot(self.last)

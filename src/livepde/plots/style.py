@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -30,6 +31,7 @@ GREY = "#7f7f7f"
 MOST_POINTS = 20_000
 # Width and height of a panel in inches.
 PANEL = (5.4, 3.4)
+DPI = 120
 
 
 def prior_left(data: xr.Dataset, label: str, k: int = -1) -> float:
@@ -202,6 +204,17 @@ def empty(rows: int, columns: int, title: str) -> Figure:
     if title:
         drawn.suptitle(title)
     return drawn
+
+
+def png(drawn: Figure) -> bytes:
+    """Return a figure as an image; `Figure.savefig` would draw it twice, once for its layout."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    image = io.BytesIO()
+    drawn.set_dpi(DPI)
+    canvas: Any = FigureCanvasAgg(drawn)  # has no types
+    canvas.print_png(image)
+    return image.getvalue()
 
 
 def panel(ax: Axes | None) -> Axes:

@@ -35,6 +35,7 @@ from livepde.dates import with_epoch, without_epoch
 from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import RunError
 from livepde.identifier import Identifier
+from livepde.plots.style import png
 from livepde.runs.database import DAMAGE
 from livepde.runs.journal import Journal
 from livepde.runs.run_verdict import verdict, verdict_table
@@ -502,9 +503,7 @@ def drawn_into(folder: Path, figures: Mapping[str, FigureFactory], notes: list[s
         file = f"{name}.png"
 
         def saved(draw: FigureFactory = draw, file: str = file) -> bool:
-            image = io.BytesIO()
-            draw().savefig(image, format="png", dpi=120)
-            write_bytes(folder / file, image.getvalue())
+            write_bytes(folder / file, png(draw()))
             return True
 
         if attempted(f"The figure '{name}'", saved, False, notes):

@@ -409,12 +409,12 @@ class Live:
 
     def _record(self) -> None:
         """Store the estimates of the group."""
-        before, self.busy = self.busy, True
+        group, before, self.busy = [*self._unread], self.busy, True
         try:
-            while self._unread:
-                number, estimate, keeps = self._unread[0]
-                self.journal.append(self.result._record(estimate, keeps), number)
-                self._unread.popleft()
+            records = self.result._records([(estimate, keeps) for _, estimate, keeps in group])
+            for (number, *_), record in zip(group, records, strict=True):
+                self.journal.append(record, number)
+            self._unread.clear()
         finally:
             self.busy = before
 
