@@ -97,6 +97,19 @@ def test_the_program_finds_the_fault_from_a_case_and_from_a_run(biased):
         assert best["level"] == "trusted"
 
 
+@pytest.mark.slow
+def test_a_better_case_is_run_with_the_data_of_the_comparison(biased):
+    other = biased.parent / "rod.csv"
+    other = other.rename(other.with_name("other.csv"))
+    written = biased.parent / "better.toml"
+    options = ("--data", other, "--variant", FREED, "--write", written, "--jobs", "1", "--json")
+    code, output = call("compare", biased, *options)
+    assert code == 0
+    assert json.loads(output)["notes"][-1] == (
+        f"Wrote {written}: livepde run {written} --data {other}"
+    )
+
+
 @pytest.mark.long
 def test_variants_in_processes_are_those_of_this_process(biased):
     options = ["--variant", FREED, "--json", "--jobs"]
