@@ -36,9 +36,9 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str
     """Return blocks of members that can be stepped together, and the reasons why others cannot.
 
     Their cases differ only in data, initial state and descriptions; their samples have the same
-    times.
+    times and channels.
     """
-    groups: dict[tuple[str, float, bytes], dict[str, Prepared]] = {}
+    groups: dict[tuple[str, float, bytes, tuple[str, ...]], dict[str, Prepared]] = {}
     settings: dict[Case, str] = {}
     apart: dict[str, str] = {}
     for name, one in members.items():
@@ -54,7 +54,9 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str
             settings[one.case] = one.case.spec.model_dump_json(
                 exclude={**dict.fromkeys(TOLD, True), **unread}
             )
-        key = settings[one.case], one.assimilate_from, one.stream.t.tobytes()
+        # Tables of late channels, or with the noise of readings, differ in the order of channels.
+        table = one.stream
+        key = settings[one.case], one.assimilate_from, table.t.tobytes(), table.names
         groups.setdefault(key, {})[name] = one
     found = []
     for group in groups.values():
