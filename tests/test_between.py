@@ -353,12 +353,14 @@ def test_a_row_without_a_needed_sensor_keeps_its_switch() -> None:
 
 def test_what_held_before_the_start_of_the_data_holds_in_each_kind_of_source() -> None:
     rows = [{"t": 0.0, "h": 7.0, "a": 0.0}, *({"t": float(k), "a": float(k)} for k in range(1, 6))]
-    columns, clock = {"a": Column(("a",)), "h": Column(("h",), between="hold")}, Clock("t", start=3)
+    rows.append({"t": 6.0, "h": 9.0, "a": 6.0})  # after the stop, while the first samples wait
+    columns = {"a": Column(("a",)), "h": Column(("h",), between="hold")}
+    clock = Clock("t", start=3, stop=5)
     known = {n: [one.get(n, NAN) for one in rows] for n in ("a", "h")}
     table = tabulated([one["t"] for one in rows], known, columns, clock)
     lines = [*JsonLines([json.dumps(one) for one in rows], columns, clock)]
     habits = {"h": Habit(0.0, None, False, False, "hold")}
-    sink = Intake(columns, clock, Policy(channels=habits))
+    sink = Intake(columns, clock, Policy(wait=9.0, channels=habits))
     outcomes = [sink.take(one, one["t"]) for one in rows] + [sink.flush()]
     live = [one for outcome in outcomes for one in outcome.ready]
     np.testing.assert_array_equal(table.t, [3.0, 4.0, 5.0])

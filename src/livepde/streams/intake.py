@@ -251,9 +251,10 @@ class Intake:
             found.remark("malformed", "", str(error), token)
             return None
         values, remarks = self._values(row, token)
-        if times is None:
+        if math.isinf(times[0]):
             found.remark("outside", "", "not between start and stop", token)
-            self._hold_first(values)
+            if times[0] < 0.0:
+                self._hold_first(values)
             return None
         if not values:
             found.remarks += remarks or [Remark("malformed", "", NO_VALUE, row=token)]
@@ -458,16 +459,17 @@ class Intake:
             values[channel] = value
         return values, found.remarks
 
-    def _time(self, row: Mapping[str, Any]) -> tuple[float, float] | None:
-        """Return the time of a row, and how much later the clocks show it again; None: outside.
+    def _time(self, row: Mapping[str, Any]) -> tuple[float, float]:
+        """Return the time of a row, and how much later the clocks show it again.
 
-        It is the model time once t = 0 is known, else seconds since 1970 if times are dates.
+        It is the model time once t = 0 is known, else seconds since 1970 if times are dates; -inf
+        before start, inf after stop.
         """
         stated, dates = row_time(row, self.clock, before=self.dates)
         t = stated + self.policy.shift
         low, high = self.clock.bounds(dates, "data")
         if not low <= t <= high:
-            return None
+            return (-math.inf if t < low else math.inf), 0.0
         if self.dates not in (None, dates):
             was, is_now = ("number", "date") if dates else ("date", "number")
             raise SampleError(f"the time is a {is_now}; it was a {was} before")
