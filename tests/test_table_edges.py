@@ -14,6 +14,7 @@ from factories import short_rod
 import livepde as lp
 from livepde import cases
 from livepde.cases.case import Prepared
+from livepde.cases.live_case import LiveCase
 from livepde.cases.measured import measured
 from livepde.cases.new_case import channels_in
 from livepde.cases.remedies import after_gaps, start_missed, with_settings
@@ -21,6 +22,7 @@ from livepde.cli.check import _refused
 from livepde.errors import CaseError, DataError, SampleError, TimeOrderError
 from livepde.models import EQUATIONS, heat
 from livepde.runs import input_findings
+from livepde.streams import DataTable
 from livepde.verdict import Cause, Finding, Verdict
 
 ROWS = 61
@@ -82,6 +84,19 @@ def test_a_long_gap_of_an_input_is_the_first_to_be_mended(tmp_path, rows, said, 
     both = after_gaps(Verdict.of([refused, note]), [note])
     shown = next(one for one in both.findings if one.what == "refused")
     assert shown.remedy.startswith(note.remedy or "Check them.")
+
+
+def test_a_replay_of_complete_data_has_the_samples_of_the_batch_run(tmp_path):
+    settings: dict[str, Any] = {"data.every": 2, "law.refit": False, "law.verdict": False}
+    found = changed(tmp_path, without("T_left", slice(20, 26)), **settings)
+    assert isinstance(found.stream, DataTable)
+    with LiveCase(found.case) as wiring:
+        run = wiring.live()
+        assert run is not None
+        run.run()
+        taken = [[one.values[name] for name in found.stream.names] for one in run.journal.taken()]
+        assert dict(run.journal.counts) == dict(found.stream.remarks)
+    np.testing.assert_array_equal(taken, found.stream.values)
 
 
 def test_the_clock_of_one_of_several_files_is_corrected_before_they_are_joined(tmp_path):
