@@ -22,6 +22,7 @@ from livepde.cli.check import _refused
 from livepde.errors import CaseError, DataError, SampleError, TimeOrderError
 from livepde.models import EQUATIONS, heat
 from livepde.runs import input_findings
+from livepde.samples import by_name
 from livepde.streams import DataTable
 from livepde.verdict import Cause, Finding, Verdict
 
@@ -57,6 +58,17 @@ def test_a_run_begins_where_all_inputs_have_a_value(tmp_path):
     (note,) = noted(found)
     assert "20 rows at the start, before its first value, were left out" in note.text
     assert any("T_left: the first 20 rows have no value" in text for text in _refused(found))
+
+
+@pytest.mark.parametrize(("between", "value"), [("hold", 7.0), ("line", 8.0)])
+def test_a_run_begins_with_what_earlier_rows_state_of_other_inputs(tmp_path, between, value):
+    def change(table: pd.DataFrame) -> None:
+        table.loc[:3, "T_left"] = np.nan
+        table.loc[3:5, "T_right"] = [7.0, np.nan, 9.0]
+
+    found = changed(tmp_path, change, **{"channels.T_right.between": between})
+    assert by_name(found.first.z, ())["T_right"] == pytest.approx(value, abs=0.6)
+    assert found.identifier.step(found.first.t, found.first.z).status.ok
 
 
 def test_an_input_without_any_value_is_refused_in_terms_of_the_case(tmp_path):

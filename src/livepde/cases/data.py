@@ -242,7 +242,7 @@ def without_wild_start(case: CaseContent, table: DataTable) -> DataTable:
     begin = int(np.flatnonzero(lacking)[-1]) + 1 if lacking.any() else 0
     counts = zip(table.names, wild.sum(axis=0).tolist(), strict=True)
     remarks = {**table.remarks, **{(START, name): n for name, n in counts if n}}
-    return replace(table, t=table.t[begin:], values=values[begin:], remarks=remarks)
+    return _from_row(case, replace(table, values=values, remarks=remarks), begin)
 
 
 def wild_start(
@@ -296,19 +296,28 @@ def _from_first_inputs(case: CaseContent, table: DataTable) -> DataTable:
         if first := int(known[:, k].argmax()):
             remarks[BEGIN, name] = first
             begin = max(begin, first)
-    if not begin:
-        return table
-    return replace(table, t=table.t[begin:], values=table.values[begin:], remarks=remarks)
+    return _from_row(case, replace(table, remarks=remarks), begin)
+
+
+def _from_row(case: CaseContent, table: DataTable, begin: int) -> DataTable:
+    """Return a record from a row on, with what the rows before it state of inputs that hold."""
+    values, channels = table.values[begin:].copy(), case.spec.channels
+    for k, name in enumerate(table.names if begin else ()):
+        stated = table.values[: begin + 1, k]
+        stated = stated[np.isfinite(stated)]
+        if len(stated) and name in channels and channels[name].between == "hold":
+            values[0, k] = stated[-1]
+    return replace(table, t=table.t[begin:], values=values)
 
 
 def without_gaps(case: CaseContent, table: DataTable) -> DataTable:
     """Return a finished record without gaps and spikes of the channels that drive the model."""
-    table = _from_first_inputs(case, without_wild_start(case, table))
-    channels = case.spec.channels
-    interpolated = [name for name, item in channels.items() if item.gaps == "interpolate"]
-    means = [name for name in interpolated if channels[name].between == "next"]
+    table, channels = without_wild_start(case, table), case.spec.channels
+    # Of an input without which rows are left out, only rows that state another input remain.
+    filled = [n for n, item in channels.items() if item.drives and item.gaps != "hold"]
+    means = [name for name in filled if channels[name].between == "next"]
     screened = [name for name, item in channels.items() if item.screened]
-    return fill_table(table, interpolated, screened, means=means)
+    return _from_first_inputs(case, fill_table(table, filled, screened, means=means))
 
 
 def reader_of(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Any:
