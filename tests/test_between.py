@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import deque
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -349,6 +350,28 @@ def test_a_row_without_a_needed_sensor_keeps_its_switch() -> None:
     assert dict(table.remarks) == {("skipped", "a"): 3}
     late = tabulated(t, {"a": a, "h": h}, needed, Clock("t", start=2.5))
     np.testing.assert_array_equal(late.values[:, 1], [7.0, NAN])  # as it was before the start
+
+
+def test_a_value_that_is_repeated_keeps_no_row_without_a_needed_channel() -> None:
+    columns = {
+        "s": Column(("s",)),
+        "a": Column(("a",), needed=True),
+        "h": Column(("h",), between="hold"),
+    }
+    t = np.arange(6.0)
+    known = {"s": t, "a": [1.0, NAN, NAN, NAN, 1.0, 1.0], "h": [5.0, 5.0, 5.0, 7.0, 7.0, 7.0]}
+    expected = [0.0, 3.0, 4.0, 5.0]
+    assert tabulated(t, known, columns, CLOCK).t.tolist() == expected
+    rows = [{"t": s} | {n: x[k] for n, x in known.items()} for k, s in enumerate(t.tolist())]
+    lines = [json.dumps(row).replace("NaN", "null") for row in rows]
+    assert [one.t for one in JsonLines(lines, columns, CLOCK)] == expected
+    sink = Intake(columns, CLOCK, Policy(channels={"h": Habit(0.0, None, False, False, "hold")}))
+    outcomes = [sink.take(row, row["t"]) for row in rows] + [sink.flush()]
+    assert [one.t for outcome in outcomes for one in outcome.ready] == expected
+    parts = [{n: replace(columns[n], needed=False)} for n in columns]
+    tables = [tabulated(t, known, part, CLOCK) for part in parts]
+    joined = join_tables(tables, 1.0, ["s"], ["a"], "data", {"h": "hold"}, together=True)
+    assert joined.t.tolist() == expected
 
 
 def test_what_held_before_the_start_of_the_data_holds_in_each_kind_of_source() -> None:

@@ -535,7 +535,8 @@ class Intake:
             found.remark("skipped", needed[0], text, sample.tokens[-1])
             sample.values = self._held(sample.values)
             self._hold_first(sample.values)
-            if not (self._recent and sample.values):
+            news = any(self._is_news(channel, value) for channel, value in sample.values.items())
+            if not (self._recent and news):
                 found.spent += sample.tokens
                 return
         self._before.clear()
@@ -552,12 +553,21 @@ class Intake:
                 self._accepted.popleft()
 
     def _held(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Return what a sample that is left out states of inputs that are held."""
+        """Return what a sample that is left out states of inputs."""
+        habits = {channel: self.policy.habit(channel) for channel in values}
         return {
             channel: value
             for channel, value in values.items()
-            if self.policy.habit(channel).between != "line" and not math.isnan(value)
+            if (habits[channel].between != "line" or habits[channel].interpolated)
+            and not math.isnan(value)
         }
+
+    def _is_news(self, channel: str, value: float) -> bool:
+        """Return whether a value of an input is a mean, or not the one that holds already."""
+        if (between := self.policy.habit(channel).between) != "hold":
+            return between == "next"
+        before = (one.get(channel, NAN) for _, one in reversed(self._recent))
+        return value != next(filter(math.isfinite, before), NAN)
 
     def _hold_first(self, values: Mapping[str, float]) -> None:
         """Remember values of rows before the first sample that hold until the next reading."""
