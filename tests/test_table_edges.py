@@ -133,6 +133,27 @@ def test_the_clock_of_one_of_several_files_is_corrected_before_they_are_joined(t
         np.testing.assert_allclose(found.values[:, columns], plain.values)
 
 
+@pytest.mark.parametrize("dated", [False, True])
+def test_what_is_late_is_read_until_the_stop(tmp_path, dated):
+    def change(table: pd.DataFrame) -> None:
+        if dated:
+            dates = pd.Timestamp("2025-03-01") + pd.to_timedelta(table["time_s"], unit="s")
+            table["time_s"] = dates.dt.strftime("%Y-%m-%d %H:%M:%S")
+
+    stop: Any = "2025-03-01 00:05" if dated else 300
+    late = {f"channels.{name}.late": "20 s" for name in ("T_left", "T_10")}
+    given = {**late, "channels.T_left.spikes": "keep", "data.stop": stop}
+    found, plain = changed(tmp_path / "late", change, **given), changed(tmp_path, lambda _: None)
+    table, raw = found.stream, plain.raw
+    assert isinstance(table, DataTable)
+    assert raw is not None
+    assert table.t[-1] == 300.0
+    assert not table.remarks.keys() & {("missing", "T_left"), ("ended", "T_left")}
+    for name in ("T_left", "T_10"):
+        shown = raw.values[raw.t == 320.0, raw.names.index(name)]
+        assert table.values[-1, table.names.index(name)] == shown
+
+
 def test_a_start_that_the_first_readings_miss_is_named(tmp_path):
     prepared = changed(tmp_path, lambda table: None, initial="90 degC")
     doubted = Verdict.of([Finding("misfit", "caution", "It misfits.")])

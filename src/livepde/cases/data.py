@@ -65,6 +65,8 @@ LATE = (
     "late requires complete data. For a live source, delay the other channels at the source, or "
     "correct the clock."
 )
+SAME = 1e-9  # of the length of a record: times that differ by less are one moment
+MOMENT = 1e-6  # seconds, to which dates are rounded
 LEAP = "30 d"  # after a longer pause a second row has to confirm the time
 Data: TypeAlias = str | Iterable[str] | RowSource | None  # a file, lines of JSON, or the case's own
 
@@ -90,6 +92,7 @@ def clock_of(case: CaseContent, data: DataSpec | None = None) -> Clock:
         format=data.time_format,
         decimal=data.decimal,
         hour="".join(data.times[1:]),
+        margin=max([0.0, *delays(case).values()]),
     )
 
 
@@ -117,7 +120,7 @@ def read_data(case: CaseContent, source: str | Iterable[str] | None) -> DataTabl
             tables = [_read(path, columns, clock, spec)]
     tables = _on_time(case, columns, tables)
     if len(tables) == 1:
-        return tables[0]
+        return _until_stop(case, clock, tables[0])
     from livepde.streams.join import join_tables
 
     needed = [name for name, column in columns.items() if column.needed]
@@ -128,7 +131,21 @@ def read_data(case: CaseContent, source: str | Iterable[str] | None) -> DataTabl
     profile = isinstance(initial, InitialSpec) and initial.start in INTERPOLATED
     together = profile or bool(delays(case))
     sensors, where = case.roles(*SENSORS), case.where("data.file")
-    return join_tables(tables, clock.second, sensors, needed, where, between, together=together)
+    joined = join_tables(tables, clock.second, sensors, needed, where, between, together=together)
+    return _until_stop(case, clock, joined)
+
+
+def _until_stop(case: CaseContent, clock: Clock, table: DataTable) -> DataTable:
+    """Return the rows of a table until stop, once the times of its channels are corrected."""
+    if not clock.margin:
+        return table
+    dates, first = table.origin is not None, 0.0
+    slack = SAME * float(np.ptp(table.t))
+    if table.origin is not None:
+        first, slack = since_1970(table.origin) * clock.second, slack + MOMENT * clock.second
+    _, high = clock.bounds(dates, case.where("data"))
+    end = np.searchsorted(table.t + first, high - clock.margin + slack, "right")
+    return replace(table, t=table.t[:end], values=table.values[:end])
 
 
 def _on_time(
