@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import deque
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -351,14 +352,38 @@ def test_a_row_without_a_needed_sensor_keeps_its_switch() -> None:
     np.testing.assert_array_equal(late.values[:, 1], [7.0, NAN])  # as it was before the start
 
 
+def test_a_value_that_is_repeated_keeps_no_row_without_a_needed_channel() -> None:
+    columns = {
+        "s": Column(("s",)),
+        "a": Column(("a",), needed=True),
+        "h": Column(("h",), between="hold"),
+    }
+    t = np.arange(6.0)
+    known = {"s": t, "a": [1.0, NAN, NAN, NAN, 1.0, 1.0], "h": [5.0, 5.0, 5.0, 7.0, 7.0, 7.0]}
+    expected = [0.0, 3.0, 4.0, 5.0]
+    assert tabulated(t, known, columns, CLOCK).t.tolist() == expected
+    rows = [{"t": s} | {n: x[k] for n, x in known.items()} for k, s in enumerate(t.tolist())]
+    lines = [json.dumps(row).replace("NaN", "null") for row in rows]
+    assert [one.t for one in JsonLines(lines, columns, CLOCK)] == expected
+    sink = Intake(columns, CLOCK, Policy(channels={"h": Habit(0.0, None, False, False, "hold")}))
+    outcomes = [sink.take(row, row["t"]) for row in rows] + [sink.flush()]
+    assert [one.t for outcome in outcomes for one in outcome.ready] == expected
+    parts = [{n: replace(columns[n], needed=False)} for n in columns]
+    tables = [tabulated(t, known, part, CLOCK) for part in parts]
+    joined = join_tables(tables, 1.0, ["s"], ["a"], "data", {"h": "hold"}, together=True)
+    assert joined.t.tolist() == expected
+
+
 def test_what_held_before_the_start_of_the_data_holds_in_each_kind_of_source() -> None:
     rows = [{"t": 0.0, "h": 7.0, "a": 0.0}, *({"t": float(k), "a": float(k)} for k in range(1, 6))]
-    columns, clock = {"a": Column(("a",)), "h": Column(("h",), between="hold")}, Clock("t", start=3)
+    rows.append({"t": 6.0, "h": 9.0, "a": 6.0})  # after the stop, while the first samples wait
+    columns = {"a": Column(("a",)), "h": Column(("h",), between="hold")}
+    clock = Clock("t", start=3, stop=5)
     known = {n: [one.get(n, NAN) for one in rows] for n in ("a", "h")}
     table = tabulated([one["t"] for one in rows], known, columns, clock)
     lines = [*JsonLines([json.dumps(one) for one in rows], columns, clock)]
     habits = {"h": Habit(0.0, None, False, False, "hold")}
-    sink = Intake(columns, clock, Policy(channels=habits))
+    sink = Intake(columns, clock, Policy(wait=9.0, channels=habits))
     outcomes = [sink.take(one, one["t"]) for one in rows] + [sink.flush()]
     live = [one for outcome in outcomes for one in outcome.ready]
     np.testing.assert_array_equal(table.t, [3.0, 4.0, 5.0])

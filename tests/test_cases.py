@@ -725,6 +725,15 @@ def test_unknowns_that_move(rod, evolution, expected):
     assert 0 < preview(prepared, prepared.stream).unknowns[0].left < 1
 
 
+def test_numbers_are_in_the_unit_that_an_unknown_states(rod):
+    numbers = {"unit": "cm^2/s", "prior": 0.5, "std": 0.3, "bounds": [0.01, 10.0]}
+    numbers["evolution"] = {"kind": "random-walk", "rate": 0.01}
+    case = cases.load(rod(), settings={"unknowns.alpha": numbers, "reference.alpha": 0.97})
+    unknown = case.model.parameter_space.unknowns["alpha"]
+    assert unknown.evolution.rate == pytest.approx(1e-6)
+    assert case.references == {"alpha": pytest.approx(9.7e-5)}
+
+
 @pytest.mark.slow
 def test_positive_unknowns(rod):
     path = rod(('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', 'transform = "log"'))

@@ -520,6 +520,18 @@ def test_what_is_finished_is_not_run_again(alike, monkeypatch):
     assert "other settings" in output
 
 
+@pytest.mark.parametrize(("key", "value"), [("late", "20 s"), ("noise_column", "T_right")])
+def test_members_whose_tables_have_other_channels_step_apart(here, key, value):
+    """Their columns have another order, and were read as those of the first member."""
+    case, names = Path("rod/case.toml"), ("T_10", "T_30")
+    settings = [{f"channels.{name}.{key}": value} for name in names]
+    members = {k: cases.load(case, settings=one).prepare() for k, one in enumerate(settings)}
+    assert len({one.stream.names for one in members.values()}) == 2
+    together, apart = member_blocks.blocks(members)
+    assert not together
+    assert list(apart) == [0, 1]
+
+
 @pytest.mark.long
 def test_says_why_members_are_run_separately(alike):
     Path("rods.csv").write_text(

@@ -15,7 +15,7 @@ from factories import short_rod
 
 from benchmarks.first_hour import FOLDER
 from livepde import cases
-from livepde.cases.read import parse
+from livepde.cases.read import apply, filled, parse, read_toml
 from livepde.cases.remedies import NO_SETTING, freed, with_settings
 from livepde.cases.variants import (
     LastEstimate,
@@ -97,6 +97,19 @@ def test_the_program_finds_the_fault_from_a_case_and_from_a_run(biased):
         assert best["level"] == "trusted"
 
 
+@pytest.mark.slow
+def test_a_better_case_is_run_with_the_data_of_the_comparison(biased):
+    other = biased.parent / "rod.csv"
+    other = other.rename(other.with_name("other.csv"))
+    written = biased.parent / "better.toml"
+    options = ("--data", other, "--variant", FREED, "--write", written, "--jobs", "1", "--json")
+    code, output = call("compare", biased, *options)
+    assert code == 0
+    assert json.loads(output)["notes"][-1] == (
+        f"Wrote {written}: livepde run {written} --data {other}"
+    )
+
+
 @pytest.mark.long
 def test_variants_in_processes_are_those_of_this_process(biased):
     options = ["--variant", FREED, "--json", "--jobs"]
@@ -130,6 +143,14 @@ def test_what_cannot_be_compared_or_written_is_refused_before_a_run(biased, tmp_
 
 
 # --- variants -----------------------------------------------------------------------------------
+
+
+def test_a_plain_value_is_written_as_the_table_that_a_key_of_it_makes(tmp_path):
+    case = short_rod(tmp_path, 5)
+    given = {"initial.std": "0.5 K", "initial.length": "10 cm"}
+    text = case.read_text()
+    assert read_toml(text, "")["initial"] == "interpolate"
+    assert read_toml(filled(text, given, ""), "") == apply(read_toml(text, ""), given, "")
 
 
 def test_a_variant_has_a_name_and_settings():

@@ -205,11 +205,14 @@ def unjudged_readings(*, spoiled: bool) -> list[str]:
 
 
 @cache
-def decayed(deviation: float) -> list[str]:
+def decayed(deviation: float, *, in_python: bool = False) -> list[str]:
     """Return the findings on a decay four times as fast as its prior, of some width."""
     far = [np.exp(-2.0 * (k + 1) * 0.1) for k in range(40)]
     unknown = lp.LogNormal(0.5, deviation)
-    return of_data(latent.run(latent.decay(unknown), latent.stream(far)).to_xarray())
+    result = latent.run(latent.decay(unknown), latent.stream(far))
+    if in_python:
+        return [one.what for one in result.verdict.findings]
+    return of_data(result.to_xarray())
 
 
 @cache
@@ -330,6 +333,9 @@ RUNS = {
         partial(unjudged_readings, spoiled=True), partial(unjudged_readings, spoiled=False)
     ),
     "run_verdict: held": Pair(partial(decayed, 0.01), partial(decayed, 0.5)),
+    "findings: held": Pair(
+        partial(decayed, 0.01, in_python=True), partial(decayed, 0.5, in_python=True)
+    ),
     "run_verdict: left out": Pair(
         lambda: of_data(modes.ran(4).to_xarray()), lambda: of_data(modes.ran(41).to_xarray())
     ),

@@ -659,7 +659,7 @@ def test_health_and_metrics(tmp_path):
         "status": "ok",
         "replaying": "",
         "counts": [["conflict", "a", 1], ["conflict", "b", 1], ["conflict", "left", 1]],
-        "verdict": "not judged",
+        "verdict": "do not trust",  # k is held at ten prior standard deviations
     }
     value = run.result.last.parameters["k"][0]
     assert f'livepde_estimate{{unknown="k"}} {value!r}' in ask("/metrics")
@@ -671,7 +671,7 @@ def test_health_and_metrics(tmp_path):
     assert 'livepde_unknown_info{unit="",unknown="k"} 1.0' in told
     (stamp,) = re.findall("^livepde_last_sample_timestamp_seconds (.*)$", told, re.MULTILINE)
     assert 0.0 <= time.time() - float(stamp) < PATIENCE
-    assert "livepde_verdict -1.0" in told
+    assert "livepde_verdict 2.0" in told
     assert "livepde_silent 0.0" in told
     assert f"livepde_step_seconds_total {run.health['seconds']!r}" in told
     assert ask("/livez") == ask("/readyz") == "ok\n"

@@ -14,6 +14,7 @@ from factories import short_rod
 import livepde as lp
 from livepde import cases
 from livepde.cases.case import Prepared
+from livepde.cases.live_case import LiveCase
 from livepde.cases.measured import measured
 from livepde.cases.new_case import channels_in
 from livepde.cases.remedies import after_gaps, start_missed, with_settings
@@ -21,6 +22,8 @@ from livepde.cli.check import _refused
 from livepde.errors import CaseError, DataError, SampleError, TimeOrderError
 from livepde.models import EQUATIONS, heat
 from livepde.runs import input_findings
+from livepde.samples import by_name
+from livepde.streams import DataTable
 from livepde.verdict import Cause, Finding, Verdict
 
 ROWS = 61
@@ -57,6 +60,17 @@ def test_a_run_begins_where_all_inputs_have_a_value(tmp_path):
     assert any("T_left: the first 20 rows have no value" in text for text in _refused(found))
 
 
+@pytest.mark.parametrize(("between", "value"), [("hold", 7.0), ("line", 8.0)])
+def test_a_run_begins_with_what_earlier_rows_state_of_other_inputs(tmp_path, between, value):
+    def change(table: pd.DataFrame) -> None:
+        table.loc[:3, "T_left"] = np.nan
+        table.loc[3:5, "T_right"] = [7.0, np.nan, 9.0]
+
+    found = changed(tmp_path, change, **{"channels.T_right.between": between})
+    assert by_name(found.first.z, ())["T_right"] == pytest.approx(value, abs=0.6)
+    assert found.identifier.step(found.first.t, found.first.z).status.ok
+
+
 def test_an_input_without_any_value_is_refused_in_terms_of_the_case(tmp_path):
     with pytest.raises(CaseError, match=r"channels\.T_left: its column has no value"):
         changed(tmp_path, without("T_left", slice(None)))
@@ -84,6 +98,19 @@ def test_a_long_gap_of_an_input_is_the_first_to_be_mended(tmp_path, rows, said, 
     assert shown.remedy.startswith(note.remedy or "Check them.")
 
 
+def test_a_replay_of_complete_data_has_the_samples_of_the_batch_run(tmp_path):
+    settings: dict[str, Any] = {"data.every": 2, "law.refit": False, "law.verdict": False}
+    found = changed(tmp_path, without("T_left", slice(20, 26)), **settings)
+    assert isinstance(found.stream, DataTable)
+    with LiveCase(found.case) as wiring:
+        run = wiring.live()
+        assert run is not None
+        run.run()
+        taken = [[one.values[name] for name in found.stream.names] for one in run.journal.taken()]
+        assert dict(run.journal.counts) == dict(found.stream.remarks)
+    np.testing.assert_array_equal(taken, found.stream.values)
+
+
 def test_the_clock_of_one_of_several_files_is_corrected_before_they_are_joined(tmp_path):
     path = short_rod(tmp_path / "plain", ROWS)
     plain = cases.load(path).prepare().raw
@@ -104,6 +131,27 @@ def test_the_clock_of_one_of_several_files_is_corrected_before_they_are_joined(t
         np.testing.assert_allclose(found.t, plain.t)
         columns = [found.names.index(name) for name in plain.names]
         np.testing.assert_allclose(found.values[:, columns], plain.values)
+
+
+@pytest.mark.parametrize("dated", [False, True])
+def test_what_is_late_is_read_until_the_stop(tmp_path, dated):
+    def change(table: pd.DataFrame) -> None:
+        if dated:
+            dates = pd.Timestamp("2025-03-01") + pd.to_timedelta(table["time_s"], unit="s")
+            table["time_s"] = dates.dt.strftime("%Y-%m-%d %H:%M:%S")
+
+    stop: Any = "2025-03-01 00:05" if dated else 300
+    late = {f"channels.{name}.late": "20 s" for name in ("T_left", "T_10")}
+    given = {**late, "channels.T_left.spikes": "keep", "data.stop": stop}
+    found, plain = changed(tmp_path / "late", change, **given), changed(tmp_path, lambda _: None)
+    table, raw = found.stream, plain.raw
+    assert isinstance(table, DataTable)
+    assert raw is not None
+    assert table.t[-1] == 300.0
+    assert not table.remarks.keys() & {("missing", "T_left"), ("ended", "T_left")}
+    for name in ("T_left", "T_10"):
+        shown = raw.values[raw.t == 320.0, raw.names.index(name)]
+        assert table.values[-1, table.names.index(name)] == shown
 
 
 def test_a_start_that_the_first_readings_miss_is_named(tmp_path):

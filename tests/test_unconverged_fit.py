@@ -7,6 +7,8 @@ import pytest
 from factories import driven_rod, line, readings
 
 import livepde as lp
+from livepde.laws.stored_samples import StoredSamples
+from livepde.stepping.newton import StepFailed
 
 TIMES = np.arange(0.0, 4.05, 0.1)
 
@@ -34,3 +36,15 @@ def test_a_fit_that_did_not_converge_is_not_trusted():
     assert whole.fit.converged
     assert not [item for item in whole.verdict.findings if item.what == "fit"]
     assert whole["a"].median == pytest.approx(np.exp(0.3), rel=0.05)
+
+
+@pytest.mark.slow
+def test_a_last_fit_that_fails_leaves_the_run_with_its_estimates(monkeypatch):
+    def fails(*_: object) -> None:
+        raise StepFailed("singular", "the matrix is singular")
+
+    monkeypatch.setattr(StoredSamples, "log_evidence", fails)
+    found = run(40)
+    assert found.fit is not None
+    assert not found.fit.converged
+    assert found.verdict.level == "do not trust"

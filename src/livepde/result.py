@@ -44,7 +44,7 @@ from livepde.records import (
     Snapshot,
 )
 from livepde.showing import Shown, listed
-from livepde.verdict import Verdict, discretised, held_inputs
+from livepde.verdict import Verdict, at_limit, discretised, held_inputs
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -181,8 +181,10 @@ class Estimate(Shown):
         It is computed on first access, which takes about a millisecond.
         """
         shifts = self.diagnostics.shifts
-        shifted = [*discretised(shifts), *held_inputs(shifts)]
-        return self.judge().with_findings([*known_badly(self.belief, self.space), *shifted])
+        found = [*known_badly(self.belief, self.space), *discretised(shifts), *held_inputs(shifts)]
+        if self.diagnostics.bounded > 0.0:
+            found.append(at_limit())
+        return self.judge().with_findings(found)
 
     @property
     def q(self) -> Array:

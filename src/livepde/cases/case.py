@@ -19,12 +19,19 @@ from livepde import laws
 from livepde.cases import case_channels
 from livepde.cases.case_content import CaseContent, resolve
 from livepde.cases.data import clock_of, read_data, reader_of, time_of, without_gaps
-from livepde.cases.process import conditioned, model_of, process_notes, wall_attributes
+from livepde.cases.process import (
+    conditioned,
+    model_of,
+    process_notes,
+    value_of,
+    wall_attributes,
+)
 from livepde.cases.read import apply, did_you_mean, read_spec, read_text, read_toml
 from livepde.cases.schema import SENSORS, GradientSpec, SensitivitySpec
 from livepde.diagnostics.check_report import Bound, Sense
 from livepde.errors import DataError, LawError
 from livepde.fem import Inputs, Moment
+from livepde.fem.field_blocks import base_name
 from livepde.frames import layout_of
 from livepde.identifier import Identifier
 from livepde.model import Model
@@ -278,8 +285,11 @@ class Case(CaseContent):
                 continue
             text = f"there is no unknown number '{label}'"
             self.require(label, space.labels, "reference", text)
-            unit = space.unknown_of(label).unit
-            found[label] = self.convert(value, unit, f"reference.{label}")
+            key, name = f"reference.{label}", base_name(label)
+            if name in self.spec.unknowns:
+                found[label] = value_of(self, name, value, key)
+            else:
+                found[label] = self.convert(value, space.unknown_of(label).unit, key)
         return found
 
     @property

@@ -64,6 +64,8 @@ LATE = (
     "late requires complete data. For a live source, delay the other channels at the source, or "
     "correct the clock."
 )
+SAME = 1e-9  # of the length of a record: times that differ by less are one moment
+MOMENT = 1e-6  # seconds, to which dates are rounded
 LEAP = "30 d"  # after a longer pause a second row has to confirm the time
 Data: TypeAlias = str | Iterable[str] | RowSource | None  # a file, lines of JSON, or the case's own
 
@@ -89,6 +91,7 @@ def clock_of(case: CaseContent, data: DataSpec | None = None) -> Clock:
         format=data.time_format,
         decimal=data.decimal,
         hour="".join(data.times[1:]),
+        margin=max([0.0, *delays(case).values()]),
     )
 
 
@@ -116,7 +119,7 @@ def read_data(case: CaseContent, source: str | Iterable[str] | None) -> DataTabl
             tables = [_read(path, columns, clock, spec)]
     tables = _on_time(case, columns, tables)
     if len(tables) == 1:
-        return tables[0]
+        return _until_stop(case, clock, tables[0])
     from livepde.streams.join import join_tables
 
     needed = [name for name, column in columns.items() if column.needed]
@@ -125,7 +128,21 @@ def read_data(case: CaseContent, source: str | Iterable[str] | None) -> DataTabl
     # before its start once they are corrected: a stated state is not that of their time.
     together = interpolates(case) or bool(delays(case))
     sensors, where = case.roles(*SENSORS), case.where("data.file")
-    return join_tables(tables, clock.second, sensors, needed, where, between, together=together)
+    joined = join_tables(tables, clock.second, sensors, needed, where, between, together=together)
+    return _until_stop(case, clock, joined)
+
+
+def _until_stop(case: CaseContent, clock: Clock, table: DataTable) -> DataTable:
+    """Return the rows of a table until stop, once the times of its channels are corrected."""
+    if not clock.margin:
+        return table
+    dates, first = table.origin is not None, 0.0
+    slack = SAME * float(np.ptp(table.t))
+    if table.origin is not None:
+        first, slack = since_1970(table.origin) * clock.second, slack + MOMENT * clock.second
+    _, high = clock.bounds(dates, case.where("data"))
+    end = np.searchsorted(table.t + first, high - clock.margin + slack, "right")
+    return replace(table, t=table.t[:end], values=table.values[:end])
 
 
 def _on_time(
@@ -239,7 +256,7 @@ def without_wild_start(case: CaseContent, table: DataTable) -> DataTable:
     begin = int(np.flatnonzero(lacking)[-1]) + 1 if lacking.any() else 0
     counts = zip(table.names, wild.sum(axis=0).tolist(), strict=True)
     remarks = {**table.remarks, **{(START, name): n for name, n in counts if n}}
-    return replace(table, t=table.t[begin:], values=values[begin:], remarks=remarks)
+    return _from_row(case, replace(table, values=values, remarks=remarks), begin)
 
 
 def wild_start(
@@ -293,19 +310,28 @@ def _from_first_inputs(case: CaseContent, table: DataTable) -> DataTable:
         if first := int(known[:, k].argmax()):
             remarks[BEGIN, name] = first
             begin = max(begin, first)
-    if not begin:
-        return table
-    return replace(table, t=table.t[begin:], values=table.values[begin:], remarks=remarks)
+    return _from_row(case, replace(table, remarks=remarks), begin)
+
+
+def _from_row(case: CaseContent, table: DataTable, begin: int) -> DataTable:
+    """Return a record from a row on, with what the rows before it state of inputs that hold."""
+    values, channels = table.values[begin:].copy(), case.spec.channels
+    for k, name in enumerate(table.names if begin else ()):
+        stated = table.values[: begin + 1, k]
+        stated = stated[np.isfinite(stated)]
+        if len(stated) and name in channels and channels[name].between == "hold":
+            values[0, k] = stated[-1]
+    return replace(table, t=table.t[begin:], values=values)
 
 
 def without_gaps(case: CaseContent, table: DataTable) -> DataTable:
     """Return a finished record without gaps and spikes of the channels that drive the model."""
-    table = _from_first_inputs(case, without_wild_start(case, table))
-    channels = case.spec.channels
-    interpolated = [name for name, item in channels.items() if item.gaps == "interpolate"]
-    means = [name for name in interpolated if channels[name].between == "next"]
+    table, channels = without_wild_start(case, table), case.spec.channels
+    # Of an input without which rows are left out, only rows that state another input remain.
+    filled = [n for n, item in channels.items() if item.drives and item.gaps != "hold"]
+    means = [name for name in filled if channels[name].between == "next"]
     screened = [name for name, item in channels.items() if item.screened]
-    return fill_table(table, interpolated, screened, means=means)
+    return _from_first_inputs(case, fill_table(table, filled, screened, means=means))
 
 
 def reader_of(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Any:

@@ -22,7 +22,6 @@ from livepde.cases.data import (
     passwords_of,
     policy_of,
     publishers_of,
-    read_data,
     refuse_late,
     source_of,
     suspect_start,
@@ -273,10 +272,13 @@ class LiveCase:
     def _fed(self, data: Data) -> Feed:
         case, named = self.case, data if isinstance(data, str) else None
         if self._reads_all(data, named):
-            table = read_data(case, named)
-            self._origin = table.origin
-            last = -math.inf if self._journal is None else self._journal.last
-            return SampleFeed(table, after=last)
+            whole = case.read(named)  # its gaps need not wait for the next value
+            self._origin = whole.origin
+            if self._journal is not None:
+                return SampleFeed(whole.stream, after=self._journal.last)
+            counts = getattr(whole.stream, "remarks", {}).items()
+            told = [Remark(kind, of, f"{n} times in these data", n) for (kind, of), n in counts]
+            return SampleFeed(whole.stream, irregular=told)
         refuse_late(case)
         self._intake, position = self._new_intake()
         return Gathered(source_of(case, data, position, self._passwords), self._intake)

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,9 +37,9 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str
     """Return blocks of members that can be stepped together, and the reasons why others cannot.
 
     Their cases differ only in data, initial state and descriptions; their samples have the same
-    times.
+    times and channels.
     """
-    groups: dict[tuple[str, float, float, bytes], dict[str, Prepared]] = {}
+    groups: dict[tuple[Any, ...], dict[str, Prepared]] = {}
     settings: dict[Case, str] = {}
     apart: dict[str, str] = {}
     for name, one in members.items():
@@ -54,7 +55,9 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str
             settings[one.case] = one.case.spec.model_dump_json(
                 exclude={**dict.fromkeys(TOLD, True), **unread}
             )
-        key = settings[one.case], one.assimilate_from, one.t0, one.stream.t.tobytes()
+        # Tables of late channels, or with the noise of readings, differ in the order of channels.
+        table = one.stream
+        key = settings[one.case], one.assimilate_from, one.t0, table.t.tobytes(), table.names
         groups.setdefault(key, {})[name] = one
     found = []
     for group in groups.values():

@@ -131,11 +131,16 @@ def _options_of(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> di
 
 def prior_of(case: CaseContent, name: str) -> float:
     """Return the value of an unknown before the data, in the model's unit."""
-    spec, unit = case.spec.unknowns[name], case.equation.unknowns[name].unit
-    if isinstance(spec.prior, str):
-        return case.convert(spec.prior, unit, f"unknowns.{name}.prior")
-    rule = conversion(spec.unit or unit, unit, case.where(f"unknowns.{name}.unit"))
-    return rule.factor * spec.prior + rule.offset
+    return value_of(case, name, case.spec.unknowns[name].prior, f"unknowns.{name}.prior")
+
+
+def value_of(case: CaseContent, name: str, value: float | str, key: str) -> float:
+    """Return a value of an unknown in the model's unit; a number is in the unit that it states."""
+    unit = case.equation.unknowns[name].unit
+    if isinstance(value, str):
+        return case.convert(value, unit, key)
+    rule = conversion(case.spec.unknowns[name].unit or unit, unit, case.where(key))
+    return rule.factor * value + rule.offset
 
 
 def _prior(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> fem.Prior:
@@ -202,7 +207,10 @@ def _evolution(
         # A rate is a difference, of the logarithm under a transform; "degC" cannot be divided.
         moving = "1" if unknown.transform or not unit else unit.replace("degC", "K")
         per = f"({moving})/({time})**0.5" if time else moving.removeprefix("1")
-        return fem.RandomWalk(case.positive(spec.rate, per, f"{key}.rate"))
+        rate = case.positive(spec.rate, per, f"{key}.rate")
+        if unknown.unit and not unknown.transform and not isinstance(spec.rate, str):
+            rate *= conversion(unknown.unit, unit, case.where(key)).factor
+        return fem.RandomWalk(rate)
     if spec.time is not None:
         return fem.MeanReverting(case.positive(spec.time, time, f"{key}.time"))
     return fem.Periodic(case.positive(spec.period, time, f"{key}.period"), spec.harmonics)

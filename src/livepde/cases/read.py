@@ -456,11 +456,14 @@ def _with(text: str, path: Sequence[str], value: Any) -> str:
     *tables, name = path
     for k, part in enumerate(tables):
         inner = here.get(part, {})
-        if isinstance(inner, InlineTable):  # written anew as a whole, evenly spaced
-            rest = ".".join(map(toml_key, path[k + 1 :]))
-            name, value = part, apply(inner.unwrap(), {rest: value}, "")
+        # Written as a whole, evenly spaced; a plain value is short for a table.
+        if isinstance(inner, InlineTable) or not isinstance(inner, Mapping):
+            whole: Any = apply(document.unwrap(), {".".join(map(toml_key, path)): value}, "")
+            for table in tables[: k + 1]:
+                whole = whole[table]
+            name, value = part, whole
             break
-        if not isinstance(inner, Mapping) or part not in here:
+        if part not in here:
             here[part] = tomlkit.table()
         here = here[part]
     if value is None:

@@ -196,6 +196,9 @@ def run_variant(
         stated = load(path, allow_code=allow_code, settings=every[:1])
         if delays(stated) == delays(prepared.case):
             return found
+        if stated.spec.data.stop is not None:  # after it stand readings that are late
+            ends = every[0], {"data.stop": None}
+            stated = load(path, allow_code=allow_code, settings=ends)
         same = _evidence_of_same(stated.prepare(data), prepared, found)
         return replace(found, same_readings=same)
     except Exception as error:  # noqa: BLE001  whatever it is, it is a row of the table
@@ -226,7 +229,7 @@ def _evidence_of_same(stated: Prepared, late: Prepared, found: VariantRun) -> fl
         apart = since_1970(known.origin) - since_1970(table.origin)
         apart *= clock_of(stated.case).second
     before, after = delays(late.case), delays(stated.case)
-    values = table.values.copy()
+    values, last = table.values.copy(), -math.inf
     for name in found.readings:
         column = known.values[:, known.names.index(name)]
         used = np.isfinite(column) & (known.t >= late.assimilate_from)
@@ -237,9 +240,12 @@ def _evidence_of_same(stated: Prepared, late: Prepared, found: VariantRun) -> fl
         width = SAME * max(float(np.ptp(table.t)), 1.0)
         low, high = known.t[used][0] + shift - width, known.t[used][-1] + shift + width
         values[(table.t < low) | (table.t > high), table.names.index(name)] = np.nan
+        last = max(last, high)
     if np.array_equal(values, table.values, equal_nan=True):
         return None
-    own = _run(Variant(AS_STATED), stated, replace(table, values=values), columns=False)
+    rows = table.t <= last
+    table = replace(table, t=table.t[rows], values=values[rows])
+    own = _run(Variant(AS_STATED), stated, table, columns=False)
     return own.log_evidence if dict(own.readings) == dict(found.readings) else math.nan
 
 

@@ -129,7 +129,8 @@ def compare(
         for each in (settings, best.variant.settings):
             text = filled(text, parse(each), str(case))
         write_bytes(write, text.encode())
-        notes.append(f"Wrote {write}: livepde run {write}")
+        of = "" if data is None else f" --data {data}"  # the case may name other data
+        notes.append(f"Wrote {write}: livepde run {write}{of}")
     if figure is not None and base.estimates:
         _draw([base, *found], best, figure)
         notes.append(f"Wrote {figure}.")

@@ -513,10 +513,16 @@ def settle(
         one = take(state, k)
         if one.log.shape[1] and (one.assimilated[0] or one.opening[0]):
             samples = StoredSamples.of(work, one)
-            found = refitted(samples, options, last=True, screened=int(one.fit.screened[0]))
-            used[k] = None if found is None else found.used
             one = changed(one, fork=Fork.none(one.now))  # this is a refit of more samples
-            each[k] = _after(work, one, samples, found, last=True)
+            try:
+                found = refitted(samples, options, last=True, screened=int(one.fit.screened[0]))
+                each[k] = _after(work, one, samples, found, last=True)
+            except Exception as error:
+                if numerical(error) is None:
+                    raise
+                each[k] = _after(work, one, samples, None, last=True)
+            else:
+                used[k] = None if found is None else found.used
     return put_each(state, each), used
 
 

@@ -158,6 +158,7 @@ class SampleFeed(Feed):
     samples: Iterable[Sample]
     names: Sequence[str] = ()  # sensors whose values an array z holds
     after: float = -math.inf  # time of the last sample taken before; samples up to it are skipped
+    irregular: Sequence[Remark] = ()  # what was found as the samples were read
     done: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
@@ -170,6 +171,10 @@ class SampleFeed(Feed):
                 return [Ready(t=sample.t, values=values)]
         self.done = True
         return []
+
+    def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
+        found, self.irregular = self.irregular, ()
+        return found
 
 
 @dataclass(eq=False)

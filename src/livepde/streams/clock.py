@@ -63,6 +63,8 @@ class Clock:
         Format of dates as text, as "%d.%m.%Y %H:%M"; empty: ISO format.
     decimal
         Decimal mark of numbers as text: "." or ",".
+    margin
+        How much later than stop rows are read, for times that are corrected.
     """
 
     name: str
@@ -74,6 +76,7 @@ class Clock:
     format: str = ""
     decimal: str = "."
     hour: str = ""
+    margin: float = 0.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -90,7 +93,7 @@ class Clock:
             if dates and (next_day := _day_after(self.stop)) is not None:
                 # A day as stop includes its hours: up to the last number before the next day.
                 high = math.nextafter(self._bound(next_day, dates, f"{where}: stop"), low)
-        return low, high
+        return low, high + self.margin
 
     def repeated_hour(self, t: float) -> float:
         """Return how much later the clocks show a time again, given since 1970, or 0."""

@@ -251,9 +251,10 @@ class Intake:
             found.remark("malformed", "", str(error), token)
             return None
         values, remarks = self._values(row, token)
-        if times is None:
+        if math.isinf(times[0]):
             found.remark("outside", "", "not between start and stop", token)
-            self._hold_first(values)
+            if times[0] < 0.0:
+                self._hold_first(values)
             return None
         if not values:
             found.remarks += remarks or [Remark("malformed", "", NO_VALUE, row=token)]
@@ -458,16 +459,17 @@ class Intake:
             values[channel] = value
         return values, found.remarks
 
-    def _time(self, row: Mapping[str, Any]) -> tuple[float, float] | None:
-        """Return the time of a row, and how much later the clocks show it again; None: outside.
+    def _time(self, row: Mapping[str, Any]) -> tuple[float, float]:
+        """Return the time of a row, and how much later the clocks show it again.
 
-        It is the model time once t = 0 is known, else seconds since 1970 if times are dates.
+        It is the model time once t = 0 is known, else seconds since 1970 if times are dates; -inf
+        before start, inf after stop.
         """
         stated, dates = row_time(row, self.clock, before=self.dates)
         t = stated + self.policy.shift
         low, high = self.clock.bounds(dates, "data")
         if not low <= t <= high:
-            return None
+            return (-math.inf if t < low else math.inf), 0.0
         if self.dates not in (None, dates):
             was, is_now = ("number", "date") if dates else ("date", "number")
             raise SampleError(f"the time is a {is_now}; it was a {was} before")
@@ -533,7 +535,8 @@ class Intake:
             found.remark("skipped", needed[0], text, sample.tokens[-1])
             sample.values = self._held(sample.values)
             self._hold_first(sample.values)
-            if not (self._recent and sample.values):
+            news = any(self._is_news(channel, value) for channel, value in sample.values.items())
+            if not (self._recent and news):
                 found.spent += sample.tokens
                 return
         self._before.clear()
@@ -550,12 +553,21 @@ class Intake:
                 self._accepted.popleft()
 
     def _held(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Return what a sample that is left out states of inputs that are held."""
+        """Return what a sample that is left out states of inputs."""
+        habits = {channel: self.policy.habit(channel) for channel in values}
         return {
             channel: value
             for channel, value in values.items()
-            if self.policy.habit(channel).between != "line" and not math.isnan(value)
+            if (habits[channel].between != "line" or habits[channel].interpolated)
+            and not math.isnan(value)
         }
+
+    def _is_news(self, channel: str, value: float) -> bool:
+        """Return whether a value of an input is a mean, or not the one that holds already."""
+        if (between := self.policy.habit(channel).between) != "hold":
+            return between == "next"
+        before = (one.get(channel, NAN) for _, one in reversed(self._recent))
+        return value != next(filter(math.isfinite, before), NAN)
 
     def _hold_first(self, values: Mapping[str, float]) -> None:
         """Remember values of rows before the first sample that hold until the next reading."""

@@ -68,9 +68,12 @@ def join_tables(
     kept = np.isfinite(inputs).all(axis=1)
     if not kept.any():
         raise DataError(f"{where}: no row has all channels that it needs.")
-    # A row that is left out keeps what it states of inputs that are held.
+    # A row that is left out keeps the means that it states, and what changes of inputs that hold.
     held = np.array([behaviour.get(name, "line") != "line" for name in names], dtype=bool)
-    states = known[begin:, held].any(axis=1) & (np.cumsum(kept) > 0) & ~kept
+    means = np.array([behaviour.get(name) == "next" for name in names], dtype=bool)
+    last = joined.ffill().shift().to_numpy()
+    new = known & (means | (joined.to_numpy() != last))
+    states = new[begin:, held].any(axis=1) & (np.cumsum(kept) > 0) & ~kept
     values[begin:][np.ix_(states, ~held)] = np.nan
     kept |= states
     t, values = t[begin:][kept], values[begin:][kept]

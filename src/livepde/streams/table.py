@@ -37,8 +37,9 @@ class Thinned:
     """Every n-th row of a stream, without the loss of a switch or of a share of a mean.
 
     A row that would be left out stays as a row of its held inputs alone where one of them
-    (`between = "hold"`) changes. So does a row that lacks a channel that each sample needs. The
-    reading of a `"next"` channel becomes the mean, weighted by time, since the last row that stays.
+    (`between = "hold"`) changes. So does a row with a `"next"` reading that lacks a channel that
+    each sample needs. Such a reading becomes the mean, weighted by time, since the last row that
+    stays.
 
     `between`: behaviour of each column between two readings.
 
@@ -75,7 +76,7 @@ class Thinned:
         changed = any(math.isfinite(row[k]) and row[k] != self._last[k] for k in self._hold)
         self.remember(row)
         kept = chosen and whole
-        states = chosen and bool(np.isfinite(row[self.held]).any())
+        states = chosen and any(math.isfinite(row[k]) for k in self._means)
         # Before the first row that is kept, values are remembered for it.
         if not (kept or (self._begun and (changed or states))):
             return None

@@ -42,7 +42,7 @@ NAMED = 4  # causes that are kept
 HALF = 0.5  # share of a misfit
 CANDIDATES = 3  # causes that are named where none explains half of a misfit
 GROSS = ("unit", "exchange")  # kinds of causes
-ONCE = ("discretisation", "hold")  # findings on the run as a whole of which there is one at most
+ONCE = ("discretisation", "held", "hold")  # findings on the run as a whole: one each at most
 LARGEST = 1e99  # evidence beyond is written as that
 SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
 DECIDES = 5.0  # the same, from which the interval is little else
@@ -209,6 +209,12 @@ def at_bound(label: str, value: float) -> Finding:
     """Return the finding of an unknown that ends at a bound."""
     text, _ = FINDINGS["bound"].filled(label=label, value=value)
     return Finding("bound", "caution", text, label, value)
+
+
+def at_limit() -> Finding:
+    """Return the finding of unknowns that are held at the allowed distance from the prior."""
+    text, remedy = FINDINGS["held, now"]
+    return Finding("held", "do not trust", text, remedy=remedy)
 
 
 def flat(label: str, left: float) -> Finding:

@@ -104,6 +104,11 @@ FINDINGS: dict[str, Sentence] = {
         "that distance.",
         "Check units, sensors and model. If they are right, the prior is much too narrow.",
     ),
+    "held, now": Sentence(
+        "Unknowns are held at the allowed distance from the prior (`within`, by default 10 prior "
+        "standard deviations).",
+        "Check units, sensors and model. If they are right, the prior is much too narrow.",
+    ),
     "left out": Sentence(
         "{share} of the variance of `{name}` is in details finer than the {count} modes of the "
         "law, which data do not reduce. Its standard deviation (root mean square) is {std}, and "
