@@ -561,4 +561,4 @@ def _calibrated(
         slopes = np.array([q.gain[n] if c.gain is not None else 1.0 for n, c in known])
         return slopes, columns | {f"gain[{name}]": y[k] * units[k] for k, name in gains}
 
-    return observation.Calibrated(base, reading, derivatives, **options)
+    return observation.Calibrated(base, reading, derivatives, adds=not gains, **options)

@@ -41,7 +41,7 @@ class MemberSensors:
 
     @cached_property
     def _read(self) -> RowProduct:
-        return row_product(sp.csr_array(self.problem.observed.G))
+        return row_product(sp.csr_array(self.problem.observed.steady_matrix))
 
     def _seen(self, columns: Array) -> Array:
         """Return G times columns of states, (..., sensors) for (..., n)."""

@@ -179,6 +179,9 @@ class Calibrated(Observation):
         (y, q, x) -> derivatives of the function in the readings y, shape (sensors,), and in
         unknowns, {"gain": shape (sensors,)}; for a function that reads each sensor alone. Default:
         by a complex step, one call for each sensor and each unknown.
+    adds
+        Whether the function adds unknowns to the readings and does nothing else, at any time: laws
+        then need no derivatives in each step.
 
     Examples
     --------
@@ -189,6 +192,7 @@ class Calibrated(Observation):
     base: Observation
     function: Calibration
     derivatives: Callable[[Array, Any, Place], tuple[Array, Mapping[str, Array]]] | None = None
+    adds: bool = False
 
     def __post_init__(self) -> None:
         self._sees_all("give of= to the observations it is made of.")
@@ -272,6 +276,20 @@ class CalibratedObserved(Observed):
         if inner_q is not None:
             H_q += slope @ inner_q
         return sp.csr_array(sp.csr_array(slope) @ inner_u), H_q
+
+    @property
+    def steady_matrix(self) -> sp.csr_array:
+        return self.base.steady_matrix
+
+    def steady_direct(self, moment: Moment) -> Array | None:
+        base = self.base.observation
+        fixed = type(self.base) is Observed and not (base.directs or base.inputs)
+        if not (self.observation.adds and fixed):
+            return None
+        if self._steady_direct is None:
+            zero = np.zeros(self.state.dim)
+            self._steady_direct = self.jacobian(zero, self.parameter.prior, moment)[1]
+        return self._steady_direct
 
     def _slope(self, y: Any, q: Any, moment: Moment) -> Array:
         return np.asarray(np.imag(self._read(y, q, moment)) / STEP)

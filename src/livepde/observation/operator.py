@@ -441,6 +441,11 @@ class Observed:
             self._steady_direct = matrix
         return matrix
 
+    @property
+    def steady_matrix(self) -> sp.csr_array:
+        """Matrix G of sensors for which `steady_direct` returns D, or that have no D."""
+        return self.G
+
     def steady_direct(self, moment: Moment) -> Array | None:
         """Return D if z = G u + D q at all times; None for other sensors, or if there is no D."""
         if type(self) is not Observed or self.observation.inputs:
