@@ -153,23 +153,6 @@ def test_wild_readings_in_a_row_are_told_from_those_beside_them():
     assert near_neighbours(values, 4.0)[[*range(17), *range(23, 40)]].all()
 
 
-@pytest.mark.slow
-def test_a_run_continues_to_the_bit():
-    rows = stream()
-    whole, half = column(PRIORS["far above"]), column(PRIORS["far above"])
-    for t, z in rows[:20]:
-        whole.step(t, z)
-        half.step(t, z)
-    content = half.dump()
-    other = column(PRIORS["far above"])
-    other.restore(content)
-    for t, z in rows[20:]:
-        one, two = whole.step(t, z), other.step(t, z)
-        assert one.parameters == two.parameters
-    assert whole.refit().parameters == other.refit().parameters
-    assert whole.estimate().fit == other.estimate().fit
-
-
 def test_a_refit_on_demand_is_that_of_the_end():
     rows = stream()
     end = column(PRIORS["near"]).run(rows).last

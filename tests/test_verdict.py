@@ -390,25 +390,6 @@ def test_a_census_knows_what_the_unknowns_take_up():
 
 
 @pytest.mark.slow
-def test_a_checkpoint_carries_the_ledger():
-    z = shown() + errors()
-    z[:, 1] += 0.08
-    sensors = lp.Points(PLACES, noise=NOISE)
-
-    def identifier() -> lp.Identifier:
-        return lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0)
-
-    one, other = identifier(), identifier()
-    for k, t in enumerate(TIMES[:101].tolist()):
-        whole = one.step(t, z[k], {"T_left": driven(t)})
-        if k == 70:
-            other.restore(one.dump())
-        if k > 70:
-            resumed = other.step(t, z[k], {"T_left": driven(t)})
-    assert resumed.verdict.to_dict() == whole.verdict.to_dict()
-
-
-@pytest.mark.slow
 def test_validation_sensors_are_judged_against_what_is_predicted():
     clean = shown(places=(0.25, 0.75, 0.5)) + errors()
     z = {"A": clean[:, 0], "C": clean[:, 1], "W": clean[:, 2]}
