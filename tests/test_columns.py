@@ -160,7 +160,7 @@ def test_the_wrong_column_is_named_first(fault: str):
 def test_a_wrong_input_with_noise_is_named_and_the_initial_state_is_made_of_it(change, words):
     """Inputs with noise have no refit: their first samples are kept, to try columns on them."""
     _, columns = bar(1)
-    wrong = {name: values[:120] for name, values in change(columns).items()}
+    wrong = {name: values[:60] for name, values in change(columns).items()}
     first = {name: float(wrong[name][0]) for name in ("TC1", "TC5")}
     weights = {"TC1": lambda x: 1.0 - x[0] / LENGTH, "TC5": lambda x: x[0] / LENGTH}
     parts = {
