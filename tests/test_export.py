@@ -9,7 +9,10 @@ import shutil
 import sys
 import warnings
 from dataclasses import replace
+from functools import cache
 from html.parser import HTMLParser
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import meshio
 import numpy as np
@@ -69,16 +72,25 @@ def journal(path, who, **attrs) -> Journal:
     return Journal.create(path, who.channels, described(who, **attrs))
 
 
+@cache
+def files_of_a_run(kind: str, count: int, attrs: tuple) -> dict[str, bytes]:
+    with TemporaryDirectory() as parent:
+        folder, who = Path(parent) / "run", identifier(kind)
+        command = ["livepde", "run", "rod.toml"]
+        writer = RunWriter.create(folder, version="1.2", command=command, title="A rod")
+        with journal(folder / "journal.sqlite", who, **dict(attrs)) as kept:
+            driven = drive(who, samples(count), journal=kept, fields_every=2)
+            assert driven.error is None
+            data = driven.result.to_xarray()
+        writer.finish(status="finished", dataset=data, shown=tables(data))
+        return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
 def made(folder, kind: str = "line", count: int = SAMPLES, **attrs) -> runs.Run:
     """Return a finished run on a mesh of some kind."""
-    who = identifier(kind)
-    command = ["livepde", "run", "rod.toml"]
-    writer = RunWriter.create(folder, version="1.2", command=command, title="A rod")
-    with journal(folder / "journal.sqlite", who, **attrs) as kept:
-        driven = drive(who, samples(count), journal=kept, fields_every=2)
-        assert driven.error is None
-        data = driven.result.to_xarray()
-    writer.finish(status="finished", dataset=data, shown=tables(data))
+    folder.mkdir()
+    for name, content in files_of_a_run(kind, count, tuple(attrs.items())).items():
+        (folder / name).write_bytes(content)
     return runs.open(folder)
 
 

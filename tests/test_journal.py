@@ -59,6 +59,13 @@ def started(folder: Path, count: int, **options) -> Live:
     return Live(identifier(), samples(count, kept.last), kept, fields_every=10, **options)
 
 
+def halved(some, two) -> list:
+    """Return all pairs, every other one of which is a long test."""
+    pairs = enumerate(itertools.product(some, two))
+    rest = (1, 2)  # of four in a row, so that each member of both is in a usual test
+    return [pytest.param(*pair, marks=[pytest.mark.long] * (k % 4 in rest)) for k, pair in pairs]
+
+
 def ran(folder: Path, count: int, **options) -> Live:
     """Return a run, begun or resumed, after so many samples."""
     run = started(folder, count, **options)
@@ -161,8 +168,10 @@ class Breaks:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("waits", [True, False])
-@pytest.mark.parametrize("method", ["accept", "append", "commit", "checkpoint", "step"])
+@pytest.mark.parametrize(
+    ("method", "waits"),
+    halved(["accept", "append", "commit", "checkpoint", "step"], [True, False]),
+)
 def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(
     tmp_path, monkeypatch, method, waits
 ):
@@ -345,8 +354,7 @@ class Failing:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("source", [Rows, AtHand])
-@pytest.mark.parametrize("first", [2, 40, 43, 73])
+@pytest.mark.parametrize(("first", "source"), halved([2, 40, 43, 73], [Rows, AtHand]))
 def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypatch, first, source):
     whole, failing = folders(tmp_path)
     broken = [*rows(40)]
