@@ -829,20 +829,6 @@ def test_unknowns_of_sensors_share_a_prior(rod):
 
 
 @pytest.mark.slow
-def test_an_unknown_offset_is_found(rod):
-    import pandas as pd
-
-    path = rod(OFFSET)
-    frame = pd.read_csv(path.parent / "rod.csv")
-    frame["T_10"] += 0.4
-    frame.to_csv(path.parent / "rod.csv", index=False)
-    _, data = result_of(path)
-    found = measures(data)
-    assert found["offset[T_10]"] == pytest.approx(0.4, abs=0.05)
-    assert found["alpha"] == pytest.approx(9.7e-5, rel=0.05)
-
-
-@pytest.mark.slow
 def test_means_along_a_line(rod):
     path = rod(('at = "30 cm", noise = "0.05 K"', 'along = ["28 cm", 0.32], noise = "0.07 K"'))
     prepared, data = result_of(path)
