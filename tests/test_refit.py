@@ -261,11 +261,17 @@ def numbers_of(identifier: lp.Identifier, items: Any) -> np.ndarray:
     return np.array(found)
 
 
+@cache
+def undisturbed() -> tuple[lp.Identifier, np.ndarray]:
+    """Return an identifier that fits apart after all samples, and its numbers."""
+    apart = insulated(apart=True)
+    return apart, numbers_of(apart, rod_samples())
+
+
 @pytest.mark.slow
 def test_a_refit_apart_goes_on_from_where_one_at_once_would():
-    samples = rod_samples()
-    apart, at_once = insulated(apart=True), insulated()
-    beside, direct = numbers_of(apart, samples), numbers_of(at_once, samples)
+    at_once, (apart, beside) = insulated(), undisturbed()
+    direct = numbers_of(at_once, rod_samples())
     assert np.array_equal(beside[:127], direct[:127])
     # The fit of 128 samples is used from sample 144 on, and the 16 since are taken by sample 151.
     assert not np.array_equal(beside[128:150], direct[128:150])
@@ -280,8 +286,7 @@ def test_a_refit_apart_goes_on_from_where_one_at_once_would():
 @pytest.mark.slow
 @pytest.mark.parametrize("at", [130, 143, 147, 150])
 def test_a_refit_apart_survives_restarts_and_copies(at: int):
-    samples = rod_samples()
-    whole = numbers_of(insulated(apart=True), samples)
+    samples, (_, whole) = rod_samples(), undisturbed()
     first, second = insulated(apart=True), insulated(apart=True)
     before = numbers_of(first, samples[:at])
     second.restore(first.dump())
