@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from itertools import product as combinations
@@ -35,6 +35,16 @@ from livepde.stepping import ForwardStage, advance
 def few(count: int, *axes: Iterable[Any]) -> list[tuple[Any, ...]]:
     """Return some of all combinations, always the same ones."""
     return random.Random(0).sample(list(combinations(*axes)), count)
+
+
+def turns(first: Iterable[Any], second: Iterable[Any], third: Sequence[Any]) -> list[Any]:
+    """Return all pairs of two axes, each with one value of a third, which take turns."""
+    second = list(second)
+    return [
+        (a, b, third[(j + k) % len(third)])
+        for j, a in enumerate(first)
+        for k, b in enumerate(second)
+    ]
 
 
 def line(cells: int = 12) -> Any:

@@ -441,6 +441,7 @@ expect = { rmse = "<= 1", alpha.error = "<= 0.1" }
 
 [expect]"""
 
+# The mistakes that newcomers make most are in test_input_errors.py.
 REFUSED = [
     ("cells = 40", "cels = 40", "no key 'mesh.cels'; did you mean 'cells'?"),
     ("cells = 40", 'cells = "many"', "mesh.cells: got 'many'; expected a whole number"),
@@ -459,10 +460,7 @@ REFUSED = [
     ),
     ('prior = "5e-5 m^2/s"', "prior = true", "unknowns.alpha.prior: got True"),
     ('prior = "5e-5 m^2/s"', "", "the key 'unknowns.alpha.prior' is missing"),
-    ('prior = "5e-5 m^2/s"', "prior = 1.0", "prior 1 is outside the bounds [1e-06, 0.001]"),
     ('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', "bounds = [2, 1]", "got [2, 1] m^2/s; needs the low"),
-    ('prior = "5e-5 m^2/s"', 'prior = "5e-5 m2/s"', "'m2' is not a unit that is known; write pow"),
-    ('to = "40 cm"', 'to = "0,4 m"', "mesh.to: got '0,4 m'; decimals need a point."),
     ('dt_max = "20 s"', 'dt_max = "20 sm"', "expected a unit such as s, min, h or d."),
     ('time_unit = "s"', 'decimal = ";"', "data.decimal: got ';'"),
     ('time_unit = "s"', 'encoding = "utf-9"', "expected the name of an encoding, as 'utf-8'"),
@@ -489,7 +487,6 @@ REFUSED = [
     ('dt_max = "20 s"', 'dt_max = "-20 s"', "steps.dt_max: got '-20 s'"),
     ('column = "T_20"', 'colunm = "T_20"', "did you mean 'column'?"),
     ('column = "T_20"', 'column = "T_20", columns = ["T_10"]', "expected column = name"),
-    ('at = "20 cm"', 'at = "20 m"', "20 m lies outside the mesh"),
     ('at = "20 cm"', "at = [0.1, 0.1]", "got 2 coordinates; needs 1"),
     ('at = "20 cm"', 'quantity = "fluid"', "has no quantity 'fluid'"),
     (', at = "20 cm"', "", "expected one of: at = position"),
@@ -500,7 +497,6 @@ REFUSED = [
      "has no 'T_left' here"),
     ('role = "boundary", column = "T_left", at = "left"',
      'role = "input", column = "T_left", at = 1', "role input has no place"),
-    ('at = "10 cm", noise = "0.05 K"', 'at = "10 cm"', "T_10.noise is missing"),
     (', noise = "0.05 K"', "", "law.noise is missing"),
     ('noise = "0.05 K"', 'noise = "0 K"', "T_10.noise: got '0 K'"),
     ('at = "10 cm"', 'over = "lft"', "the mesh has no part 'lft'; did you mean 'left'?"),
@@ -562,9 +558,7 @@ def test_what_is_refused_gets_one_sentence(rod, old, new, named):
 
 
 REFUSED_WITH_DATA = [
-    ('file = "rod.csv"', 'file = "none.csv"', "data.file: there is no file"),
     ('file = "rod.csv"', "", "data.file is missing"),
-    ('column = "T_20"', 'column = "T_21"', "there is no column 'T_21'; did you mean 'T_20'?"),
     ('initial = "interpolate"', 'initial = "interplate"', "did you mean 'interpolate'?"),
     ('initial = "interpolate"', 'initial = "20 m"', "initial: 'm' cannot be converted"),
     ("time_unit", "start = 2025-01-01\ntime_unit", "the times are numbers"),
@@ -841,20 +835,6 @@ def test_unknowns_of_sensors_share_a_prior(rod):
     assert unknowns["gain"].prior == lp.Normal(1.0, 0.05)
     assert unknowns["correlated"].evolution == lp.MeanReverting(3600.0)
     assert path.exists()
-
-
-@pytest.mark.slow
-def test_an_unknown_offset_is_found(rod):
-    import pandas as pd
-
-    path = rod(OFFSET)
-    frame = pd.read_csv(path.parent / "rod.csv")
-    frame["T_10"] += 0.4
-    frame.to_csv(path.parent / "rod.csv", index=False)
-    _, data = result_of(path)
-    found = measures(data)
-    assert found["offset[T_10]"] == pytest.approx(0.4, abs=0.05)
-    assert found["alpha"] == pytest.approx(9.7e-5, rel=0.05)
 
 
 @pytest.mark.slow

@@ -160,7 +160,7 @@ def test_the_wrong_column_is_named_first(fault: str):
 def test_a_wrong_input_with_noise_is_named_and_the_initial_state_is_made_of_it(change, words):
     """Inputs with noise have no refit: their first samples are kept, to try columns on them."""
     _, columns = bar(1)
-    wrong = {name: values[:120] for name, values in change(columns).items()}
+    wrong = {name: values[:60] for name, values in change(columns).items()}
     first = {name: float(wrong[name][0]) for name in ("TC1", "TC5")}
     weights = {"TC1": lambda x: 1.0 - x[0] / LENGTH, "TC5": lambda x: x[0] / LENGTH}
     parts = {
@@ -282,7 +282,7 @@ def test_causes_are_merged_by_what_they_explain():
 def test_an_early_boundary_is_no_late_sensor_and_the_search_ends(tmp_path: Path):
     """Six layers and four offsets; the upper boundary is an hour early, the data by volumes."""
     (job,) = (job for job in JOBS if job.name == "soil")
-    job.write(tmp_path, rows=100)
+    job.write(tmp_path, rows=70)
     table = pd.read_csv(tmp_path / "data.csv")
     table["T05"] = table["T05"].shift(-1).ffill()
     table.to_csv(tmp_path / "data.csv", index=False)
@@ -315,7 +315,7 @@ EXCHANGED = Fault("heater", ("T_10", "T_60"), "exchanged")
 @pytest.mark.slow
 def test_exchanged_sensors_that_contradict_all_are_found_from_the_start(tmp_path: Path):
     """The gate takes such columns for a disturbance, after which the stored state is wrong."""
-    prepared = walk(tmp_path, EXCHANGED, 501)
+    prepared = walk(tmp_path, EXCHANGED, 250)
     last = prepared.identifier.run(prepared.stream).last
     assert prepared.identifier._state.trial.shape[1] > 0  # there was a disturbance
     found = [finding.causes[0] for finding in last.verdict.findings if finding.causes]
@@ -337,7 +337,7 @@ def test_exchanged_sensors_that_contradict_all_are_found_from_the_start(tmp_path
 def test_wrong_columns_are_named_where_an_unknown_moves(fault: Fault, noise: str, tmp_path: Path):
     """A furnace with an unknown flux that moves: samples are filtered, not fitted, again."""
     settings = {"law.noise": "auto"} if noise else {}
-    prepared = walk(tmp_path, fault, 400, **settings)
+    prepared = walk(tmp_path, fault, 150, **settings)
     verdict = prepared.identifier.run(prepared.stream).last.verdict
     first = next(finding.causes[0] for finding in verdict.findings if finding.causes)
     kinds = {"fahrenheit": "unit", "exchanged": "exchange", "late": "lag"}
@@ -359,18 +359,18 @@ def test_samples_for_trials_outlive_a_restart(fault: Fault, tmp_path: Path):
         if number == 60:
             second.restore(first.dump())
     assert first._state.trial.shape[1] > 60
-    np.testing.assert_array_equal(first._state.trial, second._state.trial)
     np.testing.assert_array_equal(found.q, expected.q)
-    each = [one._settled(last).verdict for one, last in ((first, expected), (second, found))]
-    assert each[0].sentences == each[1].sentences
+    assert first.dump() == second.dump()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("since", [60, 150])
 def test_columns_that_were_right_for_long_are_not_wrong_from_the_start(since: int):
     """All sensors are another unit from some sample on, which is a disturbance."""
     _, columns = bar(3)
     wrong = {name: np.where(np.arange(COUNT) < since, z, z + 30.0) for name, z in columns.items()}
     identifier, samples = begun(columns | {name: wrong[name] for name in PLACES})
-    identifier.run(samples)
+    for sample in samples:
+        identifier.step(*sample)
     first = float(identifier._state.trial[0, 0, 0])
     assert first == 0.0 if since == 60 else first >= STEP * since

@@ -72,7 +72,7 @@ def test_a_kept_factor_is_made_again_after_a_restart(law, plate, tmp_path):
     half.save(tmp_path / "half.bin")
     again = fresh()
     again.load(tmp_path / "half.bin")
-    for sample in samples[8:]:
+    for sample in samples[8:14]:
         one, other = whole.step(*sample), again.step(*sample)
         assert np.array_equal(one.u, other.u)
         assert np.array_equal(one.q, other.q)

@@ -105,8 +105,7 @@ def mended(*, fault: bool) -> list[str]:
     z = rods.shown(count=count) + rods.NOISE * rng.standard_normal((count, len(rods.PLACES)))
     if fault:
         z[150:300, 1] += 0.08
-    sensors = lp.Points(rods.PLACES, noise=rods.NOISE)
-    identifier = lp.Identifier(rods.rod(), sensors, lp.SensitivityLaw(), u0=0.0)
+    identifier = rods.judged()
     for k in range(count):
         t = float(rods.TIMES[1] * k)
         estimate = identifier.step(t, z[k], {"T_left": rods.driven(t)})
@@ -117,10 +116,7 @@ def ended(offset: float = 0.0) -> list[str]:
     """Return the findings at the end of a run with an offset of one sensor."""
     z = rods.shown() + rods.errors()
     z[:, 1] += offset
-    sensors = lp.Points(rods.PLACES, noise=rods.NOISE)
-    identifier = lp.Identifier(rods.rod(), sensors, lp.SensitivityLaw(), u0=0.0)
-    each = zip(rods.TIMES.tolist(), z, strict=True)
-    result = identifier.run(lp.Sample(t, row, {"T_left": rods.driven(t)}) for t, row in each)
+    result = rods.judged().run(rods.samples(z))
     assert result.last is not None
     return kinds(result.last.verdict)
 
@@ -156,11 +152,9 @@ def counted(channel: str = "T", **counts: int) -> list[str]:
 
 def paused(gap: int = 0) -> list[str]:
     """Return the findings on the sampling of a run without so many of its rows."""
-    each = zip(rods.TIMES.tolist(), rods.shown() + rods.errors(), strict=True)
-    samples = [lp.Sample(t, row, {"T_left": rods.driven(t)}) for t, row in each]
+    samples = rods.samples(rods.shown() + rods.errors())
     del samples[40 : 40 + gap]
-    sensors = lp.Points(rods.PLACES, noise=rods.NOISE)
-    result = lp.Identifier(rods.rod(), sensors, lp.SensitivityLaw(), u0=0.0).run(samples)
+    result = rods.judged().run(samples)
     return [finding.what for finding in sampling_findings(result.to_xarray())]
 
 

@@ -384,7 +384,7 @@ def test_a_plate_at_an_end_is_judged_by_the_error_that_the_mesh_makes() -> None:
         u0=0.0,
         times=times,
         inputs=lambda t: {"T_in": math.sin(t) ** 2},
-        dt_max=0.005,
+        dt_max=0.0125,
     )
     samples, stds = list(twin), []
     for shadows in (None, lp.laws.Shadows()):

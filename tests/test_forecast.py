@@ -45,7 +45,7 @@ def plate(law):
     return lp.Identifier(model, sensors, law, validation=lp.Points({"c": (0.8, 0.2)}))
 
 
-PAIRS = [*((law, rod) for law in LAWS), ("gradient", plate), ("sensitivity", plate)]
+PAIRS = [("gradient", rod), ("refit", rod), ("sensitivity", plate)]
 
 
 def samples(count, seed=0):

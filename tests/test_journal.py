@@ -59,6 +59,35 @@ def started(folder: Path, count: int, **options) -> Live:
     return Live(identifier(), samples(count, kept.last), kept, fields_every=10, **options)
 
 
+def halved(some, two) -> list:
+    """Return all pairs, every other one of which is a long test."""
+    pairs = enumerate(itertools.product(some, two))
+    rest = (1, 2)  # of four in a row, so that each member of both is in a usual test
+    return [pytest.param(*pair, marks=[pytest.mark.long] * (k % 4 in rest)) for k, pair in pairs]
+
+
+def ran(folder: Path, count: int, **options) -> Live:
+    """Return a run, begun or resumed, after so many samples."""
+    run = started(folder, count, **options)
+    run.resume()
+    run.run()
+    run.journal.close()
+    return run
+
+
+def same_runs(one: Path, other: Path) -> int:
+    """Assert that two folders have the same estimates; return how many samples were accepted."""
+    with Journal.open(one / NAME) as mine, Journal.open(other / NAME) as yours:
+        same(mine, yours)
+        assert mine.accepted == yours.accepted
+        return mine.accepted
+
+
+def altered(path: Path, script: str) -> None:
+    with closing(sqlite3.connect(path)) as raw:
+        raw.executescript(script)
+
+
 class AtHand(Rows):
     """Rows that are all there at once."""
 
@@ -78,9 +107,7 @@ class AtHand(Rows):
 def journal_bytes(count: int) -> bytes:
     """Return the file that a run of so many samples leaves."""
     with TemporaryDirectory() as folder:
-        run = started(Path(folder), count)
-        run.run()
-        run.journal.close()
+        ran(Path(folder), count)
         return (Path(folder) / NAME).read_bytes()
 
 
@@ -141,8 +168,10 @@ class Breaks:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("waits", [True, False])
-@pytest.mark.parametrize("method", ["accept", "append", "commit", "checkpoint", "step"])
+@pytest.mark.parametrize(
+    ("method", "waits"),
+    halved(["accept", "append", "commit", "checkpoint", "step"], [True, False]),
+)
 def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(
     tmp_path, monkeypatch, method, waits
 ):
@@ -165,13 +194,8 @@ def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(
     with pytest.raises(Crash):
         run.run()
     run.journal.close()
-    again = started(broken, count)
-    again.resume()
-    again.run()
-    again.journal.close()
-    with Journal.open(whole / NAME) as one, Journal.open(broken / NAME) as other:
-        same(other, one)
-        assert other.accepted == count
+    ran(broken, count)
+    assert same_runs(broken, whole) == count
 
 
 @pytest.mark.long
@@ -179,17 +203,11 @@ def test_a_run_that_was_stopped_has_the_fields_of_one_that_was_not(tmp_path):
     whole, stopped = folders(tmp_path)
     finished(whole, 60)
     finished(stopped, 37)
-    run = started(stopped, 60)
-    run.resume()
-    run.run()
-    run.journal.close()
-    run = started(stopped, 60)  # nothing is left to do
-    run.resume()
-    run.run()
-    run.journal.close()
-    with Journal.open(whole / NAME) as one, Journal.open(stopped / NAME) as other:
-        same(other, one)
-        assert list(other)[-1].snapshot is not None
+    for _ in range(2):  # then nothing is left to do
+        ran(stopped, 60)
+    same_runs(stopped, whole)
+    with Journal.open(stopped / NAME) as kept:
+        assert list(kept)[-1].snapshot is not None
 
 
 @pytest.mark.slow
@@ -336,8 +354,7 @@ class Failing:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("source", [Rows, AtHand])
-@pytest.mark.parametrize("first", [2, 40, 43, 73])
+@pytest.mark.parametrize(("first", "source"), halved([2, 40, 43, 73], [Rows, AtHand]))
 def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypatch, first, source):
     whole, failing = folders(tmp_path)
     broken = [*rows(40)]
@@ -442,12 +459,8 @@ def test_a_file_that_may_not_grow(tmp_path):
         )
         assert not found.stderr
         assert "free disk space" in found.stdout
-    again = started(full, 400)
-    again.resume()
-    again.run()
-    again.journal.close()
-    with Journal.open(whole / NAME) as one, Journal.open(full / NAME) as other:
-        same(other, one)
+    ran(full, 400)
+    same_runs(full, whole)
 
 
 def as_nobody(code: str, *arguments: object) -> str:
@@ -540,16 +553,6 @@ def test_whether_a_journal_is_written_and_when(tmp_path):
     assert not log_of(path).exists()
     assert written(path) == path.stat().st_mtime
     assert not in_use(path)
-
-
-@pytest.mark.slow
-def test_two_writers(tmp_path):
-    first = journal(tmp_path / NAME)
-    with pytest.raises(lp.errors.RunError, match="written by another process"):
-        Journal.open(tmp_path / NAME, write=True)
-    with pytest.raises(lp.errors.RunError, match="written by another process"):
-        journal(tmp_path / NAME)
-    first.close()
 
 
 @pytest.mark.slow
@@ -674,9 +677,7 @@ HOSTILE = [
 @pytest.mark.parametrize("command", HOSTILE)
 def test_a_file_made_to_do_harm_is_one_sentence(tmp_path, command):
     path = finished(tmp_path)
-    with sqlite3.connect(path) as raw:
-        raw.executescript(command)
-    raw.close()
+    altered(path, command)
     with suppress(sqlite3.Error):  # of a table that is no table of a journal any more
         signed(path)
     refused(path)
@@ -786,9 +787,7 @@ class First:
 def test_thinning_keeps_what_a_resume_needs_and_the_phase_of_the_fields(tmp_path):
     count, retention = 10 * CHECKPOINT, Retention(10.0, 7)
     whole, broken = folders(tmp_path)
-    run = started(whole, count, retention=retention)
-    run.run()
-    run.journal.close()
+    ran(whole, count, retention=retention)
     for after in (CHECKPOINT + 3, CHECKPOINT + 10, 2):
         run = started(broken, count, retention=retention, sinks=[Breaks(after)])
         run.resume()
@@ -1022,9 +1021,7 @@ def test_estimates_that_are_deleted_are_read_from_the_journal(tmp_path):
 )
 def test_a_record_that_is_not_as_it_was_is_told(tmp_path, command):
     path = finished(tmp_path)
-    with sqlite3.connect(path) as raw:
-        raw.execute(command)
-    raw.close()
+    altered(path, command)
     refused(path, match="damaged.*restore it from a copy, or run the case again")
 
 
@@ -1034,9 +1031,7 @@ def test_the_older_checkpoint_serves_where_the_newest_is_broken(tmp_path, rest):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     for folder in (whole, broken):
         folder.mkdir()
-        first = started(folder, 2 * CHECKPOINT + 40)
-        first.run()
-        first.journal.close()
+        ran(folder, 2 * CHECKPOINT + 40)
     with sqlite3.connect(broken / NAME) as raw:
         numbers = [n for (n,) in raw.execute("SELECT id FROM checkpoints ORDER BY id DESC")]
         assert len(numbers) == 2
@@ -1054,18 +1049,13 @@ def test_the_older_checkpoint_serves_where_the_newest_is_broken(tmp_path, rest):
     assert ends[0][0] == 0
     assert ends[1][0] == (40 if rest else 2 * CHECKPOINT + 40)
     assert ends[0][1] == ends[1][1]
-    with Journal.open(whole / NAME) as one, Journal.open(broken / NAME) as other:
-        same(one, other)
+    same_runs(whole, broken)
 
 
 @pytest.mark.long
 def test_a_checkpoint_that_is_gone_for_good_is_told(tmp_path):
-    run = started(tmp_path, 3 * CHECKPOINT, retention=Retention(span=1.0))
-    run.run()
-    run.journal.close()
-    with sqlite3.connect(tmp_path / NAME) as raw:
-        raw.execute("UPDATE checkpoints SET crc = crc + 1")
-    raw.close()
+    ran(tmp_path, 3 * CHECKPOINT, retention=Retention(span=1.0))
+    altered(tmp_path / NAME, "UPDATE checkpoints SET crc = crc + 1")
     with (
         Journal.open(tmp_path / NAME, write=True) as kept,
         pytest.raises(lp.errors.RunError, match="no checkpoint is as it was"),

@@ -18,7 +18,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from live_rod import CLOCK, COLUMNS, OPENED, identifier, live, rows, same, write
+from live_rod import CLOCK, COLUMNS, OPENED, identifier, journal, live, rows, same, write
 from patience import PATIENCE
 
 import livepde as lp
@@ -96,14 +96,16 @@ def test_one_writer_many_readers(tmp_path):
     write(tmp_path, 20)
     run = live(tmp_path)
     run.run()
-    with pytest.raises(lp.errors.RunError, match="written by another process"):
-        Journal.open(tmp_path / "journal.sqlite", write=True)
-    with Journal.open(tmp_path / "journal.sqlite") as reader:
+    path = tmp_path / "journal.sqlite"
+    for write_it in (lambda: Journal.open(path, write=True), lambda: journal(path)):
+        with pytest.raises(lp.errors.RunError, match="written by another process"):
+            write_it()
+    with Journal.open(path) as reader:
         assert len(reader) == 20
         with pytest.raises(lp.errors.RunError, match="readonly"):
             reader.note(Event(0.0, "x", "", ""))
     run.journal.close()
-    Journal.open(tmp_path / "journal.sqlite", write=True).close()
+    Journal.open(path, write=True).close()
 
 
 def test_rows_out_of_order_are_put_in_order_within_the_wait():
@@ -140,19 +142,6 @@ def test_a_second_value_is_counted(repeated, value):
     assert (remark.kind, remark.channel) == ("conflict", "a")
     (sample,) = intake.flush().ready
     assert sample.values == {"a": value}
-
-
-def test_a_clock_that_leaps_does_not_make_the_rest_late():
-    intake = Intake(COLUMNS, CLOCK, Policy(leap=10.0))
-    kinds, times = [], []
-    for t in (0.0, 1.0, 1e9, 2.0, 500.0, 501.0, 502.0):
-        outcome = intake.take({"t": t, "a": 0.0, "b": 0.0, "left": 0.0})
-        kinds += [remark.kind for remark in outcome.remarks]
-        times += [ready.t for ready in outcome.ready]
-    assert times == [0.0, 1.0, 2.0]  # the others wait until they have continued for 16 steps
-    times += [ready.t for ready in intake.flush().ready]
-    assert kinds == ["leap"]  # the second is confirmed by the next ones
-    assert times == [0.0, 1.0, 2.0, 500.0, 501.0, 502.0]
 
 
 def test_each_channel_has_habits_of_its_own():
@@ -447,15 +436,19 @@ def test_rows_that_come_and_are_all_refused_are_no_health(tmp_path):
     assert run.journal.health == ""
 
 
+def looked(run: Live, number: int, level: str) -> str:
+    """Let a run look at a verdict of some level, and return the level that counts."""
+    run.result._count = 1000 + JUDGED * number
+    findings = [Finding("x", level, "It is off.")] if level != "trusted" else []
+    run._judge(SimpleNamespace(verdict=Verdict.of(findings)))
+    return run.health["verdict"]
+
+
 def test_looks_that_alternate_between_two_worse_levels_are_not_trusted(tmp_path):
     run = live(tmp_path, Rows(rows(3)))
     run.run()
-    found = []
-    for number, level in enumerate(["", "caution", "do not trust", "caution", "do not trust"]):
-        run.result._count = 1000 + JUDGED * number
-        findings = [Finding("x", level, "It is off.")] if level else []
-        run._judge(SimpleNamespace(verdict=Verdict.of(findings)))
-        found.append(run.health["verdict"])
+    each = ["trusted", "caution", "do not trust", "caution", "do not trust"]
+    found = [looked(run, number, level) for number, level in enumerate(each)]
     assert found == ["trusted", "trusted", "do not trust", "do not trust", "do not trust"]
 
 
@@ -478,32 +471,19 @@ def test_a_run_whose_model_is_wrong_is_well_and_says_so_once(tmp_path):
 def test_a_level_counts_once_two_looks_have_found_it(tmp_path):
     run = live(tmp_path, Rows(rows(3)))
     run.run()
-
-    class Looked:
-        def __init__(self, level: str) -> None:
-            grave = {"trusted": [], "caution": [Finding("x", "caution", "It is off.")]}
-            self.verdict = Verdict.of(grave[level])
-
     told = len([e for e in run.journal.events if e.kind == "verdict"])
     found = []
-    for number, level in enumerate(
-        ["trusted", "trusted", "caution", "trusted", "caution", "caution"]
-    ):
-        run.result._count = 1000 + JUDGED * number
-        run._judge(Looked(level))
-        run._judge(Looked("trusted"))  # a sample that is taken again is not looked at again
-        found.append(run.health["verdict"])
+    each = ["trusted", "trusted", "caution", "trusted", "caution", "caution"]
+    for number, level in enumerate(each):
+        looked(run, number, level)
+        found.append(looked(run, number, "trusted"))  # taken again, it is not looked at again
     assert found == ["trusted"] * 5 + ["caution"]
     events = [e.message for e in run.journal.events if e.kind == "verdict"][told:]
     assert [text.partition(":")[0] for text in events] == ["trusted", "caution"]
     # Who goes on with the run knows of the last look: the next one is the second.
-    run.result._count += JUDGED
-    run._judge(Looked("trusted"))
+    looked(run, 6, "trusted")
     run.journal.close()
-    again = live(tmp_path, Rows([]))
-    again.result._count = run.result._count + JUDGED
-    again._judge(Looked("trusted"))
-    assert again.health["verdict"] == "trusted"
+    assert looked(live(tmp_path, Rows([])), 7, "trusted") == "trusted"
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -290,10 +291,8 @@ UNFITTED = {
 }
 
 
-OTHERS = [pytest.param(why, marks=pytest.mark.slow) for why in UNFITTED if why != "moves"]
-
-
-@pytest.mark.parametrize("why", ["moves", *OTHERS])
+@pytest.mark.slow
+@pytest.mark.parametrize("why", UNFITTED)
 def test_a_sound_run_without_a_fit_has_hardly_a_wider_interval(why):
     verdict = innovations_of(truth(1), **UNFITTED[why])
     assert verdict.level == "trusted"
@@ -305,8 +304,18 @@ def test_a_sound_run_without_a_fit_has_hardly_a_wider_interval(why):
     assert one.wider < 1.3
 
 
-@pytest.mark.parametrize("why", ["moves", *OTHERS])
-@pytest.mark.parametrize("wrong", ["source", "gain", "lag"])
+# Where an unknown moves, and in a window, runs take seconds each: one of them, the rest on demand.
+SECONDS = {
+    pair: pytest.mark.slow if pair in (("moves", "gain"), ("window", "lag")) else pytest.mark.long
+    for pair in product(["moves", "window"], ["source", "gain", "lag"])
+}
+EACH = product(UNFITTED, ["source", "gain", "lag"])
+
+
+@pytest.mark.parametrize(
+    ("why", "wrong"),
+    [pytest.param(*pair, marks=SECONDS.get(pair, pytest.mark.slow)) for pair in EACH],
+)
 def test_an_interval_of_innovations_allows_for_errors_of_process_and_sensors(why, wrong):
     z = truth(3, ("source", 0.06)) if wrong == "source" else truth(3).copy()
     if wrong == "gain":

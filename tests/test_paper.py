@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,16 @@ from experiments.__main__ import app as studies
 from livepde.laws.coupled.coupled_stage import nearest_root
 from livepde.laws.damping import Residual
 from livepde.reproduce import EXPERIMENTS, boiger2016, seed
+
+SETTING = reference.Setting(
+    q_true=lambda x: 0.025 * x**2 - 0.025 * x,
+    u_true=lambda x, t: np.sin(np.pi * x) / (1 + t),
+    f=lambda x, t: seed.f([x], t),
+    state_ends="clamped",
+    parameter_ends="clamped",
+    omega=seed.OMEGA,
+    gain=100.0,
+)
 
 
 def test_the_papers_space() -> None:
@@ -66,19 +77,7 @@ def test_every_step_is_solved_to_rounding() -> None:
     run = lp.paper.identifier(twin.model, twin.observation, gain=100.0, u0=seed.start)
     estimates = [run.step(sample.t, sample.z) for sample in twin]
     assert all(estimate.status.ok for estimate in estimates)
-    found = reference.run(
-        reference.Setting(
-            q_true=lambda x: 0.025 * x**2 - 0.025 * x,
-            u_true=lambda x, t: np.sin(np.pi * x) / (1 + t),
-            f=lambda x, t: seed.f([x], t),
-            state_ends="clamped",
-            parameter_ends="clamped",
-            omega=seed.OMEGA,
-            gain=100.0,
-            c1=1.0,
-            steps=10,
-        )
-    )
+    found = reference.run(replace(SETTING, c1=1.0, steps=10))
     q = np.array([estimate.q for estimate in estimates])
     assert np.abs(q - found.Q).max() < 1e-6 * np.abs(found.Q).max()
 
@@ -94,16 +93,7 @@ def test_a_stage_is_solved_whose_root_is_a_million_times_from_its_start() -> Non
     samples = list(case.samples("nodal", 0.01, 3))[:count]
     estimates = [run.step(sample.t, sample.z) for sample in samples]
     assert all(estimate.status.ok for estimate in estimates)
-    setting = reference.Setting(
-        q_true=lambda x: 0.025 * x**2 - 0.025 * x,
-        u_true=lambda x, t: np.sin(np.pi * x) / (1 + t),
-        f=lambda x, t: seed.f([x], t),
-        state_ends="clamped",
-        parameter_ends="clamped",
-        omega=seed.OMEGA,
-        gain=100.0,
-        mu=1.0,
-    )
+    setting = replace(SETTING, mu=1.0)
     at = reference.Discretisation(setting)
     _, _, loads = reference.truth(at, 0.6 * np.arange(count))
     G = twin.observed.G

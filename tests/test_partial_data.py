@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from factories import turns
 
 import livepde as lp
 from benchmarks.partial import PROCESSES, Readings, omega
@@ -56,9 +57,7 @@ def model(A: Any, unknown: str = "field", mesh: Any = MESH, **options: Any) -> l
     return lp.Model(state, UNKNOWNS[unknown](mesh), A=A, B=lambda u, v, x: laplace(u, v), **options)
 
 
-@pytest.mark.parametrize("mesh", [MESH, SQUARE], ids=["line", "square"])
-@pytest.mark.parametrize("unknown", UNKNOWNS)
-@pytest.mark.parametrize("name", OPERATORS)
+@pytest.mark.parametrize(("name", "unknown", "mesh"), turns(OPERATORS, UNKNOWNS, [MESH, SQUARE]))
 def test_derivatives_of_u_are_found(name, unknown, mesh):
     expected, A = OPERATORS[name]
     if name == "slope of q" and unknown == "number":

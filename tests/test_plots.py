@@ -13,7 +13,6 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from skfem import ElementLineP1
 
 import livepde as lp
 from livepde import plots
@@ -283,18 +282,6 @@ def test_colours_differ_in_lightness_too() -> None:
     lightness = [sum(int(shade[k : k + 2], 16) for k in (1, 3, 5)) for shade in shades]
     assert lightness == sorted(lightness)
     assert len(set(plots.PALETTE)) == len(plots.PALETTE)
-
-
-def test_result_plots_itself() -> None:
-    mesh = lp.interval(0, 1, 4)
-    model = lp.Model(
-        lp.Field(mesh, ElementLineP1(), dirichlet={"boundary": 0.0}),
-        lp.Normal(1.0),
-        A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
-    )
-    identifier = lp.Identifier(model, lp.Points([0.5]), lp.SensitivityLaw(noise=0.1), u0=1.0)
-    result = identifier.run([(0.1 * k, [0.5]) for k in range(4)])
-    assert isinstance(drawn(result.plot(title="rod")), Figure)
 
 
 def test_loops_name_a_limit_once():

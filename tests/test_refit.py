@@ -153,23 +153,6 @@ def test_wild_readings_in_a_row_are_told_from_those_beside_them():
     assert near_neighbours(values, 4.0)[[*range(17), *range(23, 40)]].all()
 
 
-@pytest.mark.slow
-def test_a_run_continues_to_the_bit():
-    rows = stream()
-    whole, half = column(PRIORS["far above"]), column(PRIORS["far above"])
-    for t, z in rows[:20]:
-        whole.step(t, z)
-        half.step(t, z)
-    content = half.dump()
-    other = column(PRIORS["far above"])
-    other.restore(content)
-    for t, z in rows[20:]:
-        one, two = whole.step(t, z), other.step(t, z)
-        assert one.parameters == two.parameters
-    assert whole.refit().parameters == other.refit().parameters
-    assert whole.estimate().fit == other.estimate().fit
-
-
 def test_a_refit_on_demand_is_that_of_the_end():
     rows = stream()
     end = column(PRIORS["near"]).run(rows).last
@@ -278,11 +261,17 @@ def numbers_of(identifier: lp.Identifier, items: Any) -> np.ndarray:
     return np.array(found)
 
 
+@cache
+def undisturbed() -> tuple[lp.Identifier, np.ndarray]:
+    """Return an identifier that fits apart after all samples, and its numbers."""
+    apart = insulated(apart=True)
+    return apart, numbers_of(apart, rod_samples())
+
+
 @pytest.mark.slow
 def test_a_refit_apart_goes_on_from_where_one_at_once_would():
-    samples = rod_samples()
-    apart, at_once = insulated(apart=True), insulated()
-    beside, direct = numbers_of(apart, samples), numbers_of(at_once, samples)
+    at_once, (apart, beside) = insulated(), undisturbed()
+    direct = numbers_of(at_once, rod_samples())
     assert np.array_equal(beside[:127], direct[:127])
     # The fit of 128 samples is used from sample 144 on, and the 16 since are taken by sample 151.
     assert not np.array_equal(beside[128:150], direct[128:150])
@@ -297,8 +286,7 @@ def test_a_refit_apart_goes_on_from_where_one_at_once_would():
 @pytest.mark.slow
 @pytest.mark.parametrize("at", [130, 143, 147, 150])
 def test_a_refit_apart_survives_restarts_and_copies(at: int):
-    samples = rod_samples()
-    whole = numbers_of(insulated(apart=True), samples)
+    samples, (_, whole) = rod_samples(), undisturbed()
     first, second = insulated(apart=True), insulated(apart=True)
     before = numbers_of(first, samples[:at])
     second.restore(first.dump())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from factories import driven_rod, line
 
 import livepde as lp
 from livepde.reproduce import seed_excited
-from livepde.runs import doubts, measures, verdict
+from livepde.runs import doubts, verdict
 from livepde.stepping import Advance, simulate
 from livepde.streams import AbsoluteNoise, Twin
 
@@ -42,23 +41,8 @@ def run(model: lp.Model, truth: lp.Model, shift: Any = 0.0, **options: Any) -> A
     )
 
 
-@cache
-def right() -> Any:
-    """Return the dataset of a run whose model is right."""
-    model = rod(lp.Normal(0.5, 0.3))
-    return run(model, model)
-
-
 def as_tuple(item: Any) -> tuple[float, Any]:
     return (item.t, item.z) if isinstance(item, lp.Sample) else (item[0], item[1])
-
-
-@pytest.mark.slow
-def test_the_right_model_raises_no_doubts():
-    model = rod(lp.Normal(0.2, 0.1))
-    data = run(model, model)
-    assert doubts(data) == []
-    assert measures(data)["innovation_ratio"] == pytest.approx(1.0, abs=0.3)
 
 
 @pytest.mark.slow

@@ -86,20 +86,6 @@ def stream(model, k, times, noise=0.0, seed=0):
 
 
 @pytest.mark.slow
-def test_the_refit_makes_the_result_independent_of_the_prior():
-    found = []
-    for prior in (0.5, 1.0, 4.0):
-        model = conductivity(prior)
-        sensors, samples = stream(model, 2.0, 0.05 * np.arange(81), noise=0.01)
-        ident = lp.Identifier(model, sensors, lp.SensitivityLaw())
-        last = ident.run(samples).last
-        assert abs(last.q[0] - 2.0) < 3 * last.q_std[0]
-        assert last.q_std[0] < 0.03
-        found.append(last.q[0])
-    assert np.ptp(found) < 0.003
-
-
-@pytest.mark.slow
 def test_a_full_window_goes_on_from_the_estimate():
     model = conductivity()
     sensors, samples = stream(model, 2.0, 0.05 * np.arange(121), noise=0.01)

@@ -19,7 +19,7 @@ from livepde.cases.measured import measured
 from livepde.cases.new_case import channels_in
 from livepde.cases.remedies import after_gaps, start_missed, with_settings
 from livepde.cli.check import _refused
-from livepde.errors import CaseError, DataError, SampleError, TimeOrderError
+from livepde.errors import CaseError, DataError, SampleError
 from livepde.models import EQUATIONS, heat
 from livepde.runs import input_findings
 from livepde.samples import by_name
@@ -210,10 +210,3 @@ def test_a_compressed_file_is_named(tmp_path):
     path.write_bytes(gzip.compress(b"time,T\n0,1\n1,2\n"))
     with pytest.raises(DataError, match="is compressed: unpack it first"):
         measured(path, "s")
-
-
-def test_a_sample_before_the_initial_time_names_it():
-    rod = heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": 0.0})
-    identifier = lp.Identifier(rod, lp.Points({"T": 0.5}, noise=0.01), u0=1.0)
-    with pytest.raises(TimeOrderError, match="is before the initial time t0"):
-        identifier.step(-0.5, [1.0])

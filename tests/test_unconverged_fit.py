@@ -25,20 +25,6 @@ def run(passes: int) -> lp.Estimate:
 
 
 @pytest.mark.slow
-def test_a_fit_that_did_not_converge_is_not_trusted():
-    one, whole = run(1), run(40)
-    assert one.fit is not None
-    assert not one.fit.converged
-    assert one.verdict.level == "do not trust"
-    (found,) = [item for item in one.verdict.findings if item.what == "fit"]
-    assert "did not converge" in found.text
-    assert whole.fit is not None
-    assert whole.fit.converged
-    assert not [item for item in whole.verdict.findings if item.what == "fit"]
-    assert whole["a"].median == pytest.approx(np.exp(0.3), rel=0.05)
-
-
-@pytest.mark.slow
 def test_a_last_fit_that_fails_leaves_the_run_with_its_estimates(monkeypatch):
     def fails(*_: object) -> None:
         raise StepFailed("singular", "the matrix is singular")

@@ -108,6 +108,16 @@ def run(
     return identifier, estimate
 
 
+def judged(law: Any = None, **options: Any) -> lp.Identifier:
+    sensors = lp.Points(PLACES, noise=NOISE, unit="degC")
+    return lp.Identifier(rod(), sensors, law or lp.SensitivityLaw(), u0=0.0, **options)
+
+
+def samples(z: Any) -> list[lp.Sample]:
+    each = zip(TIMES.tolist(), z, strict=False)
+    return [lp.Sample(t, row, {"T_left": driven(t)}) for t, row in each]
+
+
 def named(found: Verdict) -> list[tuple[str, str]]:
     """Return kinds and subjects of the first two causes."""
     return [(c.kind, c.subject) for f in found.findings for c in f.causes[:2]]
@@ -200,8 +210,7 @@ def test_a_missing_loss_is_named():
 def test_a_jump_is_named_and_turns_the_verdict_soon():
     half = len(TIMES) // 2
     z = np.concatenate([shown()[:half], shown(k=0.2)[half:]]) + errors()
-    sensors = lp.Points(PLACES, noise=NOISE)
-    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0)
+    identifier = judged()
     turned = None
     for k, t in enumerate(TIMES.tolist()):
         estimate = identifier.step(t, z[k], {"T_left": driven(t)})
@@ -237,10 +246,8 @@ def test_a_verdict_is_a_warning_in_the_log_unless_the_run_is_trusted(caplog, off
     caplog.set_level("INFO", "livepde.run")
     z = shown()[:60] + errors()[:60]
     z[:, 1] += offset
-    sensors = lp.Points(PLACES, noise=NOISE, unit="degC")
-    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0)
-    times = zip(TIMES.tolist(), z, strict=False)
-    drive(identifier, (lp.Sample(t, row, {"T_left": driven(t)}) for t, row in times))
+    identifier = judged()
+    drive(identifier, iter(samples(z)))
     (told,) = (one for one in caplog.records if one.kind == "verdict")
     assert told.levelname == level
     assert told.getMessage().startswith("verdict: trusted") == (level == "INFO")
@@ -313,9 +320,7 @@ def test_directions_move_the_estimate_by_what_they_say():
 
 def fed(inputs: Any, *, between: str = "line") -> lp.Estimate:
     """Return the last estimate of a run whose channel reads some values."""
-    sensors = lp.Points(PLACES, noise=NOISE)
-    own = {"T_left": between}
-    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0, between=own)
+    identifier = judged(between={"T_left": between})
     z = shown() + errors()
     for k, t in enumerate(TIMES.tolist()):
         estimate = identifier.step(t, z[k], {"T_left": inputs[k]})
@@ -355,14 +360,10 @@ def test_gaps_of_a_channel_are_told_and_in_the_interval():
 
 @pytest.mark.slow
 def test_what_was_not_judged_is_judged_from_where_it_is_taken_up():
-    def identifier(judged: bool) -> lp.Identifier:
-        sensors = lp.Points(PLACES, noise=NOISE)
-        return lp.Identifier(rod(), sensors, lp.SensitivityLaw(verdict=judged), u0=0.0)
-
-    one, z = identifier(False), shown() + errors()
+    one, z = judged(lp.SensitivityLaw(verdict=False)), shown() + errors()
     for k, t in enumerate(TIMES[:60].tolist()):
         before = one.step(t, z[k], {"T_left": driven(t)})
-    other = identifier(True)
+    other = judged()
     other.restore(one.dump())
     z[60:, 1] += 6.0 * NOISE
     for k, t in enumerate(TIMES[60:120].tolist(), 60):
@@ -387,25 +388,6 @@ def test_a_census_knows_what_the_unknowns_take_up():
         traces[name] = trace(sound), trace(FAULTS["offset"].change(sound))
     assert max(sound for sound, _ in traces.values()) < 1.0
     assert traces["borehole"][1] < VISIBLE < traces["rod"][1]
-
-
-@pytest.mark.slow
-def test_a_checkpoint_carries_the_ledger():
-    z = shown() + errors()
-    z[:, 1] += 0.08
-    sensors = lp.Points(PLACES, noise=NOISE)
-
-    def identifier() -> lp.Identifier:
-        return lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0)
-
-    one, other = identifier(), identifier()
-    for k, t in enumerate(TIMES[:101].tolist()):
-        whole = one.step(t, z[k], {"T_left": driven(t)})
-        if k == 70:
-            other.restore(one.dump())
-        if k > 70:
-            resumed = other.step(t, z[k], {"T_left": driven(t)})
-    assert resumed.verdict.to_dict() == whole.verdict.to_dict()
 
 
 @pytest.mark.slow
@@ -460,8 +442,7 @@ def test_sensors_that_read_in_turn_show_the_noise_of_their_readings():
 
 
 def test_few_samples_are_too_few():
-    sensors = lp.Points(PLACES, noise=NOISE)
-    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0)
+    identifier = judged()
     estimate = identifier.step(0.1, np.zeros(3), {"T_left": 0.0})
     assert estimate.verdict.level == "not judged"
     assert "1 samples, at least 20 required" in estimate.verdict.sentences[0]
@@ -482,10 +463,8 @@ def test_what_is_left_out_is_said():
 def test_a_verdict_survives_json_and_stands_in_the_dataset():
     z = shown() + errors()
     z[:, 1] += 0.08
-    sensors = lp.Points(PLACES, noise=NOISE)
-    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0)
-    stream = [(t, z[k], {"T_left": driven(t)}) for k, t in enumerate(TIMES.tolist())]
-    result = identifier.run(stream)
+    identifier = judged()
+    result = identifier.run(samples(z))
     found = result.verdict
     stored = json.loads(json.dumps(found.to_dict()))
     assert Verdict.from_dict(stored).to_dict() == found.to_dict()

@@ -8,6 +8,7 @@ import string
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,7 @@ def case_schema() -> dict[str, Any]:
     return {"$schema": DIALECT, **schema, "title": "A case of livepde"}
 
 
+@cache
 def schema_text() -> str:
     """Return the file of the JSON schema."""
     return json.dumps(case_schema(), indent=1, ensure_ascii=False) + "\n"
@@ -455,6 +457,7 @@ def write_files(folder: Path, files: Mapping[str, str]) -> None:
         raise RunError(f"{folder}: cannot be written: {error.strerror or error}.") from error
 
 
+@cache
 def _measurements() -> str:
     """Return noisy temperatures of a rod, simulated on a finer mesh than the case uses."""
     times = np.arange(0.0, 3601.0, 20.0)
