@@ -29,13 +29,13 @@ from livepde.verdict.evidence import NU, TEMPER, Causes, Family, LinearModel, av
 # --- the average --------------------------------------------------------------------------------
 
 
-def dense(model: LinearModel, tried: list[tuple[Any, Any, float]]) -> tuple[Any, Any, Any]:
+def dense(model: LinearModel, tried: list[tuple[Any, Any]]) -> tuple[Any, Any, Any]:
     """Return log evidence, mean and deviation of each hypothesis with dense matrices.
 
-    A hypothesis is: columns, square root of the covariance of their amplitudes, and its prior mass.
+    A hypothesis is: columns, and a square root of the covariance of their amplitudes.
     """
     n, logs, means, deviations = len(model.z), [], [], []
-    for columns, root, _ in tried:
+    for columns, root in tried:
         B = np.hstack([model.J, model.Z[:, columns] @ root])
         H = np.eye(B.shape[1]) + B.T @ B
         squares = model.z @ np.linalg.solve(np.eye(n) + B @ B.T, model.z)
@@ -80,15 +80,18 @@ def test_the_average_is_that_of_dense_normal_models(strength):
         (np.array([*first, k]), scipy.linalg.block_diag(4.0 * one, cause(k, 4.0))) for k in range(3)
     ]
     several.append((np.arange(3, 9), 3.0 * both))
-    tried = [(nothing, np.zeros((0, 0)), 0.5)]
-    tried += [(*item, 0.25 / len(single)) for item in single]
-    tried += [(*item, 0.25 / len(several)) for item in several]
+    tried = [(nothing, np.zeros((0, 0))), *single, *several]
+    # Those of one kind differ in their size alone.
+    kinds = np.array([0, 1, 2, 3, 1, 2, 3, 4, 4, 5, 6, 7, 8])
 
     logs, means, deviations = dense(model, tried)
-    prior = np.log([mass for *_, mass in tried])
-    excess = (logs + prior).max() - logs[0] - prior[0]
+    e = np.exp(logs - logs[0])
+    of_kind = np.array([e[kinds == kind].mean() for kind in range(9)])
+    mass = np.array([0.5, *[0.25 / 3] * 3, *[0.25 / 5] * 5])
+    excess = math.log((of_kind * mass).max() / mass[0])
     eta = 1.0 if excess <= TEMPER else TEMPER / excess
-    weights = np.exp(prior + eta * (logs - logs[0]))
+    sums = np.array([e[kinds == kind].sum() for kind in range(9)])
+    weights = (mass * of_kind**eta / sums)[kinds] * e
     found = averaged(model, causes, families)
     assert found.weights == pytest.approx(weights / weights.sum(), rel=1e-6)
     assert found.means == pytest.approx(means, rel=1e-8)

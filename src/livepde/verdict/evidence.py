@@ -29,7 +29,7 @@ from livepde.linalg import Array, IntArray
 from livepde.verdict.ledger import BLOCKS, Ledger, chance
 
 NU = 10.0  # degrees of freedom of the prior of the noise level
-TEMPER = 5.0  # logarithm of the largest ratio of evidences: 3 to 8 do much the same
+TEMPER = 8.0  # logarithm of the largest ratio of evidences: 3 to 8 do much the same
 AMPLITUDES = (1.0 / 3.0, 4.0 / 3.0, 16.0 / 3.0, 64.0 / 3.0)  # prior sizes of a direction
 NOTHING = 0.5  # prior mass on "nothing is wrong"; the rest on single causes and on families alike
 LEVEL = 0.95
@@ -226,37 +226,53 @@ def averaged(model: LinearModel, causes: Causes, families: Sequence[Family]) -> 
     total, (mean, variance, _) = model.left[2], model.asked
     n, none = len(model.z), _Axes.of(model, NO_FAMILY, causes.columns)
     single = [_beside(model, none, causes, size) for size in causes.sizes]
-    several = []
+    several: list[list[_Tried]] = []
     for family in families:
         axes = _Axes.of(model, family, causes.columns)
-        several += [_alone(model, axes, size) for size in family.sizes]
-        several += [_beside(model, axes, causes, size) for size in family.beside]
-    nothing = [_alone(model, none, 0.0)]
-    tried = [*nothing, *single, *several]
+        several.append([_alone(model, axes, size) for size in family.sizes])
+        if family.beside:
+            several.append([_beside(model, axes, causes, size) for size in family.beside])
+    nothing = [[_alone(model, none, 0.0)]]
+    groups = [nothing, [single], several]
+    tried = [one for group in groups for sizes in group for one in sizes]
     squares, volume, shift, more = (np.concatenate(part) for part in zip(*tried, strict=True))
     squares = np.maximum(squares, 0.0)
     told = -0.5 * (NU + n) * np.log((NU + squares) / (NU + total)) - volume
     shares = (NOTHING, 0.5 * (1.0 - NOTHING), 0.5 * (1.0 - NOTHING))
-    counts = [sum(len(one.squares) for one in group) for group in (nothing, single, several)]
+    counts = [[(len(sizes), len(sizes[0].squares)) for sizes in group] for group in groups]
     weights = _tempered(told, shares, counts)
     level = np.maximum(1.0, (NU + squares) / (NU + n))
     return Mixture(weights, mean + shift, np.sqrt((variance + more) * level[:, None]))
 
 
-def _tempered(told: Array, shares: Sequence[float], counts: Sequence[int]) -> Array:
+def _tempered(
+    told: Array, shares: Sequence[float], counts: Sequence[Sequence[tuple[int, int]]]
+) -> Array:
     """Return the weights of hypotheses with logarithms of their evidence; the first is "nothing".
 
-    They come in groups of some counts, each with a share of the prior mass.
+    They come in groups with a share of the prior mass, and in them in blocks of (sizes, kinds).
+    Which size is right the data tell, which kind only after tempering: another one may be missing.
     """
-    masses = zip(shares, counts, strict=True)
-    prior = np.concatenate(
-        [np.full(count, math.log(share / max(count, 1))) for share, count in masses]
-    )
-    excess = float((told + prior).max() - told[0] - prior[0])
+    evidence, prior, within, first = list[Array](), list[Array](), list[Array](), 0
+    for share, blocks in zip(shares, counts, strict=True):
+        kinds = sum(kinds for _, kinds in blocks)
+        for sizes, kinds_here in blocks:
+            own = told[first : first + sizes * kinds_here].reshape(sizes, kinds_here)
+            total = scipy.special.logsumexp(own, axis=0)
+            evidence.append(total - math.log(sizes))
+            prior.append(np.full(kinds_here, math.log(share / max(kinds, 1))))
+            within.append(own - total)
+            first += own.size
+    of_kind, mass = np.concatenate(evidence), np.concatenate(prior)
+    excess = float((of_kind + mass).max() - of_kind[0] - mass[0])
     eta = 1.0 if excess <= TEMPER else TEMPER / excess
-    weights = prior + eta * told
-    found: Array = np.exp(weights - scipy.special.logsumexp(weights))
-    return found
+    logs, found, first = mass + eta * of_kind, list[Array](), 0
+    for own in within:
+        found.append((own + logs[first : first + own.shape[1]]).ravel())
+        first += own.shape[1]
+    weights = np.concatenate(found)
+    whole: Array = np.exp(weights - scipy.special.logsumexp(weights))
+    return whole
 
 
 def averaged_causes(ledger: Ledger, moved: Array, most: Array, std: Array) -> Mixture:
@@ -279,8 +295,8 @@ def averaged_causes(ledger: Ledger, moved: Array, most: Array, std: Array) -> Mi
         told.append(_tested(sums, noise, left, rho, prior)[0].ravel())
         means.append((moved * (score * variance).ravel()).T)
         variances.append((moved**2 * variance.ravel()).T)
-    evidence = np.concatenate(told)
-    weights = _tempered(evidence, (NOTHING, 1.0 - NOTHING), (1, len(evidence) - 1))
+    blocks = [[(1, 1)], [(len(AMPLITUDES), moved.shape[1])]]
+    weights = _tempered(np.concatenate(told), (NOTHING, 1.0 - NOTHING), blocks)
     deviations = np.sqrt(std**2 + np.concatenate(variances))
     return Mixture(weights, np.concatenate(means), deviations)
 
