@@ -104,7 +104,9 @@ def _show_written(
     places = [f"{key} = {toml_value(value)}" for key, value in blanks.items()]
     places += [f"positions in {case.parent / name}" for name in files if name != "case.toml"]
     told = f"replace each '?' ({len(places)})" if places else "nothing is left open. Next"
-    console.print(f"Wrote {case} for {', '.join(map(str, data))}: {told}:")
+    *others, last = map(str, data)
+    files = f"{', '.join(others)} and {last}" if others else last
+    console.print(f"Wrote {case} for {files}: {told}:")
     for place in places:
         console.print(escape(f"  {place}"))
     if places:
