@@ -105,8 +105,8 @@ def _show_written(
     places += [f"positions in {case.parent / name}" for name in files if name != "case.toml"]
     told = f"replace each '?' ({len(places)})" if places else "nothing is left open. Next"
     *others, last = map(str, data)
-    files = f"{', '.join(others)} and {last}" if others else last
-    console.print(f"Wrote {case} for {files}: {told}:")
+    tables = f"{', '.join(others)} and {last}" if others else last
+    console.print(f"Wrote {case} for {tables}: {told}:")
     for place in places:
         console.print(escape(f"  {place}"))
     if places:
