@@ -184,7 +184,7 @@ FINDINGS: dict[str, Sentence] = {
     "input, start": Sentence(
         "Input {name} had no value at the initial time, so its first value was used for the first "
         "interval.",
-        "Send a sample with {name} at the initial time.",
+        "If it was not constant, add a row with {name} at the initial time.",
     ),
     "input, gaps": Sentence(
         "Input {name} had no value in {count} of {samples} samples, so its last value was held. "
