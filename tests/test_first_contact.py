@@ -360,7 +360,7 @@ def test_the_summary_is_what_a_run_prints():
 
     printed, summary = tables(two().dataset())[0], two().summary()
     for row, label in zip(printed.rows, ["k", "r"], strict=True):
-        low, high = map(float, row[3].split(" to "))
+        low, high = map(float, row[printed.columns.index("95 %")].split(" to "))
         assert np.allclose((low, high), summary.loc[label, ["low", "high"]].tolist(), rtol=0.05)
 
 
