@@ -214,6 +214,16 @@ class Latent:
             return directions
         return self.visible(self.slopes(a)[:, None] * directions)
 
+    def tangents(self, a: Array, directions: Array) -> Array:
+        """Return `tangent` of several a, (members, dim), and their columns: (members, m, k)."""
+        if self.plain:
+            return directions
+        # Numbers in one piece: NumPy may round strided ones otherwise.
+        each = self.slopes(a.T.copy()).T[:, :, None] * directions
+        if self.dim == self.space.dim:
+            return np.asarray(each)
+        return np.array([self.visible(columns) for columns in each])
+
     def deviation(self, a: Array, std: Array) -> Array:
         """Return standard deviations of q, (m,), from those of independent latent ones, (dim,)."""
         if self.plain:

@@ -549,7 +549,8 @@ def robust_factors(reduction: Reduction, x: FilterState) -> tuple[Array, Array]:
     times.
     """
     inflation = x.innovations.inflation
-    if (inflation == 1.0).all():
+    right = inflation == 1.0
+    if right.all():
         return x.U, x.C
     k = x.C.shape[2]
     finite = np.isfinite(x.C).all(axis=(1, 2)) & np.isfinite(inflation)
@@ -565,6 +566,7 @@ def robust_factors(reduction: Reduction, x: FilterState) -> tuple[Array, Array]:
     widths[:, :k] = np.sqrt(np.minimum(widened, 1.0 / np.maximum(share, np.finfo(float).tiny)))
     widths[~finite] = 1.0
     rows = widths[:, :, None] * rotation.transpose(0, 2, 1)
+    rows[right] = np.eye(rows.shape[1])  # one of several members is as it is alone
     return rows @ x.U, rows @ x.C
 
 

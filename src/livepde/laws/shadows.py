@@ -40,11 +40,12 @@ from livepde.laws.shadow_kinds import (
     StepTolerance,
     refusal,
 )
-from livepde.laws.step_diagnostics import Diagnostics, stacked
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
 from livepde.linalg.member_arrays import changed, product, put, take
 from livepde.stepping import TINY, MemberStage, Moments, Span
 from livepde.verdict import Shifts
+from livepde.verdict.findings import NOT_KNOWN
 
 FIRST = 16  # steps that are all shadowed: where a run begins the error changes from step to step
 CALM = 4  # steps after a jump that are all shadowed
@@ -353,27 +354,25 @@ class ShadowSet:
 
     def diagnostics(self, x: FilterState, C: Array) -> Diagnostics[Array]:
         """Return the shifts of the unknowns, numbers of shape (members,)."""
-        reduction, latent = self.reduction, self.problem.model.latent
-        found = []
-        for k, a in enumerate(x.shadows.a):
-            q = reduction.bounded(x.q[k] + reduction.Phi @ x.da[k])
-            each = latent.tangent(q, reduction.Phi @ a.T)  # (m, shadows)
-            std = np.linalg.norm(latent.tangent(q, reduction.Phi @ C[k].T), axis=1)
-            shift = each / np.where(std > 0.0, std, np.inf)[:, None]
-            total = np.abs(shift[:, self.counted].sum(axis=1))
-            worst = int(np.argmax(np.where(np.isfinite(total), total, -1.0)))
-            sizes, unknowns = {}, {}
-            for row, kind in enumerate(self.kinds):
-                # Held inputs have no part in the total, and so their own worst unknown.
-                at_worst = worst if kind != HELD else int(np.argmax(np.abs(shift[:, row])))
-                sizes[kind] = float(shift[at_worst, row])
-                for label, at in latent.space.labels.items():
-                    unknowns[label, kind] = float(each[at, row])
-            shifts = Shifts(float(total[worst]), sizes, unknowns)
-            failed = float(x.shadows.failed[k]) if x.shadows.failed.any() else np.nan
-            refused = 1.0 if self.refused else np.nan
-            found.append(Diagnostics(shadow_failed=failed, mesh_unfollowed=refused, shifts=shifts))
-        return stacked(found)
+        s, Phi, latent = x.shadows, self.reduction.Phi, self.problem.model.latent
+        q = self.reduction.bounded(x.q + (Phi @ x.da[:, :, None])[:, :, 0])
+        each = latent.tangents(q, Phi @ s.a.transpose(0, 2, 1))  # (members, m, shadows)
+        std = np.linalg.norm(latent.tangents(q, Phi @ C.transpose(0, 2, 1)), axis=2)
+        shift = each / np.where(std > 0.0, std, np.inf)[:, :, None]
+        total = np.abs(shift[:, :, self.counted].sum(axis=2))
+        worst = np.argmax(np.where(np.isfinite(total), total, -1.0), axis=1)
+        members, sizes, unknowns = np.arange(len(x)), {}, {}
+        for row, kind in enumerate(self.kinds):
+            # Held inputs have no part in the total, and so their own worst unknown.
+            at_worst = worst if kind != HELD else np.argmax(np.abs(shift[:, :, row]), axis=1)
+            sizes[kind] = shift[members, at_worst, row]
+            for label, at in latent.space.labels.items():
+                unknowns[label, kind] = each[:, at, row]
+        return Diagnostics(
+            shadow_failed=np.where(s.failed, s.failed, np.nan) if s.failed.any() else NOT_KNOWN,
+            mesh_unfollowed=np.ones(len(x)) if self.refused else NOT_KNOWN,
+            shifts=Shifts(total[members, worst], sizes, unknowns),
+        )
 
     @nonfinite_allowed()  # a shift that overflows is none
     def widening(self, x: FilterState) -> tuple[Array, Array]:

@@ -117,7 +117,8 @@ class Diagnostics(Generic[Number]):
     def _own(self) -> dict[str, Any]:
         """Return the attributes that are known numbers."""
         own = vars(self)
-        return {name: own[name] for name in OWN if known(own[name])}
+        some = ((name, own[name]) for name in OWN if own[name] is not NOT_KNOWN)
+        return {name: number for name, number in some if known(number)}
 
 
 OWN = tuple(item.name for item in fields(Diagnostics) if item.name not in ("shifts", "extra"))
