@@ -72,10 +72,8 @@ def start_missed(prepared: Prepared, verdict: Verdict) -> list[Finding]:
     noise, law = prepared.identifier.observed.noise, prepared.case.law
     if isinstance(law, SensitivityLaw) and isinstance(law.noise, int | float):
         noise = np.array([law.noise])
-    # Readings that come later have moved on from the start.
-    late = prepared.t0 < prepared.first.t
     doubted = verdict.level in ("caution", "do not trust")
-    if late or not (settings and doubted) or noise is None or missed <= MISSED * np.median(noise):
+    if not (settings and doubted) or noise is None or missed <= MISSED * np.median(noise):
         return []
     unit = prepared.case.equation.state.unit
     text, remedy = FINDINGS["start, missed"].filled(
@@ -202,9 +200,12 @@ def _initial(prepared: Prepared) -> tuple[str, ...]:
 
 
 def first_miss(prepared: Prepared) -> float:
-    """Return the root mean square of the first readings less the start, 0 if it is no number."""
-    case = prepared.case
-    if case.equation.components or not isinstance(prepared.u0, float):
+    """Return the root mean square of the first readings less the start, 0 if it is no number.
+
+    Readings that come later than the start have moved on from it: 0, too.
+    """
+    later = prepared.t0 < prepared.first.t
+    if later or prepared.case.equation.components or not isinstance(prepared.u0, float):
         return 0.0
     seen = _first_readings(prepared)
     return float(np.sqrt(np.mean((seen - prepared.u0) ** 2))) if len(seen) else 0.0
