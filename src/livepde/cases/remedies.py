@@ -91,12 +91,13 @@ def _with_remedy(case: Case, cause: Cause, settings: tuple[str, ...]) -> Cause:
         return replace(cause, remedy=JUMPED)
     if cause.kind not in KEYS or cause.subject not in case.roles("sensor"):
         return cause
-    if settings == settings_in(cause.setting):  # the remedy has the value, and its unit
-        return cause
+    table = case.families.get(cause.subject, cause.subject)  # a family has one table
+    if settings == settings_in(cause.setting) and table == cause.subject:
+        return cause  # the remedy has the value, and its unit
     if not settings:
         return replace(cause, remedy=LIKELY[cause.kind].remedy.format(name=cause.subject))
     value = settings[0].partition("=")[2]
-    return replace(cause, remedy=estimating(cause.kind, cause.subject, value))
+    return replace(cause, remedy=estimating(cause.kind, table, value))
 
 
 def _may_jump(case: Case, name: str) -> bool:
