@@ -10,11 +10,13 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+import tomlkit
 from commands import bad, call
 from factories import short_rod
 
 from benchmarks.first_hour import FOLDER
 from livepde import cases
+from livepde.cases.case import with_members
 from livepde.cases.read import apply, filled, parse, read_toml
 from livepde.cases.remedies import NO_SETTING, freed, with_settings
 from livepde.cases.variants import (
@@ -274,6 +276,28 @@ def causes() -> list[Cause]:
     process = [Cause(kind, "", "", size=SIZES[kind]) for kind in ("source", "loss")]
     jump = Cause("jump", "alpha", "", setting='law.jumps=["alpha"]')
     return [*sensors, *process, Cause("flux", "right", "", size=1e-3), jump]
+
+
+def test_a_setting_of_a_sensor_writes_its_family_as_single_channels(tmp_path):
+    path = short_rod(tmp_path)
+    (tmp_path / "places.csv").write_text("name,x\n10,0.1\n30,0.3\n")
+    lines = [one for one in path.read_text().splitlines() if not one.startswith(("T_1", "T_3"))]
+    where = 1 + lines.index(next(one for one in lines if one.startswith("[channels]")))
+    family = 'T = { role = "sensor", positions = "places.csv", column = "T_{}", noise = "0.05 K" }'
+    path.write_text("\n".join([*lines[:where], family, *lines[where:]]))
+    cause = Cause("offset", "10", "", size=0.5)
+    verdict = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=(cause,))])
+    (found,) = with_settings(cases.load(path).prepare(), verdict).findings[0].causes
+    assert found.remedy == estimating("offset", "T", '"1 K"')  # the table that the case has
+    settings = parse([found.setting, "channels.30.column=T_20"])
+    case = cases.load(path, settings=settings)
+    assert list(case.roles("sensor")) == ["10", "30"]
+    assert case.model.parameter_space.labels.keys() == {"alpha", "offset[10]"}
+    assert (case.columns["10"].names, case.columns["30"].names) == (("T_10",), ("T_20",))
+    document = tomlkit.parse(path.read_text())
+    with_members(document, settings, path, allow_code=False)
+    path.write_text(filled(tomlkit.dumps(document), settings, str(path)))
+    assert cases.load(path).spec == case.spec
 
 
 @pytest.mark.slow

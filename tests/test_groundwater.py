@@ -21,7 +21,13 @@ from livepde.cases.remedies import freed, start_missed, usual_shift
 from livepde.diagnostics import check_model
 from livepde.errors import CaseError, ModelError
 from livepde.fem import grid
-from livepde.models import advection_dispersion, groundwater, mobile_immobile, pumping_test
+from livepde.models import (
+    advection_dispersion,
+    borehole,
+    groundwater,
+    mobile_immobile,
+    pumping_test,
+)
 from livepde.stepping import Advance, Alexander2, simulate
 from livepde.verdict import Cause
 
@@ -271,6 +277,17 @@ def test_what_is_wrong_is_said():
         groundwater(mesh, T, lp.Piecewise({"a": lambda x: x[0] > 30.0}, lp.Normal(1.0, 1.0)))
     with pytest.raises(ModelError, match="thickness, must be positive"):
         pumping_test(lp.interval(0.1, 10.0, 5, geometric=True), T, T, b=0.0)
+    # A drawdown with the quotient of two storages in its weak form was four times too large.
+    rings = lp.Piecewise({"near": lambda x: x[0] < 20.0, "far": lambda x: x[0] > 20.0}, T)
+    radii = lp.interval(0.1, 1000.0, 9, geometric=True)
+    field = lp.Field(radii, lp.linear(radii), prior=T)
+    for varies in (rings, field):
+        with pytest.raises(ModelError, match="pumping_test: an unknown Ss must be one number"):
+            pumping_test(radii, T, varies, b=10.0)
+        with pytest.raises(ModelError, match="borehole: an unknown rho_c must be one number"):
+            borehole(radii, T, T, H=1.0, rho_c=varies, T0=10.0)
+        with pytest.raises(ModelError, match="mobile_immobile: an unknown phi must be one number"):
+            mobile_immobile(radii, T, T, varies, T)
     with pytest.raises(ModelError, match="needs a mesh of a plane"):
         groundwater(lp.interval(0.0, 1.0, 5), T, T, wells={"Q": (0.5,)})
 

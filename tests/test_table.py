@@ -160,6 +160,25 @@ def test_columns_with_blanks_between_them(csv, text, follow):
     assert found == [[0.0, 1.0, 2.0], [1.0, 3.0, 4.0]]
 
 
+@pytest.mark.parametrize("text", ["t T 1 a b\n0 9 1 2\n1 9 3 4\n", "t a b\n0 1\n1 3 4\n"])
+def test_a_row_shorter_than_a_header_of_blanks_is_refused(csv, text):
+    """Else a column would have the values of its neighbour."""
+    path, columns = csv(text), {"T": Column(("a",))}
+    with pytest.raises(DataError, match=r"row 2: . fields, but the header has .*a blank in them"):
+        read_csv(path, columns, Clock("t"), separator=" ")
+    with closing(Follow(path, separator=" ")) as source:
+        assert "the header has" in source.poll(0.0)[0].broken
+
+
+def test_quoted_names_with_blanks_are_one_column(csv):
+    path = csv('t "T 1" a\n0  9 1\n1 9\t3\n')
+    columns = {"T": Column(("a",)), "S": Column(("T 1",))}
+    table = read_csv(path, columns, Clock("t"), separator=" ")
+    assert table.values.tolist() == [[1.0, 9.0], [3.0, 9.0]]
+    with closing(Follow(path, separator=" ")) as source:
+        assert [row.values["a"] for row in source.poll(0.0)] == ["1", "3"]
+
+
 def test_decimal_commas_are_no_fields_beside_an_empty_last_one(csv):
     path = csv("t,a,b,\n0,1,5,2,\n1,3,4,4,\n")  # a = 1,5
     with pytest.raises(DataError, match="row 2: 5 fields, but the header has 4; decimals need"):

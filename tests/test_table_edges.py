@@ -17,7 +17,7 @@ from livepde.cases.case import Prepared
 from livepde.cases.live_case import LiveCase
 from livepde.cases.measured import measured
 from livepde.cases.new_case import channels_in
-from livepde.cases.remedies import after_gaps, start_missed, with_settings
+from livepde.cases.remedies import after_gaps, freed, start_missed, with_settings
 from livepde.cli.check import _refused
 from livepde.errors import CaseError, DataError, SampleError
 from livepde.models import EQUATIONS, heat
@@ -163,6 +163,10 @@ def test_a_start_that_the_first_readings_miss_is_named(tmp_path):
     assert not start_missed(prepared, Verdict.of([]))
     near = changed(tmp_path / "near", lambda table: None)
     assert not start_missed(near, doubted)
+    # Later readings have moved on from the start: they say nothing of it.
+    later = changed(tmp_path / "later", lambda table: None, initial="90 degC", **{"data.t0": -60.0})
+    assert not start_missed(later, doubted)
+    assert not freed(later, Cause("initial", "", ""))
 
 
 def test_jumps_that_are_allowed_already_are_no_advice(tmp_path):

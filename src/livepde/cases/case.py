@@ -26,7 +26,7 @@ from livepde.cases.process import (
     value_of,
     wall_attributes,
 )
-from livepde.cases.read import apply, did_you_mean, read_spec, read_text, read_toml
+from livepde.cases.read import apply, did_you_mean, key_path, read_spec, read_text, read_toml
 from livepde.cases.schema import SENSORS, GradientSpec, SensitivitySpec
 from livepde.diagnostics.check_report import Bound, Sense
 from livepde.errors import DataError, LawError
@@ -214,17 +214,30 @@ def load(
     document = read_toml(text, str(file))
     for each in (settings,) if isinstance(settings, Mapping) else settings or ():
         if each:
+            with_members(document, each, file, allow_code)
             document = apply(document, each, str(file))
             text = tomlkit.dumps(document)
-    spec = read_spec(document, str(file))
-    place = (spec, file.parent, str(file), allow_code)
-    # Families of sensors become single channels first, because conditions name single ones.
-    content = conditioned(
-        case_channels.expanded(CaseContent(file, spec, resolve(*place), reader_of(*place)))
-    )
-    case = Case(content.path, content.spec, content.equation, content.reader, text, original)
+    content = conditioned(_expanded(document, file, allow_code))
+    whole = content.path, content.spec, content.equation, content.reader, text, original
+    case = Case(*whole, families=content.families)
     case.check()
     return case
+
+
+def _expanded(document: Mapping[str, Any], file: Path, allow_code: bool) -> CaseContent:
+    """Return the content of a document, with each family of sensors as single channels."""
+    spec = read_spec(document, str(file))
+    place = (spec, file.parent, str(file), allow_code)
+    return case_channels.expanded(CaseContent(file, spec, resolve(*place), reader_of(*place)))
+
+
+def with_members(
+    document: dict[str, Any], settings: Mapping[str, Any], file: Path, allow_code: bool
+) -> None:
+    """Write the families of which settings name a member as single channels of a document."""
+    paths = [key_path(key, str(file)) for key in settings]
+    names = [path[1] for path in paths if path[0] == "channels" and len(path) > 2]
+    case_channels.split_families(document, names, lambda: _expanded(document, file, allow_code))
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -401,6 +401,7 @@ def _initial_readings(case: CaseContent, first: Sample) -> list[_Reading]:
 def expanded(case: CaseContent) -> CaseContent:
     """Return the case with every family of channels, `each` or `positions`, as single ones."""
     channels: dict[str, schema.ChannelSpec] = {}
+    families: dict[str, str] = {}
     for name, channel in case.spec.channels.items():
         if channel.each is not None:
             key, members = f"channels.{name}.each", _evenly(case, name, channel)
@@ -414,7 +415,29 @@ def expanded(case: CaseContent) -> CaseContent:
                 raise case.error(key, f"there is a channel '{label}' already; rename it.")
             member = {"each": None, "positions": None, "at": at, "column": column}
             channels[label] = channel.model_copy(update=member)
-    return replace(case, spec=case.spec.model_copy(update={"channels": channels}))
+            families[label] = name
+    spec = case.spec.model_copy(update={"channels": channels})
+    return replace(case, spec=spec, families=families)
+
+
+def split_families(
+    document: Mapping[str, Any], names: Collection[str], content: Callable[[], CaseContent]
+) -> None:
+    """Write the families of which `names` has a member as single channels in a case's document.
+
+    `content`: returns the content of the document, with the families it has.
+    """
+    channels = document.get("channels")
+    if not isinstance(channels, dict) or set(names) <= channels.keys():
+        return
+    case = content()
+    for family in {case.families[name] for name in names if name in case.families}:
+        given = channels.pop(family)
+        common = {key: given[key] for key in given if key not in ("each", "positions")}
+        for label in (label for label, of in case.families.items() if of == family):
+            member = case.spec.channels[label]
+            at = list(member.at) if isinstance(member.at, tuple) else member.at
+            channels[label] = {**common, "at": at, "column": member.column}
 
 
 def _evenly(

@@ -7,7 +7,7 @@ import importlib.util
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ class CaseContent:
     spec: CaseSpec
     equation: Equation
     reader: Callable[..., Any] | None  # of its data, if it names one
+    families: Mapping[str, str] = field(default_factory=dict, kw_only=True)  # sensor -> its family
 
     @property
     def name(self) -> str:

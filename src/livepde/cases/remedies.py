@@ -72,10 +72,8 @@ def start_missed(prepared: Prepared, verdict: Verdict) -> list[Finding]:
     noise, law = prepared.identifier.observed.noise, prepared.case.law
     if isinstance(law, SensitivityLaw) and isinstance(law.noise, int | float):
         noise = np.array([law.noise])
-    # Readings that come later have moved on from the start.
-    late = prepared.t0 < prepared.first.t
     doubted = verdict.level in ("caution", "do not trust")
-    if late or not (settings and doubted) or noise is None or missed <= MISSED * np.median(noise):
+    if not (settings and doubted) or noise is None or missed <= MISSED * np.median(noise):
         return []
     unit = prepared.case.equation.state.unit
     text, remedy = FINDINGS["start, missed"].filled(
@@ -93,12 +91,13 @@ def _with_remedy(case: Case, cause: Cause, settings: tuple[str, ...]) -> Cause:
         return replace(cause, remedy=JUMPED)
     if cause.kind not in KEYS or cause.subject not in case.roles("sensor"):
         return cause
-    if settings == settings_in(cause.setting):  # the remedy has the value, and its unit
-        return cause
+    table = case.families.get(cause.subject, cause.subject)  # a family has one table
+    if settings == settings_in(cause.setting) and table == cause.subject:
+        return cause  # the remedy has the value, and its unit
     if not settings:
         return replace(cause, remedy=LIKELY[cause.kind].remedy.format(name=cause.subject))
     value = settings[0].partition("=")[2]
-    return replace(cause, remedy=estimating(cause.kind, cause.subject, value))
+    return replace(cause, remedy=estimating(cause.kind, table, value))
 
 
 def _may_jump(case: Case, name: str) -> bool:
@@ -202,9 +201,12 @@ def _initial(prepared: Prepared) -> tuple[str, ...]:
 
 
 def first_miss(prepared: Prepared) -> float:
-    """Return the root mean square of the first readings less the start, 0 if it is no number."""
-    case = prepared.case
-    if case.equation.components or not isinstance(prepared.u0, float):
+    """Return the root mean square of the first readings less the start, 0 if it is no number.
+
+    Readings that come later than the start have moved on from it: 0, too.
+    """
+    later = prepared.t0 < prepared.first.t
+    if later or prepared.case.equation.components or not isinstance(prepared.u0, float):
         return 0.0
     seen = _first_readings(prepared)
     return float(np.sqrt(np.mean((seen - prepared.u0) ** 2))) if len(seen) else 0.0

@@ -12,12 +12,14 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+import tomlkit
 import typer
 from rich.markup import escape
 from threadpoolctl import threadpool_limits
 
 from livepde import runs
 from livepde.atomic_write import write_bytes
+from livepde.cases.case import with_members
 from livepde.cases.read import filled, parse, read_text
 from livepde.cases.variants import (
     AS_STATED,
@@ -127,7 +129,9 @@ def compare(
     elif write is not None:
         text = read_text(case)
         for each in (settings, best.variant.settings):
-            text = filled(text, parse(each), str(case))
+            document = tomlkit.parse(text)
+            with_members(document, parse(each), case, allow_code)
+            text = filled(tomlkit.dumps(document), parse(each), str(case))
         write_bytes(write, text.encode())
         of = "" if data is None else f" --data {data}"  # the case may name other data
         notes.append(f"Wrote {write}: livepde run {write}{of}")

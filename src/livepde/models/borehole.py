@@ -12,7 +12,15 @@ import numpy as np
 from livepde.errors import ModelError
 from livepde.fem import Field, On, Place, Scalar, Unknown, declared, dot, grad, linear
 from livepde.model import Model
-from livepde.models.description import Equation, Number, Option, Quantity, Variable, by_name
+from livepde.models.description import (
+    Equation,
+    Number,
+    Option,
+    Quantity,
+    Variable,
+    by_name,
+    one_number,
+)
 
 
 def borehole(
@@ -39,7 +47,13 @@ def borehole(
         Volumetric heat capacity of the ground in J/(m^3 K), known or unknown.
     T0
         Undisturbed temperature in degC.
+
+    Raises
+    ------
+    ModelError
+        rho_c is unknown by region or as a field.
     """
+    one_number("borehole", rho_c=rho_c)
     # Quadrature of order four integrates the weight r with elements of first order exactly.
     state = Field(mesh, element or linear(mesh), dirichlet={"right": T0}, unit="degC", quadrature=4)
     if isinstance(rho_c, int | float):

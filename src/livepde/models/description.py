@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 from livepde.errors import ModelError
-from livepde.fem import Field, Integrand, Place, Unknown
+from livepde.fem import Field, Integrand, Piecewise, Place, Scalars, Unknown
 from livepde.fem.fields import SIDES
 from livepde.model import Model
 
@@ -183,6 +183,19 @@ class by_name:
 
 Number: TypeAlias = Unknown | float
 """A coefficient of an equation: unknown, or a known number."""
+
+# Unknowns that are several numbers: an equation that is divided by one has the gradient of its
+# inverse as a further term.
+VARYING = (Field, Piecewise, Scalars)
+
+
+def one_number(equation: str, **unknowns: Any) -> None:
+    """Refuse unknowns by region or as a field, by which an equation is divided."""
+    for name, unknown in unknowns.items():
+        if isinstance(unknown, VARYING):
+            text = f"an unknown {name} must be one number; give a Scalar or a prior."
+            raise ModelError(f"{equation}: {text}")
+
 
 INITIAL = Variable("", "initial state, a field; else the case's `initial`", optional=True)
 

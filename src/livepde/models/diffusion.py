@@ -8,7 +8,7 @@ from typing import Any
 from livepde import fem
 from livepde.errors import ModelError
 from livepde.model import Model
-from livepde.models.description import Equation, Fluxes, Option, Variable, by_name
+from livepde.models.description import Equation, Fluxes, Option, Variable, by_name, one_number
 
 AMBIENT = "ambient"
 
@@ -118,15 +118,14 @@ def conduction(
     ... )
     """
     unknowns = {"k": k, "loss": loss, "transfer": transfer, "source": source}
-    # Where C varies, the gradient of 1/C is a further term.
-    if isinstance(C, fem.Field | fem.Piecewise | fem.Scalars):
-        raise ModelError("conduction: an unknown C must be one number; give a Scalar or a prior.")
+    one_number("conduction", C=C)
     if isinstance(C, fem.Scalar | fem.Prior):
         unknowns["C"] = C
         return _model(CONDUCTION, mesh, unknowns, dirichlet, lambda x: 1.0, element, unit)
-    if not callable(C) and not C > 0:
+    given: Any = C
+    if not callable(C) and not given > 0:
         raise ModelError(f"conduction: the heat capacity C must be positive; got {C}.")
-    capacity = C if callable(C) else lambda x: C
+    capacity = C if callable(C) else lambda x: given
     return _model(CONDUCTION, mesh, unknowns, dirichlet, capacity, element, unit)
 
 

@@ -12,7 +12,7 @@ from livepde.errors import ModelError
 from livepde.fem import Channel, Field, On, Piecewise, Place, Unknown, dot, grad, linear
 from livepde.linalg import Array
 from livepde.model import Model
-from livepde.models.description import Equation, Option, Variable, by_name
+from livepde.models.description import Equation, Option, Variable, by_name, one_number
 
 
 def pumping_test(
@@ -50,8 +50,9 @@ def pumping_test(
     Raises
     ------
     ModelError
-        The thickness is not positive.
+        The thickness is not positive, or Ss is unknown by region or as a field.
     """
+    one_number("pumping_test", Ss=Ss)
     if not b > 0:
         raise ModelError(f"pumping_test: b, the thickness, must be positive; got {b}.")
     # Quadrature of order four integrates the weight r with elements of first order exactly.
@@ -336,9 +337,10 @@ def mobile_immobile(
     Raises
     ------
     ModelError
-        The inlet is unknown.
+        The inlet is unknown, or phi is unknown by region or as a field.
     """
     _check("mobile_immobile", inlet)
+    one_number("mobile_immobile", phi=phi)
 
     # The equations are divided by phi and 1 - phi: the mass form is free of unknowns.
     def transport(q: Any, u: Any, w: Any, x: Any) -> Any:

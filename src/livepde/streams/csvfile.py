@@ -137,9 +137,9 @@ def rows_of(lines: Iterable[str], separator: str, *, headed: bool = False) -> It
         yield from csv.reader(lines, delimiter=separator, skipinitialspace=True)
         return
     for line in lines:
-        text = line.strip()
-        if not text.startswith("#"):
-            yield text.split()
+        text = " ".join(line.split())
+        if not text.startswith("#"):  # names with blanks have quotes
+            yield from csv.reader([text], delimiter=BLANK) if text else [[]]
         elif headed:
             yield [text]
         else:  # a header that is a comment, whose names may have commas between them
@@ -341,11 +341,14 @@ def _width(cells: Sequence[str]) -> int:
     return max((k for k, cell in enumerate(cells, start=1) if cell.strip()), default=0)
 
 
-def too_wide(cells: list[str], header: list[str]) -> bool:
+def unlike(cells: list[str], header: list[str], separator: str) -> bool:
     """Return whether a row is longer than the header, and not only by empty fields.
 
-    A separator at the end of each row, or of the header, is no field.
+    A separator at the end of each row, or of the header, is no field. Between blanks no field is
+    empty: a shorter row lacks a field there, or a name has blanks.
     """
+    if separator == BLANK and len(cells) < len(header):
+        return True
     return len(cells) > len(header) and _width(cells) > _width(header)
 
 
@@ -370,10 +373,11 @@ def _cells(
         for number, row in numbered:
             if row[0].startswith("#"):  # a comment
                 continue
-            if too_wide(row, header):
+            if unlike(row, header, separator):
                 raise SampleError(
                     f"{path}, row {number}: {len(row)} fields, but the header has "
-                    f"{len(header)}; decimals need a point, and fields with a comma in them quotes."
+                    f"{len(header)}; decimals need a point, and fields with a "
+                    f"{'blank' if separator == BLANK else 'comma'} in them quotes."
                 )
             # Cells that a row lacks at its end are empty.
             row += [""] * (len(header) - len(row))

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from livepde.errors import DataError
-from livepde.streams.csvfile import UNDER, UTF_8, are_labels, is_title, rows_of, too_wide
+from livepde.streams.csvfile import UNDER, UTF_8, are_labels, is_title, rows_of, unlike
 from livepde.streams.growing_file import LONGEST, UTF_16, FilePosition, GrowingFile, Line
 from livepde.streams.table import JSON_LINES, no_file
 
@@ -282,7 +282,7 @@ class Follow(RowSource):
                 return None
         if self._is_header(cells):
             return self._headed(cells, token)
-        if too_wide(cells, self._header):
+        if unlike(cells, self._header, self._separator):
             text = f"{len(cells)} fields, the header has {len(self._header)}"
             return Row({}, token=token, broken=text)
         values = dict(zip(self._header, cells, strict=False))
