@@ -1147,3 +1147,13 @@ def test_the_column_of_times_is_time_unless_another_is_named(rod):
     path = rod(('time = "time_s"', ""))
     with pytest.raises(lp.errors.SampleError, match="there is no column 'time'; did you mean"):
         cases.load(path).prepare()
+
+
+def test_sensors_are_named_in_the_order_of_an_innovation(tmp_path):
+    """Else metrics and the table of predictions give the numbers of one sensor to another."""
+    mean = "channels.mean={ role='sensor', column='T_20', over=[0.1, 0.2], noise='0.05 K' }"
+    last = "channels.T_21={ role='sensor', column='T_20', at='20 cm', noise='0.05 K' }"
+    settings = parse(["channels.T_20=", mean, last])
+    case = cases.load(short_rod(tmp_path), settings=settings)
+    assert case.prepare().identifier.observed.names == case.sensors
+    assert case.sensors != tuple(case.roles("sensor"))

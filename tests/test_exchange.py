@@ -329,6 +329,13 @@ def test_missing_values_are_those_of_the_case(rod, tmp_path):
     assert shown == pytest.approx(identifier.forecast(t)["T_30"][0] + 273.15)
 
 
+@pytest.mark.parametrize("key", ["late", "noise_column"])
+def test_what_a_unit_would_not_do_is_refused(rod, key):
+    value = {"late": "10 s", "noise_column": "T_20"}[key]
+    with pytest.raises(lp.errors.CaseError, match=f"channels.T_10.{key}"):
+        recipe_of(load(rod, settings={f"channels.T_10.{key}": value}))
+
+
 @pytest.mark.slow
 def test_time_goes_in_seconds_whatever_the_model_counts(tmp_path):
     model = lp.Model(

@@ -337,8 +337,9 @@ class Case(CaseContent):
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Names of the sensors that are assimilated."""
-        return tuple(self.roles("sensor"))
+        """Names of the sensors that are assimilated, in the order of an innovation."""
+        kinds = case_channels.kinds_of(self.roles("sensor"))
+        return tuple(chain.from_iterable(kinds.values()))
 
     @cached_property
     def validation(self) -> Observation | None:

@@ -64,10 +64,7 @@ def observation_of(case: CaseContent, *roles: str) -> observation.Observation | 
     channels, assimilated = case.roles(*roles), "sensor" in roles
     if not channels:
         return None
-    # One observation reads all channels of a kind and a component of the state.
-    kinds: Kinds = {}
-    for name, channel in channels.items():
-        kinds.setdefault((_kind(channel), channel.of), {})[name] = channel
+    kinds = kinds_of(channels)
     names = [*chain.from_iterable(kinds.values())]
     levels = noise_of(case) if assimilated else None
     units = {case.unit(name) for name in names}
@@ -80,6 +77,14 @@ def observation_of(case: CaseContent, *roles: str) -> observation.Observation | 
     if assimilated and any(one.offset or one.gain or one.correlated for one in channels.values()):
         return _calibrated(case, _whole(case, kinds, {}), names, **outer)
     return _whole(case, kinds, outer)
+
+
+def kinds_of(channels: Mapping[str, schema.ChannelSpec]) -> Kinds:
+    """Return sensors by kind and component of the state: one observation reads each of them."""
+    kinds: Kinds = {}
+    for name, channel in channels.items():
+        kinds.setdefault((_kind(channel), channel.of), {})[name] = channel
+    return kinds
 
 
 def _whole(case: CaseContent, kinds: Kinds, outer: Mapping[str, Any]) -> observation.Observation:

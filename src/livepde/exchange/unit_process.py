@@ -12,6 +12,7 @@ import numpy as np
 
 from livepde import checkpoint
 from livepde.cases import Case
+from livepde.cases.data import refuse_late
 from livepde.errors import ConfigurationError, LivepdeError
 from livepde.frames import snapshot_of, vertex_order
 from livepde.identifier import Identifier
@@ -179,9 +180,18 @@ def of_case(case: Case, origin: datetime | None = None) -> UnitProcess:
     """Return the process of a case.
 
     `origin`: the date of t = 0, if the times of the case's data are dates.
+
+    Raises
+    ------
+    CaseError
+        A channel is late, or has a column of noise: an input of the unit has neither.
     """
+    refuse_late(case)
     ports = {}
     for name, channel in case.spec.channels.items():
+        if channel.noise_column is not None:
+            text = "an exported unit has no input for the noise of each reading: leave it out."
+            raise case.error(f"channels.{name}.noise_column", text)
         unit = channel.unit or case.unit(name)
         column = replace(case.columns[name], names=(name,))
         columns = " and ".join(channel.sources)
