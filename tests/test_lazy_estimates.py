@@ -14,10 +14,10 @@ import livepde as lp
 from livepde.checkpoint import flatten
 from livepde.frames import interval_ends
 from livepde.laws import Belief
-from livepde.laws.filter_state import FilterState
 from livepde.models import heat
 from livepde.readout import ScalarReadout
 from livepde.records import Record, RecordArrays, Snapshot
+from livepde.result import read_together
 
 
 def rod(unknown=None, law=None, validation=None, cells=30):
@@ -68,6 +68,19 @@ def test_an_estimate_that_is_read_later_is_the_same(unknown, law):
             np.testing.assert_array_equal(getattr(read, name), getattr(at_once, name))
 
 
+def test_estimates_that_are_read_together_are_the_same():
+    """To the bit, also where the intervals of only some of them are wider than expected."""
+    taken = [*samples(12)]
+    for _, values in taken[:6]:
+        values |= {f"T_{n}": 1.0 for n in range(1, 6)}
+    alone, together = ([*map(rod(UNKNOWNS[2]).step, *zip(*taken, strict=True))] for _ in range(2))
+    read_together(together)
+    for one, other in zip(alone, together, strict=True):
+        assert one.diagnostics.named() == other.diagnostics.named()
+        for name in ("q", "u", "q_factor", "u_factor", "prior_factor", "rest"):
+            np.testing.assert_array_equal(getattr(one.belief, name), getattr(other.belief, name))
+
+
 @pytest.mark.slow
 def test_what_is_not_read_is_not_computed(monkeypatch):
     made = []
@@ -94,8 +107,7 @@ def test_an_unread_estimate_holds_no_factor_of_the_stage():
     identifier = rod(cells=300)  # what the gate remembers of five sensors is little beside it
     for sample in samples(5):
         estimate = identifier.step(*sample)
-    kept = vars(estimate)["_read"].__closure__
-    (now,) = (x for x in (cell.cell_contents for cell in kept) if isinstance(x, FilterState))
+    _, now = vars(estimate)["_read"].item
     leaves = flatten(replace(now, ledger=None))  # an empty one, which all estimates share
     assert not now.ledger.rows.size
     held = [leaf for leaf in leaves.values() if isinstance(leaf, np.ndarray)]

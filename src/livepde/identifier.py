@@ -41,6 +41,7 @@ from livepde.laws import (
     numerical,
     stepped,
 )
+from livepde.laws.later import then
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.laws.verdict import StepLedger
 from livepde.linalg import Array, nonfinite_allowed
@@ -561,7 +562,7 @@ class Identifier(Shown):
         # when read.
         latent, judge = self.law.deferred(self._work, self._state)
         problem, error = self.problem, validation
-        read = latent if self.model.latent.plain else lambda: problem.physical(latent())
+        read = latent if self.model.latent.plain else then(latent, problem.physical)
         if self.validation is not None:
             belief = read()
             read = lambda: belief  # noqa: E731
@@ -579,7 +580,7 @@ class Identifier(Shown):
             validation_error=error,
             status=report.status,
             steps=report.steps,
-            diagnose=lambda: report.diagnostics,
+            diagnose=report.diagnose,
             held=held,
             space=self.model.parameter_space,
             state_space=self.model.state_space,

@@ -30,6 +30,7 @@ from livepde.frames import (
     with_estimates,
 )
 from livepde.laws import Belief, Fit, Status
+from livepde.laws.later import together
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.model import Model
@@ -299,6 +300,18 @@ class Estimate(Shown):
         return Marginal(values.reshape(shape), std.reshape(shape), space.unknown_of(name))
 
 
+def read_together(estimates: Sequence[Estimate]) -> None:
+    """Compute what estimates leave until it is read, at once: beliefs and diagnostics."""
+    parts = [vars(estimate) for estimate in estimates]
+    for name, function in (("belief", "_read"), ("diagnostics", "diagnose")):
+        # Another thread may read some of them meanwhile.
+        each = ((own, own.get(function)) for own in parts if name not in own)
+        unread = [(own, read) for own, read in each if read is not None]
+        for (own, _), value in zip(unread, together([read for _, read in unread]), strict=True):
+            own[name] = value
+            own.pop("_read", None)
+
+
 class Result(Shown):
     """Estimates of a run, as they are added.
 
@@ -413,6 +426,7 @@ class Result(Shown):
 
     def _records(self, estimates: Sequence[tuple[Estimate, bool]]) -> Iterator[Record]:
         """Iterate over the records of estimates, each with whether its fields are kept."""
+        read_together([estimate for estimate, _ in estimates])
         numbers = self._readout([estimate.belief for estimate, _ in estimates])
         for (estimate, keeps), row in zip(estimates, numbers, strict=True):
             yield Record(

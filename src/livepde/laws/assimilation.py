@@ -13,6 +13,7 @@ import numpy as np
 from livepde.laws.filter import Filter, Update
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gate import Gate
+from livepde.laws.later import then
 from livepde.laws.law import Report, Status
 from livepde.laws.step_diagnostics import Diagnostics, stacked
 from livepde.linalg import Array, IntArray, Mask
@@ -59,9 +60,8 @@ class MemberReports:
         """Return the report of one member."""
         steps = int(self.steps[k])
         parts = 1 if self.parts is None else int(self.parts[k])
-        return Report(
-            self.statuses[k], self.predicted[k], steps, lambda: self.diagnostics.member(k), parts
-        )
+        diagnose = then(self.diagnose, lambda found: found.member(k))
+        return Report(self.statuses[k], self.predicted[k], steps, diagnose, parts)
 
     def updated(self, more: Diagnostics[Array]) -> MemberReports:
         """Return the reports with all that other diagnostics know among their own."""
@@ -76,8 +76,10 @@ class MemberReports:
             statuses[k], predicted[k], steps[k] = one.status, one.predicted, one.steps
 
         def diagnosed() -> Diagnostics[Array]:
-            each = (reports.get(k, self.member(k)) for k in range(len(statuses)))
-            return stacked([one.diagnostics for one in each])
+            found = {k: one.diagnostics for k, one in reports.items()}
+            rest = (k for k in range(len(statuses)) if k not in reports)
+            found |= {k: self.diagnostics.member(k) for k in rest}
+            return stacked([found[k] for k in range(len(statuses))])
 
         return MemberReports(tuple(statuses), predicted, steps, diagnosed, self.parts)
 

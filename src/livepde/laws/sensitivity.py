@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -39,7 +39,9 @@ from livepde.laws.sensitivity_state import (
     Scale,
     SensitivityState,
     SensitivityWork,
+    joined,
     kept_for_estimates,
+    read_later,
     reports_of,
     shortened,
     stored,
@@ -530,7 +532,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 return found
             return with_discretisation(found, work.filter.shadows, now.shadows)
 
-        return Deferred(lambda: self.member_belief(work, now, 0), verdict)
+        return Deferred(read_later(self._beliefs, work, now), verdict)
 
     def final(
         self, work: SensitivityWork, state: SensitivityState, *, columns: bool = True
@@ -555,18 +557,24 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     def member_belief(self, work: SensitivityWork, now: FilterState, k: int) -> Belief:
         """Return the belief of one member, in latent coefficients."""
-        filter_ = work.filter
-        reduction, one = filter_.reduction, take(now, k)
-        drift = float(filter_.drifts(one.member)[0])
-        U, C = self.factors(work, one)
-        return Belief(
-            reduction.bounded(now.q[k] + reduction.Phi @ now.da[k]),
-            now.u[k] + now.du[k],
-            reduction.Phi @ C[0].T,
-            U[0].T,
-            reduction.Phi,
-            reduction.rest(float(now.age[k]), drift),
-        )
+        return self._beliefs([(work, take(now, k))])[0]
+
+    def _beliefs(self, samples: Sequence[tuple[SensitivityWork, FilterState]]) -> list[Belief]:
+        """Return the beliefs of one member after some samples."""
+        (work, _), now = samples[0], joined([x for _, x in samples])
+        reduction, drifts = work.filter.reduction, work.filter.drifts(now.member).tolist()
+        Phi, ages, (U, C) = reduction.Phi, now.age.tolist(), self.factors(work, now)
+        return [
+            Belief(
+                reduction.bounded(now.q[k] + Phi @ now.da[k]),
+                now.u[k] + now.du[k],
+                Phi @ C[k].T,
+                U[k].T,
+                Phi,
+                reduction.rest(ages[k], drifts[k]),
+            )
+            for k in range(len(now))
+        ]
 
 
 def _started(work: SensitivityWork, state: SensitivityState, x: FilterState) -> SensitivityState:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,13 @@ from livepde.laws.assimilation import OK, Assimilation, MemberReports, UpdateOpt
 from livepde.laws.filter import Filter, robust_factors
 from livepde.laws.filter_state import NO_LEDGER, FilterState, unaccompanied
 from livepde.laws.history import added, trimmed, withdrawn
+from livepde.laws.later import Later
 from livepde.laws.law import Fit, InitialReading
 from livepde.laws.noise_rows import rows_of_sensors
 from livepde.laws.policies import Guards, Jumps, Refit, Watch
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
-from livepde.linalg.member_arrays import changed, take, where, zeros
+from livepde.linalg.member_arrays import changed, join_fields, take, where, zeros
 from livepde.records import refusal
 from livepde.stepping import Span
 
@@ -26,6 +28,7 @@ MOST_TRIED = 600  # samples that are kept for trials of columns
 EARLY = 100  # samples after which a disturbance is no column that was wrong from the start
 SMOOTHED = 64  # samples that are smoothed again where unknowns move, at most
 LEAST = 32  # rows that a log is shortened by: a copy for each sample would cost more
+FEW = 20_000  # numbers of a square root up to which several samples are read together
 NEVER = np.iinfo(np.int64).max  # number of samples at which nothing is due any more
 
 
@@ -439,31 +442,36 @@ def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityStat
 
 def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> MemberReports:
     """Return the reports of the members after a sample."""
-    # Not all of the filter is kept for what may never be read.
-    members, innovations, level, q, da = len(now.q), now.innovations, now.level, now.q, now.da
-    reduction, shadows, evidence = work.filter.reduction, work.filter.shadows, now.evidence
-    if now.kept.q.shape[1]:
-        now = changed(now, kept=now.kept.forgotten())
-
-    def diagnosed() -> Diagnostics[Array]:
-        found = replace(innovations.diagnostics, log_evidence=evidence)
-        if work.options.adaptive:
-            found = replace(found, noise_level=np.sqrt(level))
-        if work.options.gate.beyond < np.inf:
-            found = _with_refused(found, told.refused, work.filter.problem.observed.names)
-        if work.jumps is not None:
-            found = replace(found, jump=np.zeros(members))
-        if shadows is not None:
-            found = found.updated(shadows.diagnostics(now, robust_factors(reduction, now)[1]))
-        estimate = q + da @ reduction.Phi.T
-        if reduction.bounded(estimate) is not estimate:
-            held = reduction.held(estimate)
-            if held.any():  # not only by bounds that a user has set
-                found = replace(found, bounded=np.where(held > 0, held, np.nan))
-        return found
-
+    members = len(now)
+    diagnose = read_later(_diagnosed, work, kept_for_estimates(now), told.refused)
     steps = np.full(members, told.steps)
-    return MemberReports((OK,) * members, told.predicted, steps, diagnosed, now.parts)
+    return MemberReports((OK,) * members, told.predicted, steps, diagnose, now.parts)
+
+
+def _diagnosed(
+    samples: Sequence[tuple[SensitivityWork, FilterState, Mask]],
+) -> list[Diagnostics[Array]]:
+    """Return the diagnostics of each sample, from the filter after it and the readings refused."""
+    (work, *_), now = samples[0], joined([x for _, x, _ in samples])
+    reduction, shadows = work.filter.reduction, work.filter.shadows
+    found = replace(now.innovations.diagnostics, log_evidence=now.evidence)
+    if work.options.adaptive:
+        found = replace(found, noise_level=np.sqrt(now.level))
+    if work.options.gate.beyond < np.inf:
+        refused = np.concatenate([refused for *_, refused in samples])
+        found = _with_refused(found, refused, work.filter.problem.observed.names)
+    if work.jumps is not None:
+        found = replace(found, jump=np.zeros(len(now)))
+    if shadows is not None:
+        found = found.updated(shadows.diagnostics(now, robust_factors(reduction, now)[1]))
+    estimate = now.q + now.da @ reduction.Phi.T
+    if reduction.bounded(estimate) is not estimate:
+        held = reduction.held(estimate)
+        if held.any():  # not only by bounds that a user has set
+            found = replace(found, bounded=np.where(held > 0, held, np.nan))
+    if len(samples) == 1:
+        return [found]
+    return [found.each(itemgetter([k])) for k in range(len(samples))]
 
 
 def _with_refused(
@@ -473,6 +481,20 @@ def _with_refused(
     some = np.flatnonzero(refused.any(axis=0)).tolist()
     each = {refusal(sensors[i]): np.where(refused[:, i], 1.0, np.nan) for i in some}
     return replace(found, refused=refused.sum(axis=1).astype(float), extra={**found.extra, **each})
+
+
+def joined(states: Sequence[FilterState]) -> FilterState:
+    """Return the filters after several samples as members of one, as far as estimates need it."""
+    names = ("member", "u", "q", "du", "da", "U", "C", "age", "level", "evidence", "innovations")
+    shadows = join_fields([x.shadows for x in states], ("u", "a", "fine", "failed"))
+    return changed(join_fields(states, names), shadows=shadows)
+
+
+def read_later(of: Any, work: SensitivityWork, x: FilterState, *more: Any) -> Later[Any]:
+    """Return a function of a filter after a sample, as `kept_for_estimates` returns it."""
+    # Large arrays gain nothing, and must not be in memory twice.
+    few = len(x) == 1 and x.U.size <= FEW
+    return Later(of, (work, x, *more), (of, id(work), x.U.shape) if few else None)
 
 
 def kept_for_estimates(x: FilterState) -> FilterState:

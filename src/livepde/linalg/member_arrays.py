@@ -5,7 +5,7 @@ Arrays without members hold what no member has, and stay so.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -66,6 +66,19 @@ def join(*states: State) -> State:
 
     whole: State = _each(joined, *states)
     return whole
+
+
+def join_fields(states: Sequence[State], names: Sequence[str]) -> State:
+    """Return some fields of states one after the other; the only state as it is.
+
+    The others are not there: whoever reads them finds an error, and no wrong number.
+    """
+    if len(states) == 1:
+        return states[0]
+    new: State = object.__new__(type(states[0]))
+    parts = {name: join(*(getattr(state, name) for state in states)) for name in names}
+    object.__setattr__(new, "__dict__", parts)
+    return new
 
 
 def put(state: State, which: Any, part: State) -> State:
