@@ -318,7 +318,7 @@ def test_estimates_are_written_to_nodes(server, tmp_path):
     assert sink_numbers != (0.0, 0.0)
     assert value in last
     assert std > 0.0
-    assert server.read("verdict") == "not judged"
+    assert server.read("verdict") == "do not trust"  # k is at the limit of its prior
     run.journal.close()
 
 
