@@ -208,7 +208,7 @@ def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> 
     for label in labels:
         for one in ended:
             if (known := one.estimates.get(label)) is not None:
-                named = f"{label} [{known.unit}]" if known.unit else label
+                named = f"{label} in {known.unit}" if known.unit else label
                 mark = "apart" if label in apart[id(one)] else ""
                 value, ends = digits(known.value, known.std)[0], (known.low, known.high)
                 each.append((named, names[id(one)], value, interval(*ends, known.std), mark))
