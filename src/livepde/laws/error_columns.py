@@ -188,7 +188,7 @@ class ErrorColumns:
         stage = ForwardStage(model)
         places = PLACES if stage.symmetric or not stage.keeps else ()
 
-        power = _radial(model)
+        power = radial_power(model)
 
         def stiffness(shape: Callable[[Any], Any]) -> Any:
             return model.bilinear(lambda u, v, x: x[0] ** power * shape(x) * dot(grad(u), grad(v)))
@@ -290,7 +290,7 @@ class ErrorColumns:
         return later(stage, p, now, h, loads, lifts)
 
 
-def _radial(model: Model) -> int:
+def radial_power(model: Model) -> int:
     """Return the power of the first coordinate that weighs all integrals: 0 where none does.
 
     It is that in M: 1 for a radius in a plane or around an axis, 2 for one in space.
