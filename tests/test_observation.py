@@ -11,7 +11,9 @@ from factories import CASES, excited, excited_q, excited_u, line, observe, produ
 from skfem import ElementLineHermite, ElementLineP1, ElementTriP1, MeshTri
 
 import livepde as lp
+from livepde.errors import ObservationError
 from livepde.fem import START, Inputs, Moment
+from livepde.models import heat
 from livepde.streams import Twin
 
 
@@ -441,3 +443,14 @@ def test_sensitivity_law_with_a_sensor_that_sees_the_parameter():
     last = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=1.0).run(twin).last
     for name, value in q_true.items():
         assert last.parameters[name][0] == pytest.approx(value, rel=0.02)
+
+
+def test_a_calibration_that_does_more_than_to_add_is_found_out():
+    model = heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": 0.0})
+    for reading in (lambda y, q, x: 2.0 * y, lambda y, q, x: y + q.alpha**2):
+        sensors = lp.observation.Calibrated(
+            lp.Points({"a": 0.3, "b": 0.6}), reading, adds=True, noise=0.01
+        )
+        identifier = lp.Identifier(model, sensors, u0=1.0)
+        with pytest.raises(ObservationError, match="adds=True, but function does more"):
+            identifier.step(0.1, [0.9, 0.9])

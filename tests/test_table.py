@@ -7,6 +7,7 @@ import re
 from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, date, datetime, timedelta
+from pathlib import Path
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -113,6 +114,17 @@ def test_as_a_german_excel_writes_it(tmp_path, encoding):
     assert [one.t for found in outcomes for one in found.ready] == table.t.tolist()
 
 
+def numbers_in(path: Path, separator: str, follow: bool) -> list[list[float]]:
+    """Return the columns t, a and b of a file that is followed, or read at once."""
+    if follow:
+        with closing(Follow(path, separator=separator)) as source:
+            rows = [row.values for row in source.poll(0.0)]
+        return [[float(row[name]) for name in ("t", "a", "b")] for row in rows]
+    columns = {"T": Column(("a",)), "S": Column(("b",))}
+    table = read_csv(path, columns, Clock("t"), separator=separator)
+    return np.column_stack([table.t, table.values]).tolist()
+
+
 @pytest.mark.parametrize("follow", [False, True])
 @pytest.mark.parametrize(
     "text",
@@ -125,14 +137,7 @@ def test_as_a_german_excel_writes_it(tmp_path, encoding):
 )
 def test_a_separator_at_the_end_of_a_row_shifts_no_column(csv, text, follow):
     path = csv(text)
-    if follow:
-        with closing(Follow(path)) as source:
-            rows = [row.values for row in source.poll(0.0)]
-        found = [[float(row[name]) for name in ("t", "a", "b")] for row in rows]
-    else:
-        table = read_csv(path, {"T": Column(("a",)), "S": Column(("b",))}, Clock("t"))
-        found = np.column_stack([table.t, table.values]).tolist()
-    assert found == [[0.0, 1.0, 2.0], [1.0, 3.0, 4.0]]
+    assert numbers_in(path, ",", follow) == [[0.0, 1.0, 2.0], [1.0, 3.0, 4.0]]
 
 
 @pytest.mark.parametrize("follow", [False, True])
@@ -149,15 +154,7 @@ def test_columns_with_blanks_between_them(csv, text, follow):
     path = csv(text)
     assert how_written(path).separator == " "
     assert header_of(path, " ", "utf-8", 0) == ["t", "a", "b"]
-    if follow:
-        with closing(Follow(path, separator=" ")) as source:
-            rows = [row.values for row in source.poll(0.0)]
-        found = [[float(row[name]) for name in ("t", "a", "b")] for row in rows]
-    else:
-        columns = {"T": Column(("a",)), "S": Column(("b",))}
-        table = read_csv(path, columns, Clock("t"), separator=" ")
-        found = np.column_stack([table.t, table.values]).tolist()
-    assert found == [[0.0, 1.0, 2.0], [1.0, 3.0, 4.0]]
+    assert numbers_in(path, " ", follow) == [[0.0, 1.0, 2.0], [1.0, 3.0, 4.0]]
 
 
 @pytest.mark.parametrize("text", ["t T 1 a b\n0 9 1 2\n1 9 3 4\n", "t a b\n0 1\n1 3 4\n"])

@@ -114,7 +114,7 @@ def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
     if "missing" in data:
         told.append("missing: far outside the other values; check them")
     # Times that are numbers count from an event, which is at rest before the first row.
-    first = table.samples.t[0]
+    first = min(one.samples.t[0] for one in table.tables)
     if equation.spacing == "geometric" and table.samples.origin is None and first > 0.0:
         data["t0"] = _open(table.time_unit)
         told.append("t0: when the process began, at rest")

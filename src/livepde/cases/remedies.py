@@ -153,8 +153,8 @@ def _of_sensor(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     given = stated
     if stated is None:
         who = prepared.identifier.observed
-        units = {"offset": who.units[who.names.index(cause.subject)].replace("degC", "K")}
-        unit = {**units, "at_std": case.equation.length_unit}.get(key, "")
+        own = who.units[who.names.index(cause.subject)].replace("degC", "K")
+        unit = {"offset": own, "at_std": case.equation.length_unit}.get(key, "")
         value = f"{WIDE * abs(size):.2g}"
         given = f"{value} {unit}" if unit else float(value)
     return (channel_setting(cause.subject, key, toml_value(given)),)
@@ -221,10 +221,11 @@ def _first_readings(prepared: Prepared) -> Array:
 
 def _capacity(case: Case) -> float:
     """Return the factor from the rate of the state to a source of the equation."""
-    name = case.equation.storage
-    if not name:
-        return 1.0
-    return prior_of(case, name) if name in case.spec.unknowns else float(case.options[name])
+    each = (
+        prior_of(case, name) if name in case.spec.unknowns else float(case.options[name])
+        for name in case.equation.capacity
+    )
+    return math.prod(each)
 
 
 def _free(case: Case, name: str) -> bool:
@@ -241,21 +242,14 @@ def _source(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
 
 
 def _loss(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
-    """Return the settings of a loss to surroundings at the temperature of the first readings.
-
-    That of water is a leakance, which needs no surroundings.
-    """
-    case = prepared.case
-    if not cause.size > 0.0:
-        return ()
-    if _free(case, "leakance"):
-        size = float(f"{cause.size * prior_of(case, 'Ss') * case.options['b']:.2g}")
-        return (_adding("leakance", size, prior=size, transform="log"),)
-    if not _free(case, "loss"):
+    """Return the settings of a loss to surroundings at the temperature of the first readings."""
+    case, name = prepared.case, prepared.case.equation.loss
+    if not (_free(case, name) and cause.size > 0.0):
         return ()
     size = float(f"{cause.size * _capacity(case):.2g}")
-    settings = [_adding("loss", size, prior=size, transform="log")]
-    if "ambient" not in {*case.spec.channels, *case.spec.inputs}:
+    settings = [_adding(name, size, prior=size, transform="log")]
+    needed = {"ambient"} & case.equation.inputs.keys()
+    if needed - {*case.spec.channels, *case.spec.inputs}:
         seen = _first_readings(prepared)
         if not len(seen):
             return ()

@@ -134,7 +134,7 @@ def _switching(case: Case, samples: DataTable) -> list[str]:
 
 
 def _show_predicted(console: Console, prepared: Prepared) -> list[str]:
-    """Print the readings beside their prediction at the prior; return which move against it."""
+    """Print the readings and their prediction at the prior; return a sentence on opposite signs."""
     measured, prior = predicted(prepared, prepared.stream)
     against: list[str] = []
     rows: list[tuple[str, ...]] = []
@@ -154,11 +154,10 @@ def _show_predicted(console: Console, prepared: Prepared) -> list[str]:
         )
     if not against:
         return []
-    text = (
-        f"{', '.join(against)}: the readings fall where the prior predicts a rise, or rise where it"
-    )
-    text += " predicts a fall."
-    return [f"{text} Check the sign of these columns and of the inputs: `factor = -1` turns it."]
+    return [
+        f"{', '.join(against)}: the readings fall where the prior predicts a rise, or the reverse. "
+        "Check the sign of these columns and of the inputs: `factor = -1` turns it."
+    ]
 
 
 def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:

@@ -188,11 +188,13 @@ def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> 
         gained = one.gained(base)
         return math.isnan(gained), -gained if math.isfinite(gained) else 0.0
 
+    def named(one: VariantRun) -> str:
+        return one.variant.name + (" *" if one is best else "")
+
     ended = sorted((one for one in (base, *found) if not one.error), key=rank)
-    names = {id(one): one.variant.name + (" *" if one is best else "") for one in ended}
     rows = [
         (
-            names[id(one)],
+            named(one),
             one.level,
             shown(one.gained(base), "+.1f"),
             shown(one.misfit, ".2g"),
@@ -204,14 +206,14 @@ def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> 
     columns = ("variant", "verdict", "evidence", "/ noise", "validation", "unknowns")
     tables = [Table("Variants (* recommended)", columns, rows)]
     labels = dict.fromkeys(label for one in (base, *ended) for label in one.estimates)
-    each, apart = list[tuple[str, ...]](), {id(one): one.apart(base) for one in ended}
+    each: list[tuple[str, ...]] = []
     for label in labels:
         for one in ended:
             if (known := one.estimates.get(label)) is not None:
-                named = f"{label} in {known.unit}" if known.unit else label
-                mark = "apart" if label in apart[id(one)] else ""
+                unknown = f"{label} in {known.unit}" if known.unit else label
                 value, ends = digits(known.value, known.std)[0], (known.low, known.high)
-                each.append((named, names[id(one)], value, interval(*ends, known.std), mark))
+                mark = "apart" if label in one.apart(base) else ""
+                each.append((unknown, named(one), value, interval(*ends, known.std), mark))
     if each:
         tables.append(Table("Estimates", ("unknown", "variant", "value", "95 %", ""), each))
     failed = [(one.variant.name, one.error) for one in found if one.error]

@@ -1,4 +1,4 @@
-"""Whether one column of the data explains a misfit: late, scaled, off, in another unit, exchanged.
+"""Whether one column of the data explains a misfit: late, off, scaled, turned, exchanged ...
 
 An error of a column is tried on the stored samples themselves: the column is corrected, and the
 model is fitted again. So inputs and sensors are compared alike, and lags and units are exact.
@@ -70,7 +70,8 @@ class Unit(NamedTuple):
     # Of the conversion of its values.
     factor: float
     constant: float
-    times: float = np.nan  # how many times too large or too small its values are
+    # How many times too large or too small its values are; NaN where only their sign is turned.
+    times: float = np.nan
 
 
 UNITS: tuple[Unit, ...] = (

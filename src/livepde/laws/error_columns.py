@@ -201,9 +201,8 @@ class ErrorColumns:
         for axis, span in enumerate(self.span):
             halves = stiffness(self._halves(axis))
             yield Answer("layer", "xyz"[axis], load=_minus(halves)), ALWAYS
-            cell = 1.0 / model.mesh.nelements
-            if len(self.span) > 1:
-                cell = float(model.mesh.param()) / span
+            in_line = len(self.span) == 1
+            cell = 1.0 / model.mesh.nelements if in_line else float(model.mesh.param()) / span
             for place in places:
                 matrix = stiffness(self._band(axis, place, max(NARROW, 1.5 * cell)))
                 yield Answer("contact", "xyz"[axis], load=_minus(matrix)), ALWAYS

@@ -4,7 +4,7 @@ What errors would do to the readings makes the columns of a linear model: those 
 answers to it (`livepde.laws.error_columns`), those of sensors are added here. Single causes have
 one column each, families many, with an amplitude for each shape in space and course in time. See
 `livepde.verdict.evidence` for the average over them. Where the stored samples cannot be fitted
-again, the sums of the verdict tell what single causes would do to the innovations.
+again, they are those of single causes on the innovations, from the sums of the verdict.
 """
 
 from __future__ import annotations

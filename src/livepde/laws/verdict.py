@@ -172,7 +172,7 @@ def with_columns(verdict: Verdict, columns: Columns | str) -> Verdict:
 
 
 def _doubted(verdict: Verdict) -> bool:
-    """Whether something speaks against a run."""
+    """Return whether a verdict has a finding that is more than a note."""
     return any(finding.severity != "note" for finding in verdict.findings)
 
 

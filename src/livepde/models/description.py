@@ -102,6 +102,11 @@ class Equation:
     storage
         Option that may be an unknown instead, by which the equation is divided then: only the
         ratio of other unknowns to it is determined without a known flux or source.
+    loss
+        Unknown that exchanges with the surroundings.
+    capacity
+        Unknowns and options whose product with a rate of the state is a source, or with a rate of
+        decay a loss.
     spacing
         Of an interval's mesh: "geometric" where u changes most at the left end, as around a well.
     alternatives
@@ -127,6 +132,8 @@ class Equation:
     fluxes: Fluxes | None = None
     conductivity: str = ""
     storage: str = ""
+    loss: str = "loss"
+    capacity: tuple[str, ...] = ()
     spacing: Literal["uniform", "geometric"] = "uniform"
     alternatives: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     components: tuple[str, ...] = ()

@@ -228,4 +228,5 @@ CONDUCTION = Equation(
     fluxes=Fluxes("W/m^2", "W/(m^2 K)", "W/m^3"),
     conductivity="k",
     storage="C",
+    capacity=("C",),
 )

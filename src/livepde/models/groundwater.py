@@ -216,6 +216,8 @@ PUMPING_TEST = Equation(
     options={"b": Option("m", "thickness of the aquifer; with 1 m k is T and Ss is S")},
     build=by_name(pumping_test, "is pumped by the input Q, with 0 far away"),
     element=linear,
+    loss="leakance",
+    capacity=("Ss", "b"),
     spacing="geometric",
 )
 

@@ -287,8 +287,16 @@ class CalibratedObserved(Observed):
         if not (self.observation.adds and fixed):
             return None
         if self._steady_direct is None:
-            zero = np.zeros(self.state.dim)
-            self._steady_direct = self.jacobian(zero, self.parameter.prior, moment)[1]
+            zero, q = np.zeros(self.state.dim), self.parameter.prior
+            direct = self.jacobian(zero, q, moment)[1]
+            y, more = np.arange(1.0, 1.0 + self.size), np.linspace(0.5, 1.5, len(q))
+            shift = 0.0 if direct is None else direct @ (q + more)
+            if not np.allclose(self._read(y, q + more, moment), y + shift):
+                raise ObservationError(
+                    "Calibrated: adds=True, but function does more than to add unknowns to the "
+                    "readings. Leave out adds."
+                )
+            self._steady_direct = direct
         return self._steady_direct
 
     def _slope(self, y: Any, q: Any, moment: Moment) -> Array:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 LAYERS, SURFACES = "wall_layers", "surface_resistance"
 MOST_ROWS = 40
 DIGITS = 15  # of a number
-FINEST = 1000.0  # widths of an interval over its last digit but one
+FINEST = 1000.0  # parts of the width of an interval to which its ends are shown, at most
 MOST = 10.0  # times its value that an error is shown as a share
 TOTALS = ("rmse", "innovation_ratio", "jumps", "failed_steps")  # numbers of a run as a whole
 ROLES = ("assimilated", "validation")  # of channels, of which there are totals, too

@@ -230,49 +230,46 @@ def averaged(model: LinearModel, causes: Causes, families: Sequence[Family]) -> 
     for family in families:
         axes = _Axes.of(model, family, causes.columns)
         several.append([_alone(model, axes, size) for size in family.sizes])
-        if family.beside:
-            several.append([_beside(model, axes, causes, size) for size in family.beside])
-    nothing = [[_alone(model, none, 0.0)]]
-    groups = [nothing, [single], several]
+        several.append([_beside(model, axes, causes, size) for size in family.beside])
+    # Blocks of hypotheses that differ in their size, which is the outer axis.
+    groups = [[[_alone(model, none, 0.0)]], [single], several]
     tried = [one for group in groups for sizes in group for one in sizes]
     squares, volume, shift, more = (np.concatenate(part) for part in zip(*tried, strict=True))
     squares = np.maximum(squares, 0.0)
     told = -0.5 * (NU + n) * np.log((NU + squares) / (NU + total)) - volume
+    kinds, counts = list[IntArray](), [0, 0, 0]
+    for number, group in enumerate(groups):
+        for sizes in filter(None, group):
+            count = len(sizes[0].squares)
+            kinds += [sum(counts) + np.arange(count)] * len(sizes)
+            counts[number] += count
     shares = (NOTHING, 0.5 * (1.0 - NOTHING), 0.5 * (1.0 - NOTHING))
-    counts = [[(len(sizes), len(sizes[0].squares)) for sizes in group] for group in groups]
-    weights = _tempered(told, shares, counts)
+    weights = _tempered(told, np.concatenate(kinds), shares, counts)
     level = np.maximum(1.0, (NU + squares) / (NU + n))
     return Mixture(weights, mean + shift, np.sqrt((variance + more) * level[:, None]))
 
 
 def _tempered(
-    told: Array, shares: Sequence[float], counts: Sequence[Sequence[tuple[int, int]]]
+    told: Array, kinds: IntArray, shares: Sequence[float], counts: Sequence[int]
 ) -> Array:
     """Return the weights of hypotheses with logarithms of their evidence; the first is "nothing".
 
-    They come in groups with a share of the prior mass, and in them in blocks of (sizes, kinds).
-    Which size is right the data tell, which kind only after tempering: another one may be missing.
+    Which size is right the data tell; which kind only after tempering, since the right one may be
+    missing.
+
+    `kinds`: the kind of each. `shares`, `counts`: of groups of kinds, their share of the prior
+    mass, and how many kinds they have.
     """
-    evidence, prior, within, first = list[Array](), list[Array](), list[Array](), 0
-    for share, blocks in zip(shares, counts, strict=True):
-        kinds = sum(kinds for _, kinds in blocks)
-        for sizes, kinds_here in blocks:
-            own = told[first : first + sizes * kinds_here].reshape(sizes, kinds_here)
-            total = scipy.special.logsumexp(own, axis=0)
-            evidence.append(total - math.log(sizes))
-            prior.append(np.full(kinds_here, math.log(share / max(kinds, 1))))
-            within.append(own - total)
-            first += own.size
-    of_kind, mass = np.concatenate(evidence), np.concatenate(prior)
-    excess = float((of_kind + mass).max() - of_kind[0] - mass[0])
+    masses = zip(shares, counts, strict=True)
+    prior = np.concatenate([np.full(n, math.log(share / max(n, 1))) for share, n in masses])
+    total = np.full(len(prior), -np.inf)
+    np.logaddexp.at(total, kinds, told)
+    of_kind = total - np.log(np.bincount(kinds))
+    excess = float((of_kind + prior).max() - of_kind[0] - prior[0])
     eta = 1.0 if excess <= TEMPER else TEMPER / excess
-    logs, found, first = mass + eta * of_kind, list[Array](), 0
-    for own in within:
-        found.append((own + logs[first : first + own.shape[1]]).ravel())
-        first += own.shape[1]
-    weights = np.concatenate(found)
-    whole: Array = np.exp(weights - scipy.special.logsumexp(weights))
-    return whole
+    weights = (prior + eta * of_kind - total)[kinds] + told
+    found: Array = np.exp(weights - scipy.special.logsumexp(weights))
+    return found
 
 
 def averaged_causes(ledger: Ledger, moved: Array, most: Array, std: Array) -> Mixture:
@@ -295,8 +292,10 @@ def averaged_causes(ledger: Ledger, moved: Array, most: Array, std: Array) -> Mi
         told.append(_tested(sums, noise, left, rho, prior)[0].ravel())
         means.append((moved * (score * variance).ravel()).T)
         variances.append((moved**2 * variance.ravel()).T)
-    blocks = [[(1, 1)], [(len(AMPLITUDES), moved.shape[1])]]
-    weights = _tempered(np.concatenate(told), (NOTHING, 1.0 - NOTHING), blocks)
+    count = moved.shape[1]
+    kinds = np.concatenate([[0], np.tile(1 + np.arange(count), len(AMPLITUDES))])
+    shares = (NOTHING, 1.0 - NOTHING)
+    weights = _tempered(np.concatenate(told), kinds, shares, (1, count))
     deviations = np.sqrt(std**2 + np.concatenate(variances))
     return Mixture(weights, np.concatenate(means), deviations)
 
