@@ -438,34 +438,34 @@ def test_every_proposed_variant_is_a_case(tmp_path, equation):
         assert cases.load(path, settings=settings).prepare().identifier
 
 
-def exchanging(seed: int, rate: float, h: float) -> pd.DataFrame:
-    """Return readings of a rod with side loss that exchanges heat at its right end.
+def heated(h: float = 1e-12, upper: float = 2e-5, switched: float = 0.0) -> pd.DataFrame:
+    """Return readings of a rod with side loss: finite volumes and the trapezoidal rule.
 
-    Finite volumes and the trapezoidal rule; left end driven, surroundings at `ambient`.
+    The left end is driven, the surroundings are at `ambient`. `h`: heat transfer at the right end.
+    `upper`: diffusivity beyond 10 cm. `switched`: source from 1200 s on.
     """
-    cells, step, count, parts = 120, 10.0, 240, 10
-    dx, alpha = 0.3 / cells, 2e-5
-    t = step * np.arange(count)
+    cells, step, count, parts, rate = 120, 10.0, 240, 10, 3e-4
+    dx = 0.3 / cells
+    x, t = dx * (np.arange(cells) + 0.5), step * np.arange(count)
+    alpha = np.where(x < 0.1, 2e-5, upper)
     left = 20.0 + 25.0 * (1.0 - np.exp(-t / 100.0)) * (1.0 + 0.4 * np.sin(t / 110.0))
     ambient = 20.0 + 1.5 * np.sin(t / 320.0)
-    main = np.full(cells, -2.0 * alpha / dx**2 - rate)
-    through = 1.0 / (1.0 / h + 0.5 * dx / alpha) / dx
-    main[0], main[-1] = -3.0 * alpha / dx**2 - rate, -alpha / dx**2 - rate - through
-    near = np.full(cells - 1, alpha / dx**2)
-    A = scipy.sparse.diags_array([near, main, near], offsets=[-1, 0, 1])
+    near = 2.0 / (1.0 / alpha[1:] + 1.0 / alpha[:-1]) / dx**2
+    through = 1.0 / (1.0 / h + 0.5 * dx / alpha[-1]) / dx
+    out = np.r_[2.0 * alpha[0] / dx**2, near], np.r_[near, through]
+    A = scipy.sparse.diags_array([near, -out[0] - out[1] - rate, near], offsets=[-1, 0, 1])
     one, dt = scipy.sparse.eye_array(cells), step / parts
     solver = scipy.sparse.linalg.splu(scipy.sparse.csc_array(one - 0.5 * dt * A))
     u, shown = np.full(cells, 20.0), [np.full(cells, 20.0)]
     for k in range((count - 1) * parts):
-        ends = (np.interp(dt * (k + 0.5), t, drive) for drive in (left, ambient))
-        wall, air = ends
-        b = np.full(cells, rate * air)
-        b[0] += 2.0 * alpha / dx**2 * wall
+        wall, air = (np.interp(dt * (k + 0.5), t, drive) for drive in (left, ambient))
+        b = np.full(cells, rate * air + (switched if dt * k >= 1200.0 else 0.0))
+        b[0] += out[0][0] * wall
         b[-1] += through * air
         u = solver.solve((one + 0.5 * dt * A) @ u + dt * b)
         if (k + 1) % parts == 0:
             shown.append(u)
-    x, rng = dx * (np.arange(cells) + 0.5), np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     places = {"T_5": 0.05, "T_15": 0.15, "T_25": 0.25}
     readings = {
         name: np.array([np.interp(at, x, one) for one in shown]) + 0.05 * rng.standard_normal(count)
@@ -474,10 +474,10 @@ def exchanging(seed: int, rate: float, h: float) -> pd.DataFrame:
     return pd.DataFrame({"t": t, "left": left, "ambient": ambient} | readings)
 
 
-EXCHANGING = """
+HEATED = """
 equation = "heat"
 initial = "20 degC"
-mesh = { from = 0, to = "30 cm", cells = 40 }
+mesh = { from = 0, to = "30 cm", cells = 60 }
 data = { file = "rod.csv", time = "t", time_unit = "s" }
 [unknowns]
 alpha = { prior = "3e-5 m^2/s", std = "2e-5 m^2/s", transform = "log" }
@@ -494,8 +494,8 @@ T_25 = { column = "T_25", role = "sensor", at = "25 cm", noise = "0.05 K" }
 @pytest.mark.slow
 def test_an_exchange_that_the_case_lacks_is_named_and_found(tmp_path):
     path = tmp_path / "case.toml"
-    path.write_text(EXCHANGING)
-    exchanging(1, 3e-4, 2e-5).to_csv(tmp_path / "rod.csv", index=False)
+    path.write_text(HEATED)
+    heated(h=2e-5).to_csv(tmp_path / "rod.csv", index=False)
     base = run_variant(path, (), Variant("as stated"))
     assert (base.error, base.level) == ("", "caution")
     assert (base.causes[0].kind, base.causes[0].subject) == ("transfer", "right")
@@ -507,10 +507,35 @@ def test_an_exchange_that_the_case_lacks_is_named_and_found(tmp_path):
     assert all(one.low <= truth[name] <= one.high for name, one in found.estimates.items())
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "error", "truth"),
+    [
+        ("layers of alpha", {"upper": 4e-5}, {"alpha[layer_1]": 2e-5, "alpha[layer_2]": 4e-5}),
+        ("source that jumps", {"switched": 0.003}, {"alpha": 2e-5, "source": 0.003}),
+    ],
+)
+def test_a_layer_for_each_sensor_and_a_source_that_jumps_are_tried(tmp_path, name, error, truth):
+    """Halfway between the sensors lies the border of the layers, and not in the middle of all."""
+    path = tmp_path / "case.toml"
+    path.write_text(HEATED)
+    heated(**error).to_csv(tmp_path / "rod.csv", index=False)
+    doubted = ended("as stated", 0.0, 1.0, errors={"T_5": 0.3})
+    variants = {one.name: one for one in proposed(cases.load(path).prepare(), doubted)}
+    found = run_variant(path, (), variants[name])
+    assert found.error == ""
+    assert found.misfit < 1.1
+    truth = truth | {"loss": 3e-4}
+    for label, value in truth.items():
+        one = found.estimates[label]
+        assert one.low <= value <= one.high
+        assert abs(one.value / value - 1.0) < 0.1
+
+
 def test_a_variant_without_an_unknown_lacks_what_is_read_for_it_alone(tmp_path):
     path = tmp_path / "case.toml"
-    path.write_text(EXCHANGING)
-    exchanging(1, 3e-4, 2e-5).iloc[:5].to_csv(tmp_path / "rod.csv", index=False)
+    path.write_text(HEATED)
+    heated().iloc[:5].to_csv(tmp_path / "rod.csv", index=False)
     with pytest.raises(CaseError, match=r"channels\.ambient: the equation does not read it with"):
         cases.load(path, settings={"unknowns.loss": None})
     variants = {

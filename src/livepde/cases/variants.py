@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +39,8 @@ GAINED = 3.0  # of log evidence: strong evidence (Kass and Raftery 1995), 20 to 
 SAME = 1e-9  # of the length of a run: times that differ by less are one moment
 WORSE = 0.02  # share by which the error of validation sensors may grow: about its own error
 USABLE = ("trusted", "caution")
-MOST = 12  # variants that the program chooses
+MOST_LAYERS = 8
+MOST = 14  # variants that the program chooses
 SAMPLES = 64  # in which a source moves the state by the usual error
 NAMES = {  # kind of cause -> name of the variant
     "offset": "offset of {}",
@@ -47,6 +49,7 @@ NAMES = {  # kind of cause -> name of the variant
     "jump": "jumps of {}",
     "source": "source",
     "loss": "loss",
+    "channel": "gain of {}",
     "flux": "flux at {}",
     "transfer": "heat transfer at {}",
     "boundary": "offset of {}",
@@ -403,9 +406,10 @@ def proposed(prepared: Prepared, base: VariantRun, most: int = MOST) -> list[Var
     found: dict[frozenset[str], Variant] = {}
     for variant in _candidates(prepared, base):
         if variant.settings:
-            # The same keys with another prior are no other variant.
-            keys = frozenset(setting.partition("=")[0] for setting in variant.settings)
-            found.setdefault(keys, variant)
+            # The same keys with another prior are no other variant, other layers are.
+            keys = (setting.partition("=")[0] for setting in variant.settings)
+            layers = [setting for setting in variant.settings if ".regions=" in setting]
+            found.setdefault(frozenset((*keys, *layers)), variant)
     return list(found.values())[:most]
 
 
@@ -421,9 +425,9 @@ def _candidates(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     if case.spec.law.kind != "sensitivity":
         return
     yield from _process(prepared, base)
+    yield from _layers(case)
     yield from _sensors(prepared, base)
     yield from _fewer(case)
-    yield from _layers(case)
     known = {name: size for name, size in base.misfits.items() if math.isfinite(size)}
     if len(known) > 2:
         worst = max(known, key=lambda name: known[name])
@@ -444,8 +448,11 @@ def _process(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     if not (isinstance(table, DataTable) and len(table) > 1 and error > 0.0):
         return
     time = SAMPLES * float(np.median(np.diff(table.t)))
-    for kind, size in (("source", error / time), ("loss", 0.1 / time)):
-        yield Variant(kind, freed(prepared, Cause(kind, "", "", size=size)))
+    source = freed(prepared, Cause("source", "", "", size=error / time))
+    yield Variant("source", source)
+    if source and not prepared.case.spec.law.jumps:
+        yield Variant("source that jumps", (*source, 'law.jumps=["source"]'))
+    yield Variant("loss", freed(prepared, Cause("loss", "", "", size=0.1 / time)))
     values = [Cause("boundary", name, "", size=error) for name in prepared.case.roles("boundary")]
     offsets = [setting for cause in values for setting in freed(prepared, cause)]
     if offsets:
@@ -489,18 +496,29 @@ def _fewer(case: Case) -> Iterator[Variant]:
 
 
 def _layers(case: Case) -> Iterator[Variant]:
-    """Iterate over unknowns with two layers, with their border at the middle of the sensors."""
+    """Iterate over unknowns with two layers, and with one for each sensor.
+
+    Their borders lie halfway between sensors.
+    """
     nodes = np.sort(case.mesh.p[0])[1:-1]
     if len(case.mesh.p) != 1 or not len(nodes):
         return
     low, high = float(case.mesh.p.min()), float(case.mesh.p.max())
     places = getattr(case.observation, "positions", None)
-    inner = np.asarray(() if places is None else places, dtype=float).ravel()
+    inner = np.unique(np.asarray(() if places is None else places, dtype=float).ravel())
     middle = float(np.median(inner)) if len(inner) else 0.5 * (low + high)
-    border = float(nodes[np.abs(nodes - middle).argmin()])
+    borders = 0.5 * (inner[1:] + inner[:-1])
+    near = [float(nodes[np.abs(nodes - one).argmin()]) for one in (middle, *borders)]
+    two, many = [low, near[0], high], [low, *sorted(set(near[1:])), high]
+    tried = {"two layers": dict(zip(("lower", "upper"), pairwise(two), strict=True))}
+    if 3 < len(many) <= 1 + MOST_LAYERS:
+        each = enumerate(pairwise(many), 1)
+        tried["layers"] = {f"layer_{number}": ends for number, ends in each}
     for name, unknown in case.spec.unknowns.items():
         own = next(iter(case.equation.unknowns), "") == name
-        if own and not unknown.regions and not unknown.field:
-            layers = {"lower": [low, border], "upper": [border, high]}
-            setting = f"unknowns.{toml_key(name)}.regions={toml_value(layers)}"
-            yield Variant(f"two layers of {name}", (setting,))
+        if not own or unknown.regions or unknown.field:
+            continue
+        for what, layers in tried.items():
+            value = toml_value({label: list(ends) for label, ends in layers.items()})
+            setting = f"unknowns.{toml_key(name)}.regions={value}"
+            yield Variant(f"{what} of {name}", (setting,))
