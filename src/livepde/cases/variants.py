@@ -450,7 +450,8 @@ def _process(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     time = SAMPLES * float(np.median(np.diff(table.t)))
     source = freed(prepared, Cause("source", "", "", size=error / time))
     yield Variant("source", source)
-    if source and not prepared.case.spec.law.jumps:
+    law = prepared.case.spec.law
+    if source and law.kind == "sensitivity" and not law.jumps:
         yield Variant("source that jumps", (*source, 'law.jumps=["source"]'))
     yield Variant("loss", freed(prepared, Cause("loss", "", "", size=0.1 / time)))
     values = [Cause("boundary", name, "", size=error) for name in prepared.case.roles("boundary")]
