@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -124,7 +123,7 @@ class Loop:
 
     def step(
         self,
-        t: float | datetime | np.datetime64,
+        t: Any,
         z: Any,
         inputs: Mapping[str, float] | None = None,
         *,
