@@ -776,7 +776,8 @@ class Identifier(Shown):
             index of a table, the coordinate of a dataset, or the one column that is called time,
             date or the like.
         time_unit
-            Unit of times that are numbers; default that of the model.
+            Unit of times that are numbers; default that of the model. Required if the name of
+            their column has another one, such as time_min.
         columns
             Channel -> name of its column, where they differ: {"T_10": "TS_3_2_1"}.
         units
