@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from numbers import Integral
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
@@ -352,10 +353,14 @@ class Result(Shown):
         count: int | None = None,
         ignored: Sequence[str] = (),
     ) -> None:
+        if not (isinstance(fields_every, Integral) and fields_every >= 1):
+            raise ConfigurationError(
+                f"fields_every must be a whole number, at least 1; got {fields_every!r}."
+            )
         self.model = model
         self.observed = observed
         self.validation = validation
-        self.fields_every = fields_every
+        self.fields_every = int(fields_every)
         self.last: Estimate | None = None
         self._settled: Belief | None = None
         self._ended = False  # a last fit was asked for
@@ -520,6 +525,8 @@ class Result(Shown):
         import xarray as xr
 
         last, model = self._last("sample"), self.model
+        if not (isinstance(n, Integral) and n >= 1):
+            raise ConfigurationError(f"sample: n must be a whole number, at least 1; got {n!r}.")
         q, u = draws(last.belief, last.space, n, seed)
         numbers = {
             label: ("draw", q[:, k], {"units": last.space.unknown_of(label).unit})
