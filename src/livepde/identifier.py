@@ -277,7 +277,8 @@ class Identifier(Shown):
 
     def _input_noise(self, given: Mapping[str, float]) -> dict[str, float]:
         """Return the noise of input channels, checked."""
-        for name, std in given.items():
+        stds: Mapping[str, Any] = given
+        for name, std in stds.items():
             if name not in self.model.channels:
                 raise ConfigurationError(
                     f"input_noise: the model has no channel '{name}'; it has "
@@ -1081,7 +1082,7 @@ def _check_parts(*parts: object) -> None:
 
 def _time(name: str, value: Any) -> float:
     """Return a time or duration of the options."""
-    if not isinstance(value, Real | np.ndarray) or np.ndim(value) or math.isnan(value):
+    if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf" or math.isnan(value):
         raise ConfigurationError(
             f"{name} must be a number, in the unit of time of the model; got {value!r}."
         )

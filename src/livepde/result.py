@@ -353,10 +353,7 @@ class Result(Shown):
         count: int | None = None,
         ignored: Sequence[str] = (),
     ) -> None:
-        if not (isinstance(fields_every, Integral) and fields_every >= 1):
-            raise ConfigurationError(
-                f"fields_every must be a whole number, at least 1; got {fields_every!r}."
-            )
+        _check_count("fields_every", fields_every)
         self.model = model
         self.observed = observed
         self.validation = validation
@@ -525,8 +522,7 @@ class Result(Shown):
         import xarray as xr
 
         last, model = self._last("sample"), self.model
-        if not (isinstance(n, Integral) and n >= 1):
-            raise ConfigurationError(f"sample: n must be a whole number, at least 1; got {n!r}.")
+        _check_count("sample: n", n)
         q, u = draws(last.belief, last.space, n, seed)
         numbers = {
             label: ("draw", q[:, k], {"units": last.space.unknown_of(label).unit})
@@ -737,6 +733,12 @@ class Result(Shown):
         from livepde.plots import RunPlots
 
         return RunPlots(self)
+
+
+def _check_count(name: str, value: Any) -> None:
+    """Refuse what is not a whole number, at least 1."""
+    if not isinstance(value, Integral) or int(value) < 1:
+        raise ConfigurationError(f"{name} must be a whole number, at least 1; got {value!r}.")
 
 
 def _number(value: float) -> float | None:
