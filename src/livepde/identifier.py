@@ -284,7 +284,7 @@ class Identifier(Shown):
                     f"input_noise: the model has no channel '{name}'; it has "
                     f"{list(self.model.channels)}. Specify the noise of sensors in the observation."
                 )
-            if not (isinstance(std, Real) and math.isfinite(std) and std > 0.0):
+            if not (isinstance(std, Real) and 0.0 < float(std) < math.inf):
                 raise ConfigurationError(
                     f"input_noise of '{name}' must be a positive number; got {std!r}."
                 )
