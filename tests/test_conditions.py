@@ -82,6 +82,9 @@ def test_says_what_is_wrong_with_a_condition() -> None:
         ({"boundary": {"left": Flux(1.0)}, "per": "C"}, "per='C' is not an unknown of the model"),
         ({"sources": {"s": Source(1.0, "core")}}, "no subdomain 'core'"),
         ({"sources": {"s": Source(1.0, lambda x: x[0] > 2.0)}}, "no cell"),
+        ({"boundary": {"left": Exchange(-5.0, 20.0)}}, "the coefficient -5.0; expected 0 or more"),
+        ({"boundary": {"left": Exchange(np.nan, 20.0)}}, "got nan; expected a finite number"),
+        ({"boundary": {"left": Flux(lambda x, t: 1.0)}}, "expected a finite number"),  # type: ignore[arg-type]
     ):
         with pytest.raises(ModelError, match=text):
             with_conditions(slab({"right": 20.0}), **given)  # type: ignore[arg-type]

@@ -213,6 +213,13 @@ def test_options_of_an_identifier_are_checked(option, value, said):
         rod_with_inputs(**{option: value})
 
 
+@pytest.mark.parametrize("value", [lambda x: 1.0 + x[0], lambda t: t])
+def test_a_boundary_value_of_one_argument_is_told(value):
+    model = lp.models.heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": value})
+    with pytest.raises(lp.errors.SpaceError, match=r"Expected a function g\(x, t\)"):
+        lp.Identifier(model, lp.Points({"T": 0.5}, noise=0.1)).step(1.0, [0.0])
+
+
 def test_an_input_with_two_values_is_refused():
     rod = rod_with_inputs()
     with pytest.raises(lp.errors.SampleError, match="'left' is 1 among the readings and 2 among"):

@@ -483,7 +483,13 @@ class FieldBlock(Block):
             if isinstance(value, Channel):
                 u[dofs] = Place(u, None, moment).inputs[value.name]
             elif callable(value):
-                u[dofs] = value(self.doflocs[:, dofs], moment.t)
+                try:
+                    u[dofs] = value(self.doflocs[:, dofs], moment.t)
+                except TypeError as error:
+                    raise SpaceError(
+                        f"dirichlet: a boundary value failed: {error}. "
+                        "Expected a function g(x, t) with a number for each point."
+                    ) from error
             else:
                 u[dofs] = value
         return u

@@ -6,8 +6,10 @@ J v, in the unit of D u_n.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -143,6 +145,12 @@ class _Terms:
         """Add a flux, or an exchange as two terms, so that the term in u reads no input."""
         if isinstance(condition, Flux):
             return self.gained(condition.value, boundary)
+        known = condition.coefficient
+        if isinstance(known, int | float) and known < 0.0:
+            raise ModelError(
+                f"with_conditions: the exchange at '{boundary}' has the coefficient {known}; "
+                "expected 0 or more. The flux into the domain is coefficient (ambient - u)."
+            )
         h, ambient = self._divided(condition.coefficient), self._amount(condition.ambient)
         given = condition.coefficient, condition.ambient
         # A term in u that reads an input would make the matrix of a stage depend on time, and
@@ -190,6 +198,12 @@ class _Terms:
             one = self._amount(value.unknown)
             return lambda q, x: value.factor * one(q, x)
         if not isinstance(value, str):
+            given: Any = value
+            if not isinstance(given, Real) or not math.isfinite(given):
+                raise ModelError(
+                    f"with_conditions: got {given!r:.60}; expected a finite number, a Channel, or "
+                    "the name of an unknown."
+                )
             return lambda q, x: value
         if value not in self.unknowns:
             raise ModelError(

@@ -8,7 +8,15 @@ from typing import Any
 from livepde import fem
 from livepde.errors import ModelError
 from livepde.model import Model
-from livepde.models.description import Equation, Fluxes, Option, Variable, by_name, one_number
+from livepde.models.description import (
+    Equation,
+    Fluxes,
+    Option,
+    Variable,
+    by_name,
+    everywhere,
+    one_number,
+)
 
 AMBIENT = "ambient"
 
@@ -139,6 +147,7 @@ def _model(
     unit: str,
 ) -> Model:
     held = dict(dirichlet or {})
+    everywhere(equation.name, mesh, **{equation.conductivity: unknowns[equation.conductivity]})
     # A term without an unknown of its own is left out of the form, and its input with it.
     given = {key: unknown for key, unknown in unknowns.items() if unknown is not None}
 
