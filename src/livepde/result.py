@@ -267,7 +267,12 @@ class Estimate(Shown):
             u_std = self.u_std if self.u_std is not None else np.full_like(self.u, np.nan)
             known = self.state_space.unknown_of(name)
             return Marginal(self.u[part], u_std[part], known, partial(self._at, name))
-        components = () if self.state_space is None else self.state_space.fields
+        if self.state_space is None:
+            raise ConfigurationError(
+                f"estimate['{name}']: this estimate was pickled, without its state; its unknowns "
+                f"are {[*space.labels, *space.fields]}."
+            )
+        components = self.state_space.fields
         raise ConfigurationError(
             f"estimate['{name}']: there is no unknown '{name}'; there are "
             f"{[*space.labels, *space.fields, *components]}."
