@@ -7,6 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
+import livepde as lp
 from livepde.cli.printing import print_table
 from livepde.reproduce import boiger2016
 from livepde.runs import Table
