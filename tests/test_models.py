@@ -441,3 +441,17 @@ def test_layers_with_gaps_or_overlaps_are_refused(name, regions, said):
         RODS[name](mesh, lp.Piecewise(regions, lp.LogNormal(1.0, std=0.5)))
     halves = {"a": "core", "b": lambda x: x[0] > 0.5}
     RODS[name](mesh, lp.Piecewise(halves, lp.LogNormal(1.0, std=0.5)))
+
+
+@pytest.mark.parametrize(
+    ("C", "said"),
+    [
+        (lambda x: 1.0 - 2.0 * (x[0] > 0.5), "must be positive everywhere; its least value is -1"),
+        (lambda x: 1.0 * (x[0] > 0.5), "must be positive everywhere; its least value is 0"),
+        (np.nan, "must be positive; got nan"),
+        ("2e6", "must be positive; got '2e6'"),
+    ],
+)
+def test_a_heat_capacity_is_positive_everywhere(C, said):
+    with pytest.raises(ModelError, match=said):
+        conduction(lp.interval(0.0, 1.0, 10), lp.LogNormal(1.0, std=0.5), LEFT, C=C)
