@@ -421,6 +421,21 @@ def crossed(measure: Measure, region: Callable[[Array], Any]) -> IntArray:
     return np.concatenate(found)
 
 
+def sizes(measure: Measure, region: Callable[[Array], Any]) -> tuple[float, float]:
+    """Return the size of a region by a measure of all cells, and by finer parts of crossed ones."""
+    cut = crossed(measure, region)
+    plain, exact = 0.0, 0.0
+    for at, piece in measure.pieces():
+        inside = piece.weights * region(piece.points)
+        plain += float(inside.sum())
+        whole = np.isin(np.arange(at.start, at.stop), cut, invert=True)
+        exact += float(inside[whole].sum())
+    if len(cut):
+        fine = FineMeasure(measure.mesh, measure.order, members=cut)
+        exact += sum(float((x.weights * region(x.points)).sum()) for _, x in fine.pieces())
+    return plain, exact
+
+
 class _Sides(NamedTuple):
     """Facets of a boundary: adjacent cells, quadrature points, weights, normals."""
 
