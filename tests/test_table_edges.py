@@ -236,3 +236,20 @@ def test_a_compressed_file_is_named(tmp_path):
     path.write_bytes(gzip.compress(b"time,T\n0,1\n1,2\n"))
     with pytest.raises(DataError, match="is compressed: unpack it first"):
         measured(path, "s")
+
+
+@pytest.mark.parametrize(
+    ("cell", "said"),
+    [
+        ("0,93", "numbers only; got '0,93': read the table with decimal=','"),
+        ("open", "numbers only; got 'open'."),
+    ],
+)
+def test_text_in_a_table_is_named(cell, said):
+    rod = heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": lp.Channel("a")})
+    table = pd.DataFrame({"T": ["0.9", cell], "a": [1.0, 1.0]}, index=[1.0, 2.0])
+    identifier = lp.Identifier(rod, lp.Points({"T": 0.5}, noise=0.1, unit="degC"), u0=1.0)
+    with pytest.raises(lp.errors.SampleError, match=said):
+        identifier.run(table)
+    with pytest.raises(lp.errors.ConfigurationError, match="'a' is no sensor, so its values are"):
+        identifier.run(table, units={"a": "K"})

@@ -72,6 +72,11 @@ class Reading:
                         f"{option}: there is no channel '{name}'{tables.hint(name, known)}"
                     )
         for name in self.units:
+            if name not in self.sensor_units:
+                raise ConfigurationError(
+                    f"units: '{name}' is no sensor, so its values are in the unit of the model: "
+                    "convert its column."
+                )
             if not self.sensor_units.get(name):
                 raise ConfigurationError(
                     f"units: the model has no unit for '{name}': name it where the sensors are "
