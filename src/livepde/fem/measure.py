@@ -389,8 +389,10 @@ class FineMeasure(Measure):
 
     @cached_property
     def _rule(self) -> tuple[Array, Array]:
-        parts = MESHES[self.mesh.refdom].init_refdom().refined(BISECTIONS[self.mesh.dim()])
         X, W = get_quadrature(self.mesh.refdom, self.order)
+        if self.mesh.refdom not in MESHES:  # wedges, which scikit-fem does not refine
+            return X, W
+        parts = MESHES[self.mesh.refdom].init_refdom().refined(BISECTIONS[self.mesh.dim()])
         mapping = parts.mapping()
         points, weights = mapping.F(X), np.abs(mapping.detDF(X)) * W
         return points.reshape(len(points), -1), weights.ravel()
@@ -402,6 +404,8 @@ class _Corners(Measure):
 
     @cached_property
     def _rule(self) -> tuple[Array, Array]:
+        if self.mesh.refdom not in MESHES:
+            return get_quadrature(self.mesh.refdom, self.order)
         X = MESHES[self.mesh.refdom].init_refdom().p
         middle = X.mean(axis=1, keepdims=True)
         return middle + (1.0 - INWARDS) * (X - middle), np.full(X.shape[1], np.nan)
