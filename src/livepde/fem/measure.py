@@ -389,6 +389,8 @@ class FineMeasure(Measure):
 
     @cached_property
     def _rule(self) -> tuple[Array, Array]:
+        X: Array
+        W: Array
         X, W = get_quadrature(self.mesh.refdom, self.order)
         if self.mesh.refdom not in MESHES:  # wedges, which scikit-fem does not refine
             return X, W
@@ -405,7 +407,8 @@ class _Corners(Measure):
     @cached_property
     def _rule(self) -> tuple[Array, Array]:
         if self.mesh.refdom not in MESHES:
-            return get_quadrature(self.mesh.refdom, self.order)
+            inner: tuple[Array, Array] = get_quadrature(self.mesh.refdom, self.order)
+            return inner
         X = MESHES[self.mesh.refdom].init_refdom().p
         middle = X.mean(axis=1, keepdims=True)
         return middle + (1.0 - INWARDS) * (X - middle), np.full(X.shape[1], np.nan)
