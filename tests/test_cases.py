@@ -19,6 +19,7 @@ from livepde.cases.new_case import write_template
 from livepde.cases.preview import Preview, preview
 from livepde.cases.read import parse
 from livepde.cases.schema import SensitivitySpec
+from livepde.fem import Inputs, Moment
 from livepde.runs import checks_of, drive, measures, tables
 from livepde.units import convert
 
@@ -210,6 +211,50 @@ def test_layers_that_end_inside_of_a_cell_get_one_note(rod):
     assert notes == [
         "Layer 'a' of alpha, layer 'b' of alpha end inside a cell. Add the ends to `mesh.nodes`."
     ]
+
+
+HEATED_PLATE = """
+equation = "conduction"
+initial = 20
+[mesh]
+x = [0, "1 m"]
+y = [0, "50 cm"]
+cells = [10, 10]
+[options]
+C = 2e6
+[sources]
+heater = { value = "P", over = ["26 cm", "44 cm", "11 cm", "33 cm"] }
+[data]
+file = "plate.csv"
+time_unit = "s"
+[unknowns.k]
+prior = 20
+std = 10
+transform = "log"
+[channels]
+P = { role = "input", column = "P" }
+T = { role = "sensor", column = "T", at = ["60 cm", "20 cm"], noise = "0.1 K" }
+"""
+
+
+def test_a_source_in_a_box_of_a_rectangle_has_its_power(tmp_path):
+    """The power is that of the box, wherever the cells of the mesh end."""
+    (tmp_path / "plate.csv").write_text("time,P,T\n0,1,20\n60,1,20\n")
+    (path := tmp_path / "case.toml").write_text(HEATED_PLATE)
+    case = cases.load(path)
+    moment = Moment(0.0, Inputs({"P": 1.0}))
+    power = -case.model.B(case.model.state_space.interpolate(0.0), moment).sum()
+    assert power == pytest.approx(0.18 * 0.22, rel=1e-12)
+    assert not any("inside a cell" in note for note in case.notes)
+    given = [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.75, 1.0]
+    path.write_text(
+        HEATED_PLATE.replace("cells = [10, 10]", "")
+        .replace('x = [0, "1 m"]', f"x = {given}")
+        .replace('y = [0, "50 cm"]', "y = [0, 0.11, 0.33, 0.5]")
+    )
+    with pytest.warns(UserWarning, match="its border crosses cells of the mesh"):
+        notes = cases.load(path).notes
+    assert notes == ["Source 'heater' ends inside a cell. Add the ends to `mesh.x` and `mesh.y`."]
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import datetime, timedelta
 from importlib.util import find_spec
 from types import SimpleNamespace
 from typing import Any
@@ -38,6 +39,7 @@ def rod(cells: int = 20, **options: Any) -> lp.Model:
         state=lp.Field(mesh, ElementLineP1()),
         parameter={"k": lp.LogNormal(20.0, std=10.0)},
         M=lambda u, v, x: 3.6e6 * u * v,
+        time_unit="s",
         **{"inputs": ["heater", "room"], **given},
     )
 
@@ -160,6 +162,34 @@ def test_a_boundary_value_may_be_a_control_that_jumps():
 def test_what_has_no_reduced_model_is_told(options, says):
     with pytest.raises(lp.errors.ModelError, match=says):
         ct.reduce(rod(**options), OUTPUTS, ["heater"])
+
+
+@pytest.mark.parametrize(
+    ("outputs", "says"),
+    [
+        (
+            lp.observation.Functionals(
+                {"flux": lp.On("right", lambda q, u, x: -q.k * lp.dot(lp.grad(u), x.normal))}
+            ),
+            "'flux' depends on unknowns",
+        ),
+        (lp.Points({"T": 0.1}, direct={"T": lambda q, x: q.k}), "'T' depends on unknowns"),
+        (
+            lp.observation.Transformed(lp.Points({"P": 0.1}), function=lambda T: (T + 273.15) ** 4),
+            "'P' is not linear in the state",
+        ),
+    ],
+)
+def test_an_output_that_would_stay_at_the_prior_or_at_zero_is_told(outputs, says):
+    with pytest.raises(lp.errors.ModelError, match=says):
+        ct.reduce(rod(), outputs, ["heater"], sensors=SENSORS)
+
+
+def test_an_output_that_is_not_linear_is_linearised_where_it_is_said():
+    radiation = lp.observation.Transformed(lp.Points({"P": 0.1}), function=lambda T: T**4)
+    small = ct.reduce(rod(), radiation, ["heater"], sensors=SENSORS, u=300.0)
+    y = small.outputs(small.project(np.full(21, 301.0)), np.zeros(2))
+    assert y[0] == pytest.approx(300.0**4 + 4 * 300.0**3, rel=1e-6)
 
 
 def test_a_nonlinear_model_is_linearised_where_it_is_said():
@@ -785,6 +815,22 @@ def test_a_row_of_a_pandas_table_counts_by_name_for_all_of_a_loop():
         )
     assert one.inputs == other.inputs
     assert one.known.x.tolist() == other.known.x.tolist()
+
+
+def test_times_of_a_loop_may_be_dates():
+    """As those of its identifier; a filter alone has no unit for them."""
+    begin, known = datetime(2025, 3, 1, 12), []
+    for dated in (False, True):
+        loop = ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD))
+        for k in range(3):
+            t = begin + timedelta(seconds=k * PERIOD) if dated else k * PERIOD
+            action = loop.step(t, [21.0, 20.0], {"room": ROOM}, reference={"tip": 45.0})
+        assert action.t == 2 * PERIOD
+        known.append(action.known.x.tolist())
+    assert known[0] == known[1]
+    alone = ct.Loop(ct.Kalman(reduced(), PERIOD, drive={}), ct.LQ(reduced(), GOAL, PERIOD))
+    with pytest.raises(lp.errors.SampleError, match="time t: got datetime"):
+        alone.step(begin, [21.0, 20.0], {"room": ROOM}, reference={"tip": 45.0})
 
 
 def test_a_controller_that_raises_leaves_a_loop_that_goes_on():

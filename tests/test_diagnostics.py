@@ -40,6 +40,39 @@ def test_a_wrong_derivative_is_found():
         report.raise_if_failed()
 
 
+def heat_with_traces(factor, capacity):
+    """A temperature with a large term, and traces with a small one whose derivative is given."""
+    P1 = lp.Field(line(6), ElementLineP1())
+    return lp.Model(
+        {"T": P1, "c": lp.Field(P1.mesh, ElementLineP1())},
+        {"k": lp.Normal(1.0, std=0.5)},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u.T), lp.grad(v.T)),
+        B=lambda u, v, x: capacity * u.T**4 * v.T + u.c**2 * v.c,
+        dB=lambda u, du, v, x: 4 * capacity * u.T**3 * du.T * v.T + factor * u.c * du.c * v.c,
+    )
+
+
+def test_a_wrong_derivative_is_found_beside_larger_terms():
+    start = {"T": 2.0, "c": 1e-3}
+    check_model(heat_with_traces(2.0, 1e6), u=start).raise_if_failed()
+    report = check_model(heat_with_traces(1.0, 1e6), u=start)
+    assert failed(report) == ["B'(u) of 'c' by 'c': rate of the Taylor remainder"]
+
+
+def test_a_wrong_derivative_of_a_sensor_is_found_beside_larger_readings():
+    model = reaction(line(6), ElementLineP1())
+    power = lp.observation.Transformed(lp.Points({"P": 0.9}), function=lambda u: u**4)
+
+    def voltage(slope):
+        return lp.observation.Transformed(
+            lp.Points({"V": 0.2}), lambda u: 1e-6 * u**2, derivative=lambda u: slope * 1e-6 * u
+        )
+
+    check_observation(lp.Combined([voltage(2.0), power]), model, at=600.0).raise_if_failed()
+    report = check_observation(lp.Combined([voltage(1.0), power]), model, at=600.0)
+    assert failed(report) == ["G'(u) by differences"]
+
+
 def test_a_right_derivative_passes():
     model = reaction(
         line(6),

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from datetime import datetime, timedelta
+
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.sparse as sp
 from factories import diffusion, laplace, line, observe, product, truth
@@ -180,3 +184,73 @@ def test_a_direct_sensor_that_reads_an_input_is_refused_by_its_law():
     sensors = lp.Points({"a": 0.5}, direct={"a": lambda q, x: q * x.inputs["Q"]})
     with pytest.raises(lp.errors.LawError, match="SensitivityLaw"):
         lp.Identifier(model, sensors, lp.GradientLaw())
+
+
+def rod_with_inputs(**options):
+    model = lp.models.heat(
+        lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": lp.Channel("left")}
+    )
+    return lp.Identifier(model, lp.Points({"T": 0.5}, noise=0.1), **options)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("assimilate_from", math.nan, "must be a number"),  # nothing would be assimilated
+        ("assimilate_from", datetime(2025, 1, 1), "must be a number"),
+        ("t0", datetime(2025, 1, 1), "must be a number"),
+        ("dt_max", "1 s", "must be a number"),
+        ("dt_max", timedelta(seconds=1), "must be a number"),
+        ("input_noise", {"left": "0.1"}, "must be a positive number"),
+        ("scheme", lp.Alexander2, "expected a time scheme"),
+        ("validation", ["T"], "expected an observation"),
+        ("u0", lambda x: np.zeros(3), "expected one real number for each point"),
+        ("u0", lambda x: x[0] + 1j, "expected one real number for each point"),
+    ],
+)
+def test_options_of_an_identifier_are_checked(option, value, said):
+    with pytest.raises(lp.LivepdeError, match=said):
+        rod_with_inputs(**{option: value})
+
+
+@pytest.mark.parametrize("value", [lambda x: 1.0 + x[0], lambda t: t])
+def test_a_boundary_value_of_one_argument_is_told(value):
+    model = lp.models.heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": value})
+    with pytest.raises(lp.errors.SpaceError, match=r"Expected a function g\(x, t\)"):
+        lp.Identifier(model, lp.Points({"T": 0.5}, noise=0.1)).step(1.0, [0.0])
+
+
+def test_an_input_with_two_values_is_refused():
+    rod = rod_with_inputs()
+    with pytest.raises(lp.errors.SampleError, match="'left' is 1 among the readings and 2 among"):
+        rod.step(1.0, {"T": 0.0, "left": 1.0}, {"left": 2.0})
+    samples = (
+        ({"T": 0.0, "left": 1.0}, {"left": math.nan}),
+        ({"T": 0.0, "left": math.nan}, {"left": 1.0}),
+        ({"T": 0.0, "left": 1.0}, {"left": 1.0}),
+        ({"T": 0.0}, pd.Series({"left": 1.0})),
+        ({"T": 0.0, "left": 1.0}, None),
+    )
+    states = []
+    for z, inputs in samples:
+        rod = rod_with_inputs()
+        states.append(rod.step(1.0, z, inputs).u.tolist())
+    assert all(state == states[0] for state in states)
+    ahead = [
+        rod.forecast([2.0, 3.0], g) for g in ({"left": [1, 2]}, pd.DataFrame({"left": [1, 2]}))
+    ]
+    assert ahead[0].z.tolist() == ahead[1].z.tolist()
+    with pytest.raises(lp.errors.SampleError, match="expected a mapping from names"):
+        rod.step(3.0, [0.0], [1.0])
+
+
+def test_options_of_a_result_are_checked():
+    empty = rod_with_inputs().run([])
+    with pytest.raises(lp.errors.ConfigurationError, match="contains no samples"):
+        empty.plot.estimates()
+    with pytest.raises(lp.errors.ConfigurationError, match="fields_every must be"):
+        rod_with_inputs().run([], fields_every=0)
+    result = rod_with_inputs().run([(1.0, [0.1], {"left": 0.0})])
+    for n in (0, -1, 2.5):
+        with pytest.raises(lp.errors.ConfigurationError, match="sample: n must be"):
+            result.sample(n)

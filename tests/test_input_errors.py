@@ -48,6 +48,12 @@ def commas() -> None:
     case('time_unit = "s"', 'time_unit = "s"\nseparator = ";"')()
 
 
+def minutes() -> None:
+    data("time_s", "time_min")()
+    case('time = "time_s"                # the', 'time = "time_min" # the')()
+    case('time_unit = "s"', "")()
+
+
 def nothing() -> None:
     """All is as `livepde init mine` wrote it."""
 
@@ -57,6 +63,7 @@ MISTAKES = {
     "a column": (case('column = "T_10"', 'column = "T10"'), RUN),
     "a key": (case("prior =", "priro ="), RUN),
     "a unit": (case('"5e-5 m^2/s"', '"5e-5 m2/s"'), RUN),
+    "a unit in a name": (minutes, RUN),
     "another kind of unit": (case('time_unit = "s"', 'time_unit = "m"'), RUN),
     "no unit": (case('"5e-5 m^2/s"', '"5e-5"'), RUN),
     "a decimal comma in the case": (case('at = "10 cm"', 'at = "10,5 cm"'), RUN),

@@ -410,3 +410,48 @@ def test_what_is_refused():
         fisher_kpp(mesh, ONE, ONE, K=0.0)
     with pytest.raises(lp.errors.ModelError, match="m must be at least 1"):
         porous_fisher(mesh, ONE, ONE, m=0.5)
+
+
+LEFT = {"left": 0.0}
+RODS = {
+    "heat": lambda mesh, by: lp.models.heat(mesh, by, LEFT),
+    "conduction": lambda mesh, by: lp.models.conduction(mesh, by, LEFT, C=1.0),
+    "advection_diffusion": lambda mesh, by: lp.models.advection_diffusion(
+        mesh, by, LEFT, v=lp.Normal(0.0, std=1.0)
+    ),
+    "fisher_kpp": lambda mesh, by: lp.models.fisher_kpp(mesh, by, lp.LogNormal(1.0, 1.0)),
+    "wave": lambda mesh, by: lp.models.wave(mesh, by, d=0.0, dirichlet=LEFT),
+}
+
+
+@pytest.mark.parametrize(
+    ("regions", "said"),
+    [
+        ({"a": lambda x: x[0] < 0.4, "b": lambda x: x[0] > 0.6}, "0.45 lies in 0 regions of"),
+        ({"a": lambda x: x[0] < 0.6, "b": lambda x: x[0] > 0.4}, "0.45 lies in 2 regions of"),
+        ({"a": "core", "b": lambda x: x[0] > 0.4}, "0.45 lies in 2 regions of"),
+        ({"a": lambda x: x[0] < 2.0, "b": lambda x: x[0] > 2.0}, "in the region 'b' of"),
+    ],
+)
+@pytest.mark.parametrize("name", RODS)
+def test_layers_with_gaps_or_overlaps_are_refused(name, regions, said):
+    """The coefficient would be zero in a gap, and a sum where two layers overlap."""
+    mesh = lp.interval(0.0, 1.0, 10, regions={"core": lambda x: x[0] < 0.5})
+    with pytest.raises(lp.errors.ModelError, match=f"^{name}: .*{said}"):
+        RODS[name](mesh, lp.Piecewise(regions, lp.LogNormal(1.0, std=0.5)))
+    halves = {"a": "core", "b": lambda x: x[0] > 0.5}
+    RODS[name](mesh, lp.Piecewise(halves, lp.LogNormal(1.0, std=0.5)))
+
+
+@pytest.mark.parametrize(
+    ("C", "said"),
+    [
+        (lambda x: 1.0 - 2.0 * (x[0] > 0.5), "must be positive everywhere; its least value is -1"),
+        (lambda x: 1.0 * (x[0] > 0.5), "must be positive everywhere; its least value is 0"),
+        (np.nan, "must be positive; got nan"),
+        ("2e6", "must be positive; got '2e6'"),
+    ],
+)
+def test_a_heat_capacity_is_positive_everywhere(C, said):
+    with pytest.raises(ModelError, match=said):
+        conduction(lp.interval(0.0, 1.0, 10), lp.LogNormal(1.0, std=0.5), LEFT, C=C)

@@ -77,6 +77,8 @@ def test_an_estimate_has_the_same_values(name):
         for one, other in pairs:
             np.testing.assert_array_equal(one, other)
     assert pickle.dumps(pickle.loads(pickle.dumps(again))) == pickle.dumps(again)
+    with pytest.raises(lp.errors.ConfigurationError, match="this estimate was pickled, without"):
+        again["u"].at(0.5)
 
 
 @pytest.mark.parametrize("name", RODS)

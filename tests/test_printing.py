@@ -7,6 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
+import livepde as lp
 from livepde.cli.printing import print_table
 from livepde.reproduce import boiger2016
 from livepde.runs import Table
@@ -32,3 +33,10 @@ def test_words_are_folded_where_they_fit_no_longer() -> None:
     assert out.getvalue().split().count("word") == 30
     assert max(len(line.rstrip()) for line in out.getvalue().splitlines()) <= 40
     assert "0.1235" in out.getvalue()
+
+
+def test_an_estimate_without_covariance_has_no_interval():
+    rod = lp.models.heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": 0.0})
+    mean = lp.Averages({"T": lambda x: x[0] > 0.5})
+    estimate = lp.Identifier(rod, mean, lp.GradientLaw(), u0=1.0).step(0.1, [0.9])
+    assert str(estimate["alpha"]) == f"{estimate.q[0]:.4g}"

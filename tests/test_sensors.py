@@ -71,6 +71,23 @@ def test_averages_over_named_parts_and_boundaries():
         observe(rod(), lp.Averages({"a": "nowhere"}))
 
 
+@pytest.mark.parametrize(("low", "high"), [(0.26, 0.42), (0.3, 0.36), (0.34, 0.36), (0.05, 0.93)])
+def test_averages_over_regions_whose_border_crosses_cells(low, high):
+    """Against the exact mean over an interval, and over a square of rectangles and triangles."""
+
+    def between(*x):
+        return np.logical_and.reduce([(low < one) & (one < high) for one in x])
+
+    means = {"mean": lambda x: between(x[0])}
+    z = read(rod(), lp.Averages(means), lambda x: x[0])
+    np.testing.assert_allclose(z, (low + high) / 2, atol=1e-3)  # cells are 0.1 long
+    squares = {"mean": lambda x: between(x[0], x[1])}
+    rectangles = plate(ElementQuad1(), lp.rectangle((0, 1), (0, 1), (10, 10)))
+    for owner in (rectangles, plate()):
+        z = read(owner, lp.Averages(squares), lambda x: x[0] - 2 * x[1])
+        np.testing.assert_allclose(z, -(low + high) / 2, atol=0.01)
+
+
 @pytest.mark.parametrize("mean", [True, False])
 def test_line_integrals_are_exact(mean):
     lines = {"a": (0.13, 0.77), "whole": (1.0, 0.0)}

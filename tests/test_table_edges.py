@@ -191,6 +191,28 @@ def test_a_unit_at_the_end_of_a_name_is_that_of_the_sensor(tmp_path):
     assert "unit" not in given["T_in"]
 
 
+@pytest.mark.parametrize("name", ["time_min", "t [min]", "minutes"])
+def test_a_unit_in_the_name_of_times_is_not_passed_over(tmp_path, name):
+    """Times in minutes that were read in seconds gave a diffusivity 60 times too large."""
+    rod = heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(1e-3, std=1e-3), {"left": 0.0})
+    table = pd.DataFrame({name: [1.0, 2.0, 3.0], "T": [0.9, 0.8, 0.7]})
+    table.to_csv(tmp_path / "rod.csv", index=False)
+    ways = ((table, name), (table.set_index(name), None), (tmp_path / "rod.csv", name))
+    for given, time in ways:
+
+        def run(unit, given=given, time=time):
+            identifier = lp.Identifier(rod, lp.Points({"T": 0.5}, noise=0.1), u0=1.0)
+            return identifier.run(given, time=time, time_unit=unit).last.t
+
+        said = "the name states the unit 'min(utes)?', which is not that of the model"
+        with pytest.raises(lp.errors.SampleError, match=said):
+            run(None)
+        assert [run("min"), run("s")] == [180.0, 3.0]
+    dated = table.assign(**{name: pd.date_range("2025-01-01", periods=3, freq="min")})
+    identifier = lp.Identifier(rod, lp.Points({"T": 0.5}, noise=0.1), u0=1.0)
+    assert identifier.run(dated, time=name).last.t == 120.0
+
+
 @pytest.mark.parametrize(
     "column",
     [
@@ -214,3 +236,20 @@ def test_a_compressed_file_is_named(tmp_path):
     path.write_bytes(gzip.compress(b"time,T\n0,1\n1,2\n"))
     with pytest.raises(DataError, match="is compressed: unpack it first"):
         measured(path, "s")
+
+
+@pytest.mark.parametrize(
+    ("cell", "said"),
+    [
+        ("0,93", "numbers only; got '0,93': read the table with decimal=','"),
+        ("open", "numbers only; got 'open'."),
+    ],
+)
+def test_text_in_a_table_is_named(cell, said):
+    rod = heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": lp.Channel("a")})
+    table = pd.DataFrame({"T": ["0.9", cell], "a": [1.0, 1.0]}, index=[1.0, 2.0])
+    identifier = lp.Identifier(rod, lp.Points({"T": 0.5}, noise=0.1, unit="degC"), u0=1.0)
+    with pytest.raises(lp.errors.SampleError, match=said):
+        identifier.run(table)
+    with pytest.raises(lp.errors.ConfigurationError, match="'a' is no sensor, so its values are"):
+        identifier.run(table, units={"a": "K"})

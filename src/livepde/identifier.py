@@ -10,6 +10,7 @@ from dataclasses import replace
 from datetime import datetime
 from functools import cache, partial
 from itertools import pairwise
+from numbers import Real
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -167,8 +168,15 @@ class Identifier(Shown):
     ) -> None:
         law = SensitivityLaw() if law is None else law
         _check_parts(model, observation, law)
+        t0, dt_max = _time("t0", t0), _time("dt_max", dt_max)
         if not dt_max > 0:
             raise ConfigurationError(f"dt_max must be positive; got {dt_max}.")
+        for what, part, kind, expected in (
+            ("validation", validation, Observation, "an observation, such as Points"),
+            ("scheme", scheme, Scheme, "a time scheme, such as Alexander2()"),
+        ):
+            if part is not None and not isinstance(part, kind):
+                raise ConfigurationError(f"{what}: got {part!r:.80}; expected {expected}.")
         u0_errors = tuple(u0_errors)
         _check_start(model, t0, u0, {"u0_from": u0_from, "u0_errors": u0_errors})
         # Unknowns of the sensors, as an offset, join those of the model: laws treat both alike.
@@ -199,7 +207,7 @@ class Identifier(Shown):
         )
         errors = self._initial_errors(u0_errors)
         self.problem = Problem(model, self.observed, control, noise, readings, errors, u0)
-        self.assimilate_from = assimilate_from
+        self.assimilate_from = _time("assimilate_from", assimilate_from)
         self._work = law.prepare(self.problem)
         self._q0 = model.initial_parameter(q0)
         self._u0 = model.initial_values(0.0 if u0 is None else u0)
@@ -269,13 +277,14 @@ class Identifier(Shown):
 
     def _input_noise(self, given: Mapping[str, float]) -> dict[str, float]:
         """Return the noise of input channels, checked."""
-        for name, std in given.items():
+        stds: Mapping[str, Any] = given
+        for name, std in stds.items():
             if name not in self.model.channels:
                 raise ConfigurationError(
                     f"input_noise: the model has no channel '{name}'; it has "
                     f"{list(self.model.channels)}. Specify the noise of sensors in the observation."
                 )
-            if not (math.isfinite(std) and std > 0.0):
+            if not (isinstance(std, Real) and 0.0 < float(std) < math.inf):
                 raise ConfigurationError(
                     f"input_noise of '{name}' must be a positive number; got {std!r}."
                 )
@@ -396,7 +405,7 @@ class Identifier(Shown):
         """Take one sample; return the estimate, and the interval that the law was given."""
         t, origin = self._counted(t)
         t = self._time_of_next(t)
-        measured, noise, validation, named = self._channels.parse(z, inputs or {})
+        measured, noise, validation, named = self._channels.parse(z, inputs)
         if noise is not None:
             self._check_weighs(noise)
         values, held = self._filled(named)
@@ -726,7 +735,7 @@ class Identifier(Shown):
                 f"forecast: two times are more than {MOST_SUBSTEPS} substeps of dt_max = "
                 f"{self.problem.control.dt_max:g} apart; give times in between, or a longer dt_max."
             )
-        planned = self._channels.planned(inputs or {}, t.tolist(), self._t, self._known)
+        planned = self._channels.planned(inputs, t.tolist(), self._t, self._known)
         state, last = self._state, self._last
         if state is None:
             opening = self._opening(planned[0], float(t[0]))
@@ -776,7 +785,8 @@ class Identifier(Shown):
             index of a table, the coordinate of a dataset, or the one column that is called time,
             date or the like.
         time_unit
-            Unit of times that are numbers; default that of the model.
+            Unit of times that are numbers; default that of the model. Required if the name of
+            their column has another one, such as time_min.
         columns
             Channel -> name of its column, where they differ: {"T_10": "TS_3_2_1"}.
         units
@@ -940,7 +950,7 @@ class Identifier(Shown):
             who._begin(who._inputs)
         nothing = np.full(self.observed.size, np.nan)
         for sample in samples:
-            _, own, _, named = self._channels.parse(sample.z, sample.inputs or {})
+            _, own, _, named = self._channels.parse(sample.z, sample.inputs)
             inputs = {name: named[name] for name in self.inputs if name in named}
             estimate, interval = who._taken(sample.t, nothing, inputs)
             std = noise if own is None else np.where(np.isnan(own), noise, own)
@@ -1068,6 +1078,15 @@ def _check_parts(*parts: object) -> None:
                 "Identifier(model, observation, law): as "
                 f"{kind.__name__.lower()}, got {part!r:.80}{remedy}."
             )
+
+
+def _time(name: str, value: Any) -> float:
+    """Return a time or duration of the options."""
+    if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf" or math.isnan(value):
+        raise ConfigurationError(
+            f"{name} must be a number, in the unit of time of the model; got {value!r}."
+        )
+    return float(value)
 
 
 def _check_start(model: Model, t0: float, u0: Any, uncertain: Mapping[str, Any]) -> None:

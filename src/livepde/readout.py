@@ -146,9 +146,14 @@ class Marginal:
         return (float(low), float(high)) if isinstance(self.median, float) else (low, high)
 
     def __str__(self) -> str:
-        """Return mean and standard deviation; under a transform median and 95 % interval."""
+        """Return mean and standard deviation; under a transform median and 95 % interval.
+
+        The value alone for a law without covariance.
+        """
         if not isinstance(self.median, float):
             return repr(self)
+        if np.isnan(self.deviation):
+            return f"{self.median:.4g}"
         if isinstance(self.unknown.prior, Normal):
             return f"{self.mean:.4g} ± {self.std:.2g}"
         low, high = self.interval()

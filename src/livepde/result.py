@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from numbers import Integral
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
@@ -266,7 +267,12 @@ class Estimate(Shown):
             u_std = self.u_std if self.u_std is not None else np.full_like(self.u, np.nan)
             known = self.state_space.unknown_of(name)
             return Marginal(self.u[part], u_std[part], known, partial(self._at, name))
-        components = () if self.state_space is None else self.state_space.fields
+        if self.state_space is None:
+            raise ConfigurationError(
+                f"estimate['{name}']: this estimate was pickled, without its state; its unknowns "
+                f"are {[*space.labels, *space.fields]}."
+            )
+        components = self.state_space.fields
         raise ConfigurationError(
             f"estimate['{name}']: there is no unknown '{name}'; there are "
             f"{[*space.labels, *space.fields, *components]}."
@@ -352,10 +358,11 @@ class Result(Shown):
         count: int | None = None,
         ignored: Sequence[str] = (),
     ) -> None:
+        _check_count("fields_every", fields_every)
         self.model = model
         self.observed = observed
         self.validation = validation
-        self.fields_every = fields_every
+        self.fields_every = int(fields_every)
         self.last: Estimate | None = None
         self._settled: Belief | None = None
         self._ended = False  # a last fit was asked for
@@ -520,6 +527,7 @@ class Result(Shown):
         import xarray as xr
 
         last, model = self._last("sample"), self.model
+        _check_count("sample: n", n)
         q, u = draws(last.belief, last.space, n, seed)
         numbers = {
             label: ("draw", q[:, k], {"units": last.space.unknown_of(label).unit})
@@ -730,6 +738,12 @@ class Result(Shown):
         from livepde.plots import RunPlots
 
         return RunPlots(self)
+
+
+def _check_count(name: str, value: Any) -> None:
+    """Refuse what is not a whole number, at least 1."""
+    if not isinstance(value, Integral) or int(value) < 1:
+        raise ConfigurationError(f"{name} must be a whole number, at least 1; got {value!r}.")
 
 
 def _number(value: float) -> float | None:

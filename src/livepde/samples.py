@@ -148,6 +148,16 @@ def labelled(z: Any) -> Any:
     return named
 
 
+def mapped(given: Any, what: str) -> Mapping[str, Any]:
+    """Return values by name; a row or a table of pandas counts by its names, None has none."""
+    if given is None:
+        return {}
+    found = dict(given.items()) if is_frame(given) else labelled(given)
+    if not isinstance(found, Mapping):
+        raise SampleError(f"{what}: got {given!r:.80}; expected a mapping from names to values.")
+    return found
+
+
 def number(value: Any, what: str) -> float:
     """Return a float; None is missing (NaN). `what` names it in messages."""
     if type(value) is float and math.isfinite(value):
@@ -286,13 +296,15 @@ class Channels:
         return found - needed - set(self.forced)
 
     def parse(
-        self, z: Readings, inputs: Mapping[str, float]
+        self, z: Readings, inputs: Mapping[str, float] | None
     ) -> tuple[Array, Array | None, Array, dict[str, float]]:
         """Return assimilated values and their noise, validation values, and inputs, all checked.
 
         The noise is None if no value has one of its own, NaN where one has none. Among the inputs
         may be other channels.
         """
+        if not isinstance(inputs, dict):
+            inputs = mapped(inputs, "inputs")
         if not isinstance(z, (np.ndarray, dict)):
             row = labelled(z)
             z = row if row is z else self._columns(row)
@@ -301,7 +313,22 @@ class Channels:
         else:
             measured, noise = readings(z, self.observed)
             validation, named = np.full(len(self.hidden), np.nan) if self.hidden else NOTHING, {}
-        return measured, noise, validation, named | self._named(inputs) if inputs else named
+        if inputs:
+            given = self._named(inputs)
+            self._check_once(named, given)
+            named |= {n: v for n, v in given.items() if n not in named or not math.isnan(v)}
+        return measured, noise, validation, named
+
+    def _check_once(self, named: Mapping[str, float], given: Mapping[str, float]) -> None:
+        """Refuse an input with one value among the readings and another one among the inputs."""
+        sensors = {*self.observed.names, *self.hidden}
+        for name, value in given.items():
+            other = named.get(name, value)  # a sensor may have the name of an input
+            if other != value and not (math.isnan(other) or math.isnan(value) or name in sensors):
+                raise SampleError(
+                    f"input '{name}' is {other:g} among the readings and {value:g} among the "
+                    "inputs; give one of them."
+                )
 
     def _columns(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return a row of a table without the columns that are no channel, as `run` reads a table.
@@ -314,7 +341,7 @@ class Channels:
 
     def readings(self, samples: Sequence[Sample]) -> Array:
         """Return the readings of assimilated and validation sensors, shape (samples, sensors)."""
-        rows = [self.parse(sample.z, sample.inputs or {}) for sample in samples]
+        rows = [self.parse(sample.z, sample.inputs) for sample in samples]
         shape = len(samples), self.observed.size + len(self.hidden)
         return np.reshape([[*measured, *hidden] for measured, _, hidden, _ in rows], shape)
 
@@ -382,7 +409,11 @@ class Channels:
         return Inputs(values), tuple(held)
 
     def planned(
-        self, inputs: Mapping[str, ArrayLike], times: Iterable[float], t: float, known: Inputs
+        self,
+        inputs: Mapping[str, ArrayLike] | None,
+        times: Iterable[float],
+        t: float,
+        known: Inputs,
     ) -> list[Inputs]:
         """Return all inputs at each of several future times.
 
@@ -390,7 +421,8 @@ class Channels:
         inputs of the last sample.
         """
         times, planned, last = list(times), [], known
-        plans = {name: plan(name, values, len(times)) for name, values in inputs.items()}
+        given = mapped(inputs, "forecast: inputs")
+        plans = {name: plan(name, values, len(times)) for name, values in given.items()}
         for k, when in enumerate(times):
             named = self._named({name: float(values[k]) for name, values in plans.items()})
             if when == t:  # the last sample itself: where sensors are that move is known

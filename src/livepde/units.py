@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from itertools import permutations
@@ -29,6 +30,9 @@ NOT_A_UNIT = (
     TypeError,
     ValueError,
 )
+IN_BRACKETS = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]\s*$")  # T [degC], time (min)
+AT_THE_END = re.compile(r"(?:_|^(?=\w{3}))([A-Za-z]+)$")  # time_s, minutes
+OF_TIME = re.compile(r"[mu]?s|sec|min|hr?|d|(second|minute|hour|day|week|year)s?", re.I)
 QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
 
 
@@ -139,6 +143,30 @@ def conversion(given: str, unit: str, where: str) -> Affine:
     if not math.isclose(two - one, one - zero):
         raise CaseError(f"{where}: '{given}' has no linear scale; {_expected(unit, given)}.")
     return Affine(float(one - zero), float(zero))
+
+
+def unit_in(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
+    """Return the unit in the name of a column; empty if none can be converted to `unit`."""
+    for given in filter(None, (pattern.search(name) for pattern in patterns)):
+        powers = re.sub(r"(?<=[A-Za-z])(?=\d)", "^", given[1])  # m3/h is m^3/h
+        for text in (given[1], powers, powers.replace("_", "/")):  # L_s is L/s
+            with suppress(CaseError):
+                conversion(text, unit, name)
+                return text
+    return ""
+
+
+def other_time_unit(name: str, unit: str) -> str:
+    """Return the unit of time in the name of a column if it is not `unit`; else empty.
+
+    >>> other_time_unit("time_min", "s"), other_time_unit("t [s]", "s")
+    ('min', '')
+    """
+    stated = (pattern.search(name) for pattern in (IN_BRACKETS, AT_THE_END))
+    if not (unit and any(found and OF_TIME.fullmatch(found[1]) for found in stated)):
+        return ""  # before pint is loaded
+    given = unit_in(name, unit, IN_BRACKETS, AT_THE_END)
+    return given if given and conversion(given, unit, name).factor != 1.0 else ""
 
 
 def in_si(unit: str) -> SI | None:

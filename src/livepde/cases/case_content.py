@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import inspect
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,6 +18,7 @@ from livepde import fem
 from livepde.cases.read import beside, did_you_mean
 from livepde.cases.schema import CaseSpec, ChannelSpec
 from livepde.errors import CaseError, LivepdeError, SpaceError
+from livepde.fem.measure import Measure, crossed
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.models import EQUATIONS, Equation, Fluxes, Option, Variable
@@ -174,14 +175,17 @@ def _rectangle(case: CaseContent, x: Iterable[float | str], y: Iterable[float | 
         with case.located("mesh", SpaceError):
             return fem.grid(*sides)
     _check_cells(float(spec.cells[0]) * spec.cells[1], case.where("mesh.cells"))
+    spacings = spec.spacing if isinstance(spec.spacing, tuple) else ("uniform", "uniform")
+    edges = _layer_edges(case)
     with case.located("mesh", SpaceError):
-        if not isinstance(spec.spacing, tuple):
+        if not edges and not isinstance(spec.spacing, tuple):
             (x0, x1), (y0, y1) = sides
             return fem.rectangle((x0, x1), (y0, y1), spec.cells)
         nodes = []
-        for (start, stop), number, spacing in zip(sides, spec.cells, spec.spacing, strict=True):
-            geometric = _is_graded(case, spacing, start)
-            nodes.append(fem.interval(start, stop, number, geometric=geometric).p[0])
+        for k, (ends, number, spacing) in enumerate(zip(sides, spec.cells, spacings, strict=True)):
+            geometric = _is_graded(case, spacing, ends[0])
+            across = [edge for _, axis, edge in edges if axis == k]
+            nodes.append(_spaced(ends, number, geometric, across).p[0])
         return fem.grid(*nodes)
 
 
@@ -195,10 +199,16 @@ def _interval(case: CaseContent) -> Any:
     if not start < stop:
         raise case.error("mesh", f"got from {start:g} to {stop:g} {unit}; needs from < to.")
     geometric = _is_graded(case, spec.spacing, start)
+    edges = [edge for _, axis, edge in _layer_edges(case) if axis == 0]
+    return _spaced((start, stop), cells, geometric, edges)
+
+
+def _spaced(ends: Sequence[float], cells: int, geometric: bool, edges: Sequence[float]) -> Any:
+    """Return an interval of cells with nodes at the edges of layers."""
     # The nodes nearest to ends of layers move there, because a jump of an unknown inside of a cell
     # would be blurred. If two ends share a nearest node, the second becomes a node of its own.
+    start, stop = ends
     plain = fem.interval(start, stop, cells, geometric=geometric)
-    edges = [edge for _, edge in _layer_edges(case)]
     through = _fitted(plain.p[0], edges)
     mesh = fem.interval(start, stop, cells, geometric=geometric, through=through)
     own = {edge for edge in edges if _inside(mesh.p[0], edge)} - set(through)
@@ -211,8 +221,8 @@ def _is_graded(case: CaseContent, spacing: Any, start: float) -> bool:
     return bool(spacing == "geometric")
 
 
-def _layer_edges(case: CaseContent) -> list[tuple[str, float]]:
-    """Return the ends of layers of an interval, of unknowns and of sources, each with its name."""
+def _boxes(case: CaseContent) -> list[tuple[str, str, tuple[Any, ...]]]:
+    """Return the layers and boxes of unknowns and sources: name, key, and sides."""
     given: list[tuple[str, str, Any]] = [
         (f"layer '{layer}' of {name}", f"unknowns.{name}.regions.{layer}", item.over)
         for name, unknown in case.spec.unknowns.items()
@@ -222,12 +232,17 @@ def _layer_edges(case: CaseContent) -> list[tuple[str, float]]:
         (f"source '{name}'", f"sources.{name}.over", item.over)
         for name, item in case.spec.sources.items()
     ]
+    return [(what, key, over) for what, key, over in given if isinstance(over, tuple)]
+
+
+def _layer_edges(case: CaseContent) -> list[tuple[str, int, float]]:
+    """Return the ends of layers and boxes of unknowns and sources: name, coordinate and place."""
     unit = case.equation.length_unit
     return [
-        (what, edge)
-        for what, key, over in given
-        if isinstance(over, tuple) and len(over) == 2
-        for edge in case.pair(over, unit, key)
+        (what, k // 2, edge)
+        for what, key, over in _boxes(case)
+        for k in range(0, len(over) - 1, 2)
+        for edge in case.pair((over[k], over[k + 1]), unit, key)
     ]
 
 
@@ -258,15 +273,21 @@ def _check_cells(number: float, where: str) -> None:
         )
 
 
-def off_nodes(case: CaseContent, nodes: Array) -> list[str]:
-    """Return the names of layers and sources with an end inside a cell."""
-    within = 1e-6 * np.ptp(nodes)
-    crossed = dict.fromkeys(
-        what
-        for what, edge in _layer_edges(case)
-        if _inside(nodes, edge) and np.abs(nodes - edge).min() > within
-    )
-    return list(crossed)
+def off_nodes(case: CaseContent) -> list[str]:
+    """Return the names of layers, boxes and sources with an end inside a cell."""
+    mesh = case.mesh
+    if case.spec.mesh.file is not None:
+        cells = Measure(mesh, 2)
+        sides = [(what, inside(case, over, len(mesh.p), key)) for what, key, over in _boxes(case)]
+        return [what for what, region in sides if len(crossed(cells, region))]
+    found: dict[str, None] = {}
+    for what, axis, edge in _layer_edges(case):
+        if axis >= len(mesh.p):
+            continue  # such a box is refused later
+        nodes = mesh.p[axis]
+        if _inside(nodes, edge) and np.abs(nodes - edge).min() > 1e-6 * np.ptp(nodes):
+            found[what] = None
+    return list(found)
 
 
 def subdomain(case: CaseContent, mesh: Any, name: str, key: str) -> str:

@@ -43,7 +43,7 @@ from livepde.streams.mqtt import Broker, MqttSink, MqttSource
 from livepde.streams.oddities import wild_first_rows
 from livepde.streams.sources import Follow, Lines, RowSource
 from livepde.streams.table import JSON_LINES, no_file, read_parquet
-from livepde.units import conversion
+from livepde.units import conversion, other_time_unit
 
 if TYPE_CHECKING:
     from livepde.streams.opcua import OpcuaServer
@@ -92,6 +92,7 @@ def clock_of(case: CaseContent, data: DataSpec | None = None) -> Clock:
         decimal=data.decimal,
         hour="".join(data.times[1:]),
         margin=max([0.0, *delays(case).values()]),
+        doubt="" if data.time_unit else other_time_unit(data.times[0], unit),
     )
 
 

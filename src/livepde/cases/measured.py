@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from functools import partial
@@ -15,16 +14,14 @@ from statistics import mode
 import numpy as np
 
 from livepde.cases.read import BLANK
-from livepde.errors import CaseError, SampleError
+from livepde.errors import SampleError
 from livepde.linalg import Array
 from livepde.streams import Clock, Column, DataTable, read_csv
 from livepde.streams.clock import CALLED_TIME, date_formats, number_of
 from livepde.streams.csvfile import Written, how_written
 from livepde.streams.table import JSON_LINES, MISSING
-from livepde.units import conversion
+from livepde.units import AT_THE_END, IN_BRACKETS, unit_in
 
-IN_BRACKETS = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]\s*$")  # T [degC], time (min)
-AT_THE_END = re.compile(r"(?:_|^(?=\w{3}))([A-Za-z]+)$")  # time_s, minutes
 HOUR = re.compile(r"\d{1,2}:\d{2}(:\d{2}(\.\d+)?)?( ?[AaPp][Mm])?")
 ROW_NUMBER = re.compile(r"(id|idx|index|n|no|nr|num|number|row|rec|record|sample|#)\.?", re.I)
 VALUES = {"number", "date"}  # kinds of cells that a header does not have
@@ -128,17 +125,6 @@ def measured(
         unit = "s" if samples.origin else unit_in(time[0], unit, IN_BRACKETS, AT_THE_END) or BLANK
     texts = tuple(name for name in kinds if name not in (*time, *numbers))
     return Measured(table, written, time, found, unit, samples, counted, texts)
-
-
-def unit_in(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
-    """Return the unit in the name of a column; empty if none can be converted to `unit`."""
-    for given in filter(None, (pattern.search(name) for pattern in patterns)):
-        powers = re.sub(r"(?<=[A-Za-z])(?=\d)", "^", given[1])  # m3/h is m^3/h
-        for text in (given[1], powers, powers.replace("_", "/")):  # L_s is L/s
-            with suppress(CaseError):
-                conversion(text, unit, name)
-                return text
-    return ""
 
 
 def _kinds(table: Path, written: Written, form: str) -> dict[str, str]:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from livepde.cases import schema as tables
-from livepde.cases.measured import IN_BRACKETS, Measured, measured, unit_in
+from livepde.cases.measured import Measured, measured
 from livepde.cases.read import BLANK, beside, toml_line
 from livepde.cases.schema import CaseSpec, DataSpec
 from livepde.errors import RunError
@@ -25,6 +25,7 @@ from livepde.linalg import Array
 from livepde.models import EQUATIONS, Equation, Variable, heat
 from livepde.stepping import Advance, Alexander2, simulate
 from livepde.streams.oddities import sentinels, switches
+from livepde.units import IN_BRACKETS, unit_in
 
 SCHEMA_FILE = "livepde.schema.json"  # beside a case that `livepde init` writes
 DIALECT = "https://json-schema.org/draft/2020-12/schema"

@@ -14,7 +14,13 @@ from livepde import fem
 from livepde.cases.case_channels import unknowns_of
 from livepde.cases.case_content import CaseContent, inside, off_nodes, sides_of, subdomain
 from livepde.cases.read import did_you_mean, toml_key
-from livepde.cases.schema import BoundarySpec, ChannelSpec, EvolutionSpec, UnknownSpec
+from livepde.cases.schema import (
+    BoundarySpec,
+    ChannelSpec,
+    EvolutionSpec,
+    MeshSpec,
+    UnknownSpec,
+)
 from livepde.errors import CaseError, ModelError, NameClashError, SpaceError
 from livepde.fem.field_blocks import base_name
 from livepde.model import Model
@@ -312,11 +318,18 @@ def process_notes(case: CaseContent, model: Model) -> Iterator[str]:
             "The mesh is uniform, so its cells are too large at the left end, where "
             f"'{case.equation.name}' changes most. Set `mesh.spacing = 'geometric'`."
         )
-    line = len(case.mesh.p) == 1 and spec.file is None
-    if line and (crossed := off_nodes(case, case.mesh.p[0])):
-        remedy = "Add the ends to `mesh.nodes`" if spec.nodes else "Increase `mesh.cells`"
+    if crossed := off_nodes(case):
         names, end = ", ".join(crossed), "end" if len(crossed) > 1 else "ends"
-        yield f"{names[0].upper()}{names[1:]} {end} inside a cell. {remedy}."
+        yield f"{names[0].upper()}{names[1:]} {end} inside a cell. {_off_nodes_remedy(spec)}."
+
+
+def _off_nodes_remedy(spec: MeshSpec) -> str:
+    """Return how the ends of layers and sources become borders of cells."""
+    if spec.file is not None:
+        return "Name a subdomain of the mesh file in `over`, or use smaller cells"
+    if spec.cells is not None:
+        return "Increase `mesh.cells`"
+    return f"Add the ends to {'`mesh.nodes`' if spec.nodes else '`mesh.x` and `mesh.y`'}"
 
 
 def _undriven(case: CaseContent, model: Model) -> bool:

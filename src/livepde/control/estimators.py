@@ -126,10 +126,13 @@ class Kalman:
         Raises
         ------
         SampleError
-            Wrong shape, text, infinity, or a sensor that does not exist.
+            Wrong shape, text, infinity, a date, or a sensor that does not exist.
         TimeOrderError
             t is not later than the sample before.
         """
+        t = number(t, "time t")
+        if not math.isfinite(t):
+            raise SampleError(f"time t must be a finite number; got {t}.")
         sensors, r, z = self.model.sensors.names, self.model.size, labelled(z)
         if isinstance(z, Mapping):
             unknown = [name for name in z if name not in sensors]
@@ -331,7 +334,7 @@ class Learned:
             z = {name: z[name] for name in model.sensors.names if name in z}
         # The nominal filter runs at every sample, trusted or not, so that a fallback starts from a
         # converged state.
-        nominal = self.nominal.step(t, z, inputs)
+        nominal = self.nominal.step(estimate.t, z, inputs)  # a date as a number
         doubt = self.trust.doubt(estimate, model)
         self._good = 0 if doubt else min(self._good + 1, self.trust.patience)
         if self._good < self.trust.patience:

@@ -30,7 +30,7 @@ class Action:
     Attributes
     ----------
     t
-        Time of the sample.
+        Time of the sample in the unit of the model.
     inputs
         Mapping from control to the value to apply until the next sample.
     known
@@ -123,7 +123,7 @@ class Loop:
 
     def step(
         self,
-        t: float,
+        t: Any,
         z: Any,
         inputs: Mapping[str, float] | None = None,
         *,
@@ -174,13 +174,14 @@ class Loop:
         decision = self._possible(controller.decide(known, plan, applied, self._memory), applied)
         self._before, self._memory = decision.inputs, decision.memory
         y = model.outputs(known.x, model.values(channels))
+        estimate = getattr(self.estimator, "estimate", None)
         return Action(
-            t=t,
+            t=number(t, "time t") if estimate is None else estimate.t,
             inputs=dict(zip(model.controls, decision.inputs.tolist(), strict=True)),
             known=known,
             outputs=dict(zip(model.outputs.names, y.tolist(), strict=True)),
             status=decision.status,
-            estimate=getattr(self.estimator, "estimate", None),
+            estimate=estimate,
         )
 
     def _separated(self, z: Any, inputs: Mapping[str, float]) -> tuple[Any, dict[str, float]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -128,7 +128,8 @@ def check_model(
         A typical parameter (default the prior mean) and a typical state (default the initial state
         of the model, or zero): numbers, functions of x, or coefficients.
     spread
-        Size of the random variations of u; default a tenth of the largest |u|, or 1 if u = 0.
+        Size of the random variations of u; default a tenth of the largest |u| of each component.
+        For a component that is zero, a tenth of the largest of all, or 1 if u = 0.
     t, inputs
         Time and input channels; channels that are not given are 1.
     seed
@@ -194,7 +195,7 @@ class _TestPoint:
         n, m = model.X.dim, model.Q.dim
         start = model.initial_parameter(q)
         centre = model.initial_state(start, moment) if u is None else model.initial(u, moment)
-        width = spread or 0.1 * float(np.abs(centre).max()) or 1.0
+        width = _widths(model, centre, spread)
         std = model.latent.deviations
         lower, upper = model.latent.bounds
         varied = np.clip(start + std * rng.standard_normal(m), lower, upper) * model.Q.free
@@ -206,6 +207,17 @@ class _TestPoint:
             width * rng.standard_normal(n) * model.X.free,
             rng.standard_normal(n) * model.X.free,
         )
+
+
+def _widths(model: Model, centre: Array, spread: float | None) -> Array:
+    """Return the size of the random variations of each coefficient of a state, shape (n,)."""
+    common = spread or 0.1 * float(np.abs(centre).max()) or 1.0
+    found = np.full(len(centre), common)
+    if spread is None:
+        for name in model.state_space.unknowns:
+            part = model.state_space.part(name)
+            found[part] = 0.1 * float(np.abs(centre[part]).max()) or common
+    return found
 
 
 def _densities(form: Form, moment: Moment, **coefficients: Array) -> Array:
@@ -352,21 +364,40 @@ def _derivatives(model: Model, at: _TestPoint) -> list[Check]:
             A.matrix("q", "u", moment, u=u, v=r, q=q),
         ),
     ]
-    found = [_taylor(name, given, f, J @ at.du, u, at.du) for name, given, f, J in in_u]
+    states = {name: model.state_space.part(name) for name in model.state_space.unknowns}
+    unknowns = {name: one.part for name, one in model.latent.parts.items()}
+    found = [
+        _taylor(name, given, f, J, u, at.du, (unknowns if "^T" in name else states, states))
+        for name, given, f, J in in_u
+    ]
     if A.linear_in_parameter:
         return found
     driven, pull = A.matrix("v", "q", moment, u=u, q=q), A.matrix("q", "q", moment, u=u, v=r, q=q)
+
+    def push(q: Array) -> Array:
+        return A.vector("v", moment, q=q, u=u)
+
     return [
         *found,
-        _taylor("d(A(u) q)/dq", "", lambda q: A.vector("v", moment, q=q, u=u), driven @ dq, q, dq),
-        _taylor("d(A(u)^T r)/dq", "", lambda q: pulled(u, q), pull @ dq, q, dq),
+        _taylor("d(A(u) q)/dq", "", push, driven, q, dq, (states, unknowns)),
+        _taylor("d(A(u)^T r)/dq", "", lambda q: pulled(u, q), pull, q, dq, (unknowns, unknowns)),
     ]
 
 
 def _taylor(
-    name: str, given: str, function: Callable[[Array], Array], slope: Array, at: Array, along: Array
+    name: str,
+    given: str,
+    function: Callable[[Array], Array],
+    slope: sp.csr_array,
+    at: Array,
+    along: Array,
+    parts: tuple[Mapping[str, slice], Mapping[str, slice]],
 ) -> Check:
-    """Return the rate of the Taylor remainder, or its size if it is at rounding level."""
+    """Return the rate of the Taylor remainder, or its size if it is at rounding level.
+
+    `parts`: names and coefficients of the parts of the value, and of the argument. Each pair is
+    tested, because an error in a small one would vanish in rounding errors of the others.
+    """
     remedy = (
         f"{given}= does not match {given[1]}: correct it, or leave it out and let a complex "
         "step take the derivative."
@@ -376,16 +407,31 @@ def _taylor(
     )
     if name.startswith("d("):
         remedy = remedy.replace("dd=", "dA=")
-    start = function(at)
-    remainders = []
-    for step in (1.0, *STEPS):
-        remainder = function(at + step * along) - start - step * slope
-        remainders.append(largest(remainder))
-    size = largest(start) + largest(slope)
+    rows, columns = parts
+    rows, columns = parts
+    start, found = function(at), dict[str, Check]()
+    for column, part in columns.items():
+        step = np.zeros_like(along)
+        step[part] = along[part]
+        change = slope @ step
+        remainders = np.array([function(at + s * step) - start - s * change for s in (1.0, *STEPS)])
+        for row, of in rows.items():
+            size = largest(start[of]) + largest(change[of])
+            left = np.abs(remainders[:, of]).max(axis=1, initial=0.0)
+            found[f"{name} of '{row}' by '{column}'"] = _rate(name, left, size, remedy)
+    for which, check in found.items():
+        if not check.ok:
+            more = which if len(found) > 1 else name
+            return replace(check, name=check.name.replace(name, more, 1))
+    return max(found.values(), key=lambda check: check.sense == ">=")
+
+
+def _rate(name: str, remainders: Array, size: float, remedy: str) -> Check:
+    """Return the check of Taylor remainders for the steps 1 and `STEPS`, of values of a size."""
     if remainders[0] <= FLOOR * size:
-        value = relative_to(remainders[0], size)
+        value = relative_to(float(remainders[0]), size)
         return Check.at_most(f"{name}: affine, remainder", value, FLOOR, remedy)
-    small = np.array(remainders[1:])
+    small = remainders[1:]
     above = small > FLOOR * size
     rates = np.log2(small[:-1] / np.maximum(small[1:], 1e-300))[above[:-1] & above[1:]]
     # The smallest steps decide: an error of size s in the derivative dominates the remainder only

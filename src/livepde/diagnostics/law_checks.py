@@ -141,10 +141,11 @@ def _taylor(observed: Observed, at: float, moment: Moment, rng: np.random.Genera
         more, less = (
             observed.predict(u + s * step[0], q + s * step[1], moment) for s in (STEP, -STEP)
         )
-        error = ((more - less) / (2.0 * STEP) - exact)[seen]
-        # Differences cannot resolve changes far below the magnitude of the readings.
-        size = max(largest(exact[seen]), 1e-4 * largest(z), 1e-300)
-        return Check.at_most(name, largest(error) / size, TAYLOR, text)
+        error = np.abs((more - less) / (2.0 * STEP) - exact)[seen]
+        # Differences cannot resolve changes far below the magnitude of a reading. Each sensor has
+        # its own magnitude: an error of a small one would vanish beside large ones.
+        size = np.maximum(np.maximum(np.abs(exact[seen]), 1e-4 * np.abs(z)), 1e-300)
+        return Check.at_most(name, largest(error / size), TAYLOR, text)
 
     return [
         Check.at_most(

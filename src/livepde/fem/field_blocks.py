@@ -152,6 +152,21 @@ class NamesBlock(Block):
         return tuple(f"{name}[{item}]" for item in self.names)
 
 
+def _values(function: Callable[[Array], Any], x: Array) -> Array:
+    """Return the values of a function of x at points, (d, ...)."""
+    given = np.asarray(function(x))
+    try:
+        if given.dtype.kind not in "biuf":
+            raise ValueError
+        found: Array = given + 0.0 * x[0]
+    except ValueError:
+        raise SpaceError(
+            f"a function of x returned an array of type {given.dtype} and shape {given.shape}; "
+            f"expected one real number for each point, {x[0].shape}. x[0] is the first coordinate."
+        ) from None
+    return found
+
+
 class FieldBlock(Block):
     """A finite-element function."""
 
@@ -296,9 +311,8 @@ class FieldBlock(Block):
                 return np.full(self.size, level)
             value = lambda x: np.full(np.shape(x[0]), level)  # noqa: E731
         if not isinstance(self.field.prior, Normal):  # a projection need not stay within the bounds
-            nodes = self.doflocs
-            return np.asarray(value(nodes) + 0.0 * nodes[0])
-        return self._projected(lambda at, piece: value(piece.points) + 0.0 * piece.points[0])
+            return _values(value, self.doflocs)
+        return self._projected(lambda at, piece: _values(value, piece.points))
 
     @cached_property
     def measure(self) -> Measure:
@@ -469,7 +483,13 @@ class FieldBlock(Block):
             if isinstance(value, Channel):
                 u[dofs] = Place(u, None, moment).inputs[value.name]
             elif callable(value):
-                u[dofs] = value(self.doflocs[:, dofs], moment.t)
+                try:
+                    u[dofs] = value(self.doflocs[:, dofs], moment.t)
+                except TypeError as error:
+                    raise SpaceError(
+                        f"dirichlet: a boundary value failed: {error}. "
+                        "Expected a function g(x, t) with a number for each point."
+                    ) from error
             else:
                 u[dofs] = value
         return u

@@ -6,15 +6,22 @@ J v, in the unit of D u_n.
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from livepde.errors import ModelError
 from livepde.fem import Channel, On, Place, Unknown, ignores
+from livepde.fem.measure import Measure, sizes
 from livepde.model import Model
+
+# Share of the size of a source that a mesh may miss without a warning.
+MISSED = 0.01
 
 
 @dataclass(frozen=True)
@@ -54,7 +61,8 @@ Condition: TypeAlias = Flux | Exchange
 class Source:
     """Source in a part of the domain, per volume and time: W/m^3 for heat conduction.
 
-    `over` is a predicate on x or the name of a subdomain of the mesh; None: all of the domain.
+    `over` is a predicate on x or the name of a subdomain of the mesh; None: all of the domain. Its
+    border should follow cells of the mesh, as they integrate the source.
     """
 
     value: Amount
@@ -143,6 +151,12 @@ class _Terms:
         """Add a flux, or an exchange as two terms, so that the term in u reads no input."""
         if isinstance(condition, Flux):
             return self.gained(condition.value, boundary)
+        known = condition.coefficient
+        if isinstance(known, int | float) and known < 0.0:
+            raise ModelError(
+                f"with_conditions: the exchange at '{boundary}' has the coefficient {known}; "
+                "expected 0 or more. The flux into the domain is coefficient (ambient - u)."
+            )
         h, ambient = self._divided(condition.coefficient), self._amount(condition.ambient)
         given = condition.coefficient, condition.ambient
         # A term in u that reads an input would make the matrix of a stage depend on time, and
@@ -190,6 +204,12 @@ class _Terms:
             one = self._amount(value.unknown)
             return lambda q, x: value.factor * one(q, x)
         if not isinstance(value, str):
+            given: Any = value
+            if not isinstance(given, Real) or not math.isfinite(given):
+                raise ModelError(
+                    f"with_conditions: got {given!r:.60}; expected a finite number, a Channel, or "
+                    "the name of an unknown."
+                )
             return lambda q, x: value
         if value not in self.unknowns:
             raise ModelError(
@@ -224,4 +244,12 @@ def _region(model: Model, name: str, over: Any) -> tuple[str | None, Callable[[A
     # The predicate is tried at the mean of the vertices of each cell.
     if not np.any(over(model.mesh.p[:, model.mesh.t].mean(axis=1))):
         raise ModelError(f"source '{name}': no cell of the mesh lies in it.")
+    size, exact = sizes(Measure(model.mesh, model.order), over)
+    if abs(size - exact) > MISSED * exact:
+        warnings.warn(
+            f"source '{name}': its border crosses cells of the mesh, which integrate it over "
+            f"{size:.3g} instead of {exact:.3g}, so its power is wrong by the same factor. Let "
+            "nodes of the mesh lie on its border, or use smaller cells.",
+            stacklevel=3,
+        )
     return None, over

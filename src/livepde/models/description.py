@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any, Literal, NamedTuple, TypeAlias
 
+import numpy as np
+
 from livepde.errors import ModelError
 from livepde.fem import Field, Integrand, Piecewise, Place, Scalars, Unknown
 from livepde.fem.fields import SIDES
@@ -202,6 +204,36 @@ def one_number(equation: str, **unknowns: Any) -> None:
         if isinstance(unknown, VARYING):
             text = f"an unknown {name} must be one number; give a Scalar or a prior."
             raise ModelError(f"{equation}: {text}")
+
+
+def everywhere(equation: str, mesh: Any, **unknowns: Any) -> None:
+    """Refuse a coefficient by region if a cell lies in no region or in two.
+
+    The coefficient would be zero there, or the sum of two numbers.
+    """
+    middle = mesh.p[:, mesh.t].mean(axis=1)
+    for name, unknown in unknowns.items():
+        if not isinstance(unknown, Piecewise):
+            continue
+        count = np.zeros(mesh.nelements)
+        for label, region in unknown.regions.items():
+            here = np.zeros(mesh.nelements, dtype=bool)
+            if callable(region):
+                here[:] = region(middle)
+            else:  # a name that the mesh does not have is refused where forms are evaluated
+                here[(mesh.subdomains or {}).get(region, [])] = True
+            if callable(region) and not here.any():
+                raise ModelError(
+                    f"{equation}: no cell of the mesh lies in the region '{label}' of '{name}'."
+                )
+            count += here
+        wrong = np.flatnonzero(count != 1)
+        if len(wrong):
+            at = ", ".join(f"{x:.4g}" for x in middle[:, wrong[0]])
+            raise ModelError(
+                f"{equation}: the point {at} lies in {int(count[wrong[0]])} regions of '{name}'; "
+                "every point must lie in exactly one."
+            )
 
 
 INITIAL = Variable("", "initial state, a field; else the case's `initial`", optional=True)

@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from numbers import Real
 from typing import Any
+
+import numpy as np
 
 from livepde import fem
 from livepde.errors import ModelError
+from livepde.fem.measure import START, Measure
 from livepde.model import Model
-from livepde.models.description import Equation, Fluxes, Option, Variable, by_name, one_number
+from livepde.models.description import (
+    Equation,
+    Fluxes,
+    Option,
+    Variable,
+    by_name,
+    everywhere,
+    one_number,
+)
 
 AMBIENT = "ambient"
 
@@ -123,9 +135,15 @@ def conduction(
         unknowns["C"] = C
         return _model(CONDUCTION, mesh, unknowns, dirichlet, lambda x: 1.0, element, unit)
     given: Any = C
-    if not callable(C) and not given > 0:
-        raise ModelError(f"conduction: the heat capacity C must be positive; got {C}.")
+    if not callable(C) and not (isinstance(given, Real) and float(given) > 0.0):
+        raise ModelError(f"conduction: the heat capacity C must be positive; got {C!r:.60}.")
     capacity = C if callable(C) else lambda x: given
+    least = float(np.min(capacity(Measure(mesh, 1).place(START))))
+    if not least > 0.0:
+        raise ModelError(
+            f"conduction: the heat capacity C must be positive everywhere; its least value is "
+            f"{least:g}."
+        )
     return _model(CONDUCTION, mesh, unknowns, dirichlet, capacity, element, unit)
 
 
@@ -139,6 +157,7 @@ def _model(
     unit: str,
 ) -> Model:
     held = dict(dirichlet or {})
+    everywhere(equation.name, mesh, **{equation.conductivity: unknowns[equation.conductivity]})
     # A term without an unknown of its own is left out of the form, and its input with it.
     given = {key: unknown for key, unknown in unknowns.items() if unknown is not None}
 

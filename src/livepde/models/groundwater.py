@@ -12,7 +12,7 @@ from livepde.errors import ModelError
 from livepde.fem import Channel, Field, On, Piecewise, Place, Unknown, dot, grad, linear
 from livepde.linalg import Array
 from livepde.model import Model
-from livepde.models.description import Equation, Option, Variable, by_name, one_number
+from livepde.models.description import Equation, Option, Variable, by_name, everywhere, one_number
 
 
 def pumping_test(
@@ -53,6 +53,7 @@ def pumping_test(
         The thickness is not positive, or Ss is unknown by region or as a field.
     """
     one_number("pumping_test", Ss=Ss)
+    everywhere("pumping_test", mesh, k=k)
     if not b > 0:
         raise ModelError(f"pumping_test: b, the thickness, must be positive; got {b}.")
     # Quadrature of order four integrates the weight r with elements of first order exactly.
@@ -136,6 +137,7 @@ def groundwater(
     # The term grad(1/S) would be a delta function at the jumps of S.
     if isinstance(S, Piecewise):
         raise ModelError("groundwater: S by region is not possible; take a number or a Field.")
+    everywhere("groundwater", mesh, T=T)
     varies = isinstance(S, Field)
 
     def flow(q: Any, u: Any, v: Any, x: Place) -> Any:
@@ -286,6 +288,7 @@ def advection_dispersion(
         R is below 1, or the inlet is unknown.
     """
     _check("advection_dispersion", inlet, R)
+    everywhere("advection_dispersion", mesh, D=D)
     state = _column(mesh, inlet, element, unit)
 
     # Advection and dispersion are integrated by parts together, so that the natural condition is

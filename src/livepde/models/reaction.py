@@ -18,6 +18,7 @@ from livepde.models.description import (
     Variable,
     autonomous,
     by_name,
+    everywhere,
     state,
 )
 
@@ -102,6 +103,7 @@ def fisher_kpp(
     False
     """
     _check("fisher_kpp", K)
+    everywhere("fisher_kpp", mesh, D=D)
     return Model(
         _state(mesh, dirichlet, element, unit),
         {"D": D, "r": r},

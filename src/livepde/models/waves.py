@@ -28,6 +28,7 @@ from livepde.models.description import (
     Variable,
     autonomous,
     by_name,
+    everywhere,
     state,
 )
 
@@ -100,6 +101,7 @@ def advection_diffusion(
             raise ModelError(f"advection_diffusion: {name} must be positive; got {value}.")
     every = {"kappa": kappa, "v": v, "K": K, "dispersivity": dispersivity, "source": source}
     unknowns = {name: unknown for name, unknown in every.items() if unknown is not None}
+    everywhere("advection_diffusion", mesh, kappa=kappa)
 
     def velocity(q: Any, x: Any) -> Any:
         flux = q.v if v is not None else 0.0
@@ -207,6 +209,7 @@ def wave(
                 )
             moved[name] = 0.0
     element = element or linear(mesh)
+    everywhere("wave", mesh, c2=c2)
     unknown = {} if isinstance(d, int | float) else {"d": d}
     level = float(d) if isinstance(d, int | float) else 0.0
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -12,7 +12,7 @@ import scipy.sparse as sp
 
 from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, FunctionSpace, Moment, Normal, Predicate, Scalars, Unknown
-from livepde.fem.measure import Measure
+from livepde.fem.measure import FineMeasure, Measure, crossed
 from livepde.linalg import Array, IntArray
 from livepde.observation.operator import Direct, Observation, Observed
 from livepde.spaces import HilbertSpace
@@ -432,7 +432,8 @@ class Averages(Observation):
     ----------
     regions
         Mapping from sensor name to the name of a subdomain or boundary of the mesh, or to a
-        predicate on x, evaluated at the quadrature points of the mesh.
+        predicate on x. Cells that its border crosses are divided, so that the border need not
+        follow cells.
 
     Examples
     --------
@@ -475,18 +476,43 @@ class Averages(Observation):
             raise ObservationError(
                 f"Averages: region '{name}' is '{where}'; the mesh names {known or 'nothing'}."
             )
-        measure = Measure(mesh, 2 * int(element.maxdeg), where)
-        size, row = 0.0, np.zeros(block.size)
-        for _, piece in measure.pieces():
-            weights = piece.weights
-            if not isinstance(region, str):
-                weights = region(piece.points) * weights
-            size += float(weights.sum())
-            local = block.local(piece)
-            np.add.at(row, local.dofs, (local.part("value")[0] * weights).sum(axis=-1))
+        order = 2 * int(element.maxdeg)
+        measure = Measure(mesh, order, where)
+        if isinstance(region, str):
+            size, row = _integral(block, measure)
+        else:
+            cut = crossed(measure, region)
+            size, row = _integral(block, measure, lambda x, cells: region(x) * ~np.isin(cells, cut))
+            # A region between the quadrature points of one cell is looked for on finer parts.
+            members = cut if size > 0 or len(cut) else np.arange(mesh.nelements)
+            if len(members):
+                fine = FineMeasure(mesh, order, members=members)
+                more, added = _integral(block, fine, lambda x, _: region(x))
+                size, row = size + more, row + added
         if size <= 0:
             raise ObservationError(f"Averages: region '{name}' contains no part of the mesh.")
         return row / size
+
+
+def _integral(
+    block: FieldBlock,
+    measure: Measure,
+    inside: Callable[[Array, IntArray], Any] | None = None,
+) -> tuple[float, Array]:
+    """Return size of a region, and integral of each shape function over it, shape (size,).
+
+    `inside`: function of points and of the numbers of their cells, shape (cells, 1); None: all.
+    """
+    size, row = 0.0, np.zeros(block.size)
+    for at, piece in measure.pieces():
+        weights = piece.weights
+        if inside is not None:
+            cells = np.arange(at.start, at.stop) if piece.cells is None else piece.cells
+            weights = inside(piece.points, cells[:, None]) * weights
+        size += float(weights.sum())
+        local = block.local(piece)
+        np.add.at(row, local.dofs, (local.part("value")[0] * weights).sum(axis=-1))
+    return size, row
 
 
 @dataclass(frozen=True, eq=False)

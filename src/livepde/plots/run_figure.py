@@ -307,9 +307,15 @@ class RunPlots:
     def __init__(self, result: Any) -> None:
         self._result = result
 
+    def _data(self) -> xr.Dataset:
+        if not len(self._result):
+            raise ConfigurationError("plot: the run contains no samples yet.")
+        data: xr.Dataset = self._result.dataset()
+        return data
+
     def __call__(self, **options: Any) -> Figure:
         """Draw all of the run: see `livepde.plots.overview`."""
-        data = self._result.dataset()
+        data = self._data()
         if self._result.readings is not None:
             readings = data["time"].values, self._result.readings()
             options = {"measured": readings, **options}
@@ -319,21 +325,21 @@ class RunPlots:
         self, *, sensors: Sequence[str] | None = None, ax: Axes | None = None
     ) -> Axes:
         """Draw the readings of sensors with one unit, and what the model predicted of them."""
-        data, measured = self._result.dataset(), self._result.measured
+        data, measured = self._data(), self._result.measured
         t = data["time"].values
         return measured_and_predicted(data, t, measured.to_numpy(), sensors=sensors, ax=ax)
 
     def estimates(self, name: str | None = None, *, ax: Axes | None = None) -> Axes:
         """Draw an unknown number over time with its 95 % band."""
-        return estimates(self._result.dataset(), name, ax=ax)
+        return estimates(self._data(), name, ax=ax)
 
     def residuals(self, *, validation: bool = False, ax: Axes | None = None) -> Axes:
         """Draw measured minus predicted readings."""
-        return residuals(self._result.dataset(), validation=validation, ax=ax)
+        return residuals(self._data(), validation=validation, ax=ax)
 
     def field(self, name: str, *, std: bool = False, ax: Axes | None = None) -> Axes:
         """Draw an unknown field or the state."""
-        return field(self._result.dataset(), name, std=std, ax=ax)
+        return field(self._data(), name, std=std, ax=ax)
 
     def corner(
         self, names: Sequence[str] | None = None, *, n: int = 2000, seed: int = 0, axes: Any = None

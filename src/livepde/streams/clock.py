@@ -65,6 +65,9 @@ class Clock:
         Decimal mark of numbers as text: "." or ",".
     margin
         How much later than stop rows are read, for times that are corrected.
+    doubt
+        Unit of numbers that the name of the column states, if they are to be read in another one
+        that nobody has stated. Such numbers are refused; empty: none.
     """
 
     name: str
@@ -77,6 +80,7 @@ class Clock:
     decimal: str = "."
     hour: str = ""
     margin: float = 0.0
+    doubt: str = ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -142,6 +146,11 @@ def read_times(
     Raises `SampleError`: a time that cannot be read, with the likely remedy.
     """
     dates = _are_dates(cells, clock, before)
+    if clock.doubt and not dates:
+        raise SampleError(
+            f"{where(0)} '{clock.name}': the name states the unit '{clock.doubt}', which is not "
+            f"that of the model: set time_unit = '{clock.doubt}', or the unit of these times."
+        )
     times = np.empty(len(cells))
     for k, cell in enumerate(cells):
         value = clock.stamp(cell, clock.format) if dates else number_of(cell, clock.decimal)

@@ -16,7 +16,7 @@ from livepde.samples import is_dataset, is_frame, noise_channel
 from livepde.streams import table as tables
 from livepde.streams.clock import CALLED_TIME, Clock
 from livepde.streams.csvfile import how_written, read_csv
-from livepde.units import conversion
+from livepde.units import conversion, other_time_unit
 
 INDEX = "__index_level_0__"  # how pandas names an index without a name in a Parquet file
 TEMPERATURE = re.compile(r"T\b")  # not a time, though `CALLED_TIME` has no regard for capitals
@@ -72,6 +72,11 @@ class Reading:
                         f"{option}: there is no channel '{name}'{tables.hint(name, known)}"
                     )
         for name in self.units:
+            if name not in self.sensor_units:
+                raise ConfigurationError(
+                    f"units: '{name}' is no sensor, so its values are in the unit of the model: "
+                    "convert its column."
+                )
             if not self.sensor_units.get(name):
                 raise ConfigurationError(
                     f"units: the model has no unit for '{name}': name it where the sensors are "
@@ -94,7 +99,8 @@ class Reading:
         factor, second = (
             conversion(given, self.unit, "time_unit").factor for given in (unit or self.unit, "s")
         )
-        return Clock(time, factor, second=second, **written)
+        doubt = "" if unit else other_time_unit(time, self.unit)
+        return Clock(time, factor, second=second, doubt=doubt, **written)
 
     def _columns(
         self,
@@ -164,7 +170,7 @@ class Reading:
             raise SampleError(f"data: two columns are called '{twice[0]}'; rename one.")
         series = {name: data.iloc[:, k] for k, name in enumerate(names)}
         if self._uses_index(data.index, names):
-            return self._tabulated("index", data.index, series, {})
+            return self._tabulated(str(data.index.name or "index"), data.index, series, {})
         time = self._time("data", names)
         return self._tabulated(time, series[time], series, {})
 

@@ -285,7 +285,9 @@ def tabulated(
                 given = given.to_numpy(dtype=float, na_value=np.nan)
             column: Array = np.asarray(given, dtype=float)
         except (TypeError, ValueError):
-            raise SampleError(f"{where}: column '{name}' must contain numbers only.") from None
+            raise SampleError(
+                f"{where}: column '{name}' must contain numbers only{_first_text(given)}"
+            ) from None
         if column.shape != (len(moments),):
             raise SampleError(
                 f"{where}: column '{name}' has shape {column.shape}; there are {len(moments)} "
@@ -304,6 +306,17 @@ def tabulated(
 
     written = moments if dates else None
     return to_table(found, written, numbers, columns, clock, every, missing, (where, here))
+
+
+def _first_text(column: Any) -> str:
+    """Return the end of a sentence: the first text in a column that is no number."""
+    cells = column.tolist() if hasattr(column, "tolist") else list(column)
+    texts = (cell for cell in cells if isinstance(cell, str) and number_of(cell) is None)
+    for text in texts:
+        if has_decimal_comma(text):
+            return f"; got {text!r}: read the table with decimal=',', or replace the commas."
+        return f"; got {text!r:.60}."
+    return "."
 
 
 def to_table(

@@ -326,14 +326,53 @@ class GalerkinReduction:
                 "them as parameters. Write it linear in them. They may have LogNormal priors."
             )
 
+    def check_outputs(self, *, linear: bool) -> None:
+        """Raise `ModelError` if an output depends on unknowns, or is not linear in the state.
+
+        `linear`: whether a dependence on the state is refused that is not linear; else outputs are
+        linearised at u.
+        """
+        there = self._elsewhere()
+        latent, seen = self.model.latent, self.outputs
+        a, rng = latent.inverse(self.q), np.random.default_rng(0)
+        moved = np.clip(
+            a + latent.deviations * rng.uniform(0.1, 1.0, len(a)) * self.model.Q.free,
+            *latent.bounds,
+        )
+        with np.errstate(all="ignore"):  # of a function that is not defined everywhere
+            known, other, start, middle = (
+                seen.predict(u, q, self.moment)
+                for u, q in (
+                    (there, self.q),
+                    (there, latent.value(moved)),
+                    (self.u, self.q),
+                    (0.5 * (self.u + there), self.q),
+                )
+            )
+        for k, name in enumerate(seen.names):
+            if np.isfinite([known[k], other[k]]).all() and _differ(known[[k]], other[[k]]):
+                raise ModelError(
+                    f"reduce: the output '{name}' depends on unknowns, and would stay at their "
+                    "prior. Let outputs depend on the state alone."
+                )
+            ends = 0.5 * (start[[k]] + known[[k]])
+            if linear and np.isfinite([ends[0], middle[k]]).all() and _differ(ends, middle[[k]]):
+                raise ModelError(
+                    f"reduce: the output '{name}' is not linear in the state, so that it is "
+                    "linearised at an operating point: name that with u=."
+                )
+
+    def _elsewhere(self) -> Array:
+        """Return a random state with the boundary values of the linearisation point."""
+        free, rng = self.model.X.free, np.random.default_rng(0)
+        u: Array = self.u + free * (1.0 + np.abs(self.u).max()) * rng.standard_normal(len(free))
+        return u
+
     def _check_effects(self) -> None:
         """Raise `ModelError` if an unknown number drops out by linearisation."""
         if self.model.affine:
             return
-        free = self.model.X.free
-        rng = np.random.default_rng(0)
-        elsewhere = self.u + free * (1.0 + np.abs(self.u).max()) * rng.standard_normal(len(free))
-        there = replace(self, u=elsewhere)
+        there = replace(self, u=self._elsewhere())
         for label, q in zip(self.model.parameter_space.labels, self.values()[1:], strict=True):
             if there.differ(self.q, q) and not self.differ(self.q, q):
                 raise ModelError(

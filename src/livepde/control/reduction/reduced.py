@@ -326,7 +326,8 @@ def reduce(
         The process, linear in its unknown numbers and its input channels. It is linearised if it is
         not affine in u.
     outputs
-        Observation of the controlled or limited quantities.
+        Observation of the controlled or limited quantities, of the state alone. Those that are not
+        linear in it are linearised at u.
     controls
         Channels set by a controller. All others are disturbances.
     sensors
@@ -344,8 +345,9 @@ def reduce(
     Raises
     ------
     ModelError
-        The model depends on time, or is not linear in unknown numbers or channels; or an unknown
-        number has no effect on the model linearised at u.
+        The model depends on time, or is not linear in unknown numbers or channels; an unknown
+        number has no effect on the model linearised at u; or an output depends on unknowns, or is
+        not linear in the state and u is missing.
     ConfigurationError
         A control is not a channel of the model, or the model is to be linearised and u is missing.
     """
@@ -368,6 +370,7 @@ def reduce(
         )
     frame = GalerkinReduction.linearised(model, outputs, sensors, u, q, inputs)
     frame.check_linear()
+    frame.check_outputs(linear=u is None)
     frame = frame.with_basis(modes, rates)
     frame.check()
     return ReducedModel.of(frame, tuple(controls))
