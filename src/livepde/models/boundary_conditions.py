@@ -106,21 +106,15 @@ def with_conditions(
     ('k', 'J')
     """
     more = dict(unknowns or {})
-    if per is not None and per not in model.parameter_space.labels:
-        raise ModelError(
-            f"with_conditions: per='{per}' is not an unknown of the model; it has "
-            f"{list(model.parameter_space.labels)}."
-        )
-    inverse = f"per_{per}" if f"per_{per}" in model.computed else None
-    terms = _Terms(tuple(more), per, inverse)
+    terms = _Terms(model, tuple(more), per)
     for name, given in (boundary or {}).items():
-        _check_boundary(model, name)
         for condition in given if isinstance(given, Sequence) else [given]:
             terms.through(name, condition)
     for name, source in (sources or {}).items():
         terms.gained(source.value, *_region(model, name, source.over))
-    if unused := [name for name in more if name not in terms.named]:
-        raise ModelError(f"with_conditions: no condition names the unknown '{unused[0]}'.")
+    for name in more:
+        if name not in terms.named:
+            raise ModelError(f"with_conditions: no condition names the unknown '{name}'.")
     whole = model.with_unknowns(more) if more else model
     return whole.with_terms(terms.A, terms.B, terms.inputs)
 
@@ -132,8 +126,14 @@ def _everywhere(x: Place) -> float:
 class _Terms:
     """Additional terms of A, which contain unknowns, and of B, which do not."""
 
-    def __init__(self, unknowns: tuple[str, ...], per: str | None, inverse: str | None) -> None:
-        self.unknowns, self.per, self.inverse = unknowns, per, inverse
+    def __init__(self, model: Model, unknowns: tuple[str, ...], per: str | None) -> None:
+        if per is not None and per not in model.parameter_space.labels:
+            raise ModelError(
+                f"with_conditions: per='{per}' is not an unknown of the model; it has "
+                f"{list(model.parameter_space.labels)}."
+            )
+        self.model, self.unknowns, self.per = model, unknowns, per
+        self.inverse = f"per_{per}" if f"per_{per}" in model.computed else None
         self.named: set[str] = set()
         self.inputs: list[str] = []
         self.A: list[Any] = []
@@ -141,6 +141,16 @@ class _Terms:
 
     def through(self, boundary: str, condition: Condition) -> None:
         """Add a flux, or an exchange as two terms, so that the term in u reads no input."""
+        known = self.model.mesh.boundaries or {}
+        if boundary not in known:
+            raise ModelError(
+                f"with_conditions: the mesh has no boundary '{boundary}'; it has {sorted(known)}."
+            )
+        if {boundary, "boundary"} & set(self.model.state_block.field.dirichlet):
+            raise ModelError(
+                f"with_conditions: the boundary '{boundary}' has a value, so its flux is part of "
+                "the solution. Keep one of the two."
+            )
         if isinstance(condition, Flux):
             return self.gained(condition.value, boundary)
         h, ambient = self._divided(condition.coefficient), self._amount(condition.ambient)
@@ -166,11 +176,11 @@ class _Terms:
             return term(None, None, v, x)
 
         # B and f may not read q, so a term belongs to A as soon as one amount is an unknown.
-        unknown = self.per is not None or any(
-            isinstance(amount, str | Multiple) for amount in amounts
-        )
-        form = term if unknown else driving if ignores(term, 1) else known
-        (self.A if unknown else self.B).append(form if where is None else On(where, form))
+        if self.per is not None or any(isinstance(one, str | Multiple) for one in amounts):
+            form, terms = term, self.A
+        else:
+            form, terms = driving if ignores(term, 1) else known, self.B
+        terms.append(form if where is None else On(where, form))
 
     def _divided(self, value: Amount) -> Callable[[Any, Place], Any]:
         """Return an amount over the unknown that divides the equation, if one does."""
@@ -198,19 +208,6 @@ class _Terms:
             )
         self.named.add(value)
         return lambda q, x: getattr(q, value)
-
-
-def _check_boundary(model: Model, name: str) -> None:
-    known = model.mesh.boundaries or {}
-    if name not in known:
-        raise ModelError(
-            f"with_conditions: the mesh has no boundary '{name}'; it has {sorted(known)}."
-        )
-    if {name, "boundary"} & set(model.state_block.field.dirichlet):
-        raise ModelError(
-            f"with_conditions: the boundary '{name}' has a value, so its flux is part of the "
-            "solution. Keep one of the two."
-        )
 
 
 def _region(model: Model, name: str, over: Any) -> tuple[str | None, Callable[[Any], Any]]:
