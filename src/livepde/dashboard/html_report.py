@@ -8,8 +8,10 @@ from __future__ import annotations
 import json
 import secrets
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from livepde import runs
 from livepde.dashboard.view import with_readings
@@ -41,8 +43,47 @@ def page_of(run: Run) -> str:
         from jinja2 import Environment, FileSystemLoader, StrictUndefined
         from plotly.offline import get_plotlyjs
     from livepde.dashboard.cards import findings
-    from livepde.dashboard.figures.canvas import CONFIG, when_axis
+    from livepde.dashboard.figures.canvas import CONFIG
     from livepde.dashboard.figures.panels import SECTIONS, panels
+
+    data, found = _contents(run)
+    drawn, doubts = panels(data), runs.doubts(run.dataset)
+    notes = [("info", note) for note in run.notes if note not in doubts]
+    times = [f"{key} {run.record[key]}" for key in ("started", "ended") if key in run.record]
+    case, here = run.path / CASE, Path(__file__).parent
+    environment = Environment(
+        loader=FileSystemLoader(here),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(TEMPLATE).render(
+        run=run,
+        equation=str(data.attrs.get("equation", "")),
+        samples=data.sizes["time"],
+        verdict=[*findings(run.dataset, (), run.checks, doubts), *notes],
+        tables=runs.tables(data),
+        checks=[
+            (c.name, c.value, f"{c.sense} {c.bound_text}", "ok" if c.ok else "FAILED")
+            for c in run.checks
+        ],
+        sections=SECTIONS,
+        panels=drawn,
+        case=case.read_text(encoding="utf-8", errors="replace") if case.is_file() else "",
+        drawings={panel.name: json.loads(panel.figure.to_json()) for panel in drawn},
+        config=CONFIG,
+        written=" · ".join([f"livepde {run.record.get('livepde', '')}".rstrip(), *times]),
+        style=(here / STYLE).read_text(encoding="utf-8"),
+        plotly=get_plotlyjs(),
+        nonce=secrets.token_urlsafe(16),
+        **found,
+    )
+
+
+def _contents(run: Run) -> tuple[xr.Dataset, dict[str, Any]]:
+    """Return the estimates of a run, with readings unless it is long, its times and its events."""
+    from livepde.dashboard.figures.canvas import when_axis
 
     data, events, counts = run.dataset, list[Event](), dict[tuple[str, str], int]()
     if not data.sizes["time"]:
@@ -56,44 +97,10 @@ def page_of(run: Run) -> str:
             missing = np.full(len(names), np.nan)
             readings = [known.get(t, missing) for t in data["time"].values.tolist()]
             data = with_readings(data, np.array(readings))
-    newest = events[: -MOST_EVENTS - 1 : -1]
-    axis, drawn, doubts = when_axis(data), panels(data), runs.doubts(run.dataset)
-    times = [f"{key} {run.record[key]}" for key in ("started", "ended") if key in run.record]
-    case = run.path / CASE
-    here = Path(__file__).parent
-    environment = Environment(
-        loader=FileSystemLoader(here),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template(TEMPLATE).render(
-        run=run,
-        equation=str(data.attrs.get("equation", "")),
-        samples=data.sizes["time"],
-        span=[axis.text(float(data["time"][k])) for k in (0, -1)],
-        verdict=[
-            *findings(run.dataset, (), run.checks, doubts),
-            *(("info", note) for note in run.notes if note not in doubts),
-        ],
-        tables=runs.tables(data),
-        checks=[
-            (c.name, c.value, f"{c.sense} {c.bound_text}", "ok" if c.ok else "FAILED")
-            for c in run.checks
-        ],
-        sections={
-            title: [panel for panel in drawn if panel.section == key]
-            for key, title in SECTIONS.items()
-        },
-        newest=f"{len(newest)} of {len(events)} events, newest first",
-        events=[(axis.text(e.t), e.kind, e.channel or "–", e.message) for e in newest],
-        counts=[(kind, channel or "–", number) for (kind, channel), number in counts.items()],
-        case=case.read_text(encoding="utf-8", errors="replace") if case.is_file() else "",
-        drawings={panel.name: json.loads(panel.figure.to_json()) for panel in drawn},
-        config=CONFIG,
-        written=" · ".join([f"livepde {run.record.get('livepde', '')}".rstrip(), *times]),
-        style=(here / STYLE).read_text(encoding="utf-8"),
-        plotly=get_plotlyjs(),
-        nonce=secrets.token_urlsafe(16),
-    )
+    axis, newest = when_axis(data), events[: -MOST_EVENTS - 1 : -1]
+    return data, {
+        "span": [axis.text(float(data["time"][k])) for k in (0, -1)],
+        "newest": f"{len(newest)} of {len(events)} events, newest first",
+        "events": [(axis.text(e.t), e.kind, e.channel or "–", e.message) for e in newest],
+        "counts": [(kind, channel or "–", number) for (kind, channel), number in counts.items()],
+    }

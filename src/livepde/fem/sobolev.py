@@ -142,10 +142,14 @@ def _border(s: float, M: Any, K: Any) -> Any:
         corner = sp.csr_array((n, inner.shape[0]))
         mass = sp.vstack([-M, sp.csr_array((rest, n))])
         return sp.block_array([[None, corner, K], [corner.T, inner, mass], [K, mass.T, None]])
-    if s in (0.0, 1.0):
-        return M if s == 0 else K
     if s == 2:
         return sp.block_array([[None, K], [K, -M]])
+    if s in (0.0, 1.0):
+        return M if s == 0 else K
+    return _fractional_border(s, M, K)
+
+
+def _fractional_border(s: float, M: Any, K: Any) -> Any:
     # With one auxiliary field for each pole the Schur complement E - sum F H^{-1} F is
     # lambda^s = lambda^{s - sigma} (c + sum w lambda/(lambda + b)).
     largest = _largest(M, K)
@@ -276,18 +280,17 @@ def random_field(
     >>> np.sqrt(sum(function(x) ** 2 for function in field)).round(2)
     array([0., 2., 0.])
     """
-    vertices = np.asarray(mesh.p, dtype=float).T
-    side = float(np.ptp(vertices, axis=0).max())
-    length = LENGTH * side if length is None else length
-    if std is None and len(known or ()) < 2:
+    vertices, known = np.asarray(mesh.p, dtype=float).T, known or {}
+    length = LENGTH * float(np.ptp(vertices, axis=0).max()) if length is None else length
+    if std is None and len(known) < 2:
         return ()
     for name, value in (("std", std), ("length", length)):
         if value is not None and not (np.isfinite(value) and value > 0.0):
             raise SpaceError(f"random_field: {name} must be a positive number; got {value!r}.")
-    at = np.array([np.atleast_1d(place) for place in known or ()]).reshape(-1, vertices.shape[1])
+    at = np.array([np.atleast_1d(place) for place in known]).reshape(-1, vertices.shape[1])
     points = vertices[:: -(-len(vertices) // CANDIDATES)]
     kernel = _Kernel(at, length, len(at))
-    left = np.ones(len(points)) - (_explained(kernel, points) if kernel.known else 0.0)
+    left = 1.0 - _explained(kernel, points)
     if left.max(initial=0.0) < ROUNDING:  # each vertex has a known value
         return ()
     kernel = _with_pivots(kernel, points, left, 3 * most)
@@ -298,18 +301,20 @@ def random_field(
     count = min(int(np.searchsorted(share, KEPT)) + 1, most, len(share))
     mixes = vectors[:, ::-1][:, :count].T
     if std is None:
-        scale = _spread(kernel, np.array([*(known or {}).values()], dtype=float))
-        if scale == 0.0:
-            return ()
-    else:
-        if share[count - 1] < LEAST:
-            raise SpaceError(
-                f"random_field: {count} functions represent {share[count - 1]:.0%} of the variance "
-                f"with length {length:g} and {len(at)} known values; expected {LEAST:.0%} or more: "
-                "use a larger length, or fewer known values."
-            )
+        scale = _spread(kernel, np.array([*known.values()], dtype=float))
+    elif share[count - 1] >= LEAST:
         scale = std / float(np.sqrt(((mixes @ features) ** 2).sum(axis=0).max()))
-    mixes = scale * mixes
+    else:
+        raise SpaceError(
+            f"random_field: {count} functions represent {share[count - 1]:.0%} of the variance "
+            f"with length {length:g} and {len(at)} known values; expected {LEAST:.0%} or more: "
+            "use a larger length, or fewer known values."
+        )
+    return _functions(kernel, scale * mixes, vertices) if scale else ()
+
+
+def _functions(kernel: _Kernel, mixes: Array, vertices: Array) -> tuple[Callable[..., Array], ...]:
+    """Return mixes of the functions of a kernel; on an interval straight between the vertices."""
     functions = [partial(kernel.mixed, mix) for mix in mixes]
     if vertices.shape[1] > 1:
         return tuple(functions)
@@ -333,6 +338,8 @@ def _with_pivots(kernel: _Kernel, points: Array, left: Array, most: int) -> _Ker
 
 def _explained(kernel: _Kernel, points: Array) -> Array:
     """Return the share of the variance at points that all places of a kernel explain."""
+    if not len(kernel.places):
+        return np.zeros(len(points))
     whole = _Kernel(kernel.places, kernel.length, 0)
     return np.asarray((whole.features(points) ** 2).sum(axis=0))
 

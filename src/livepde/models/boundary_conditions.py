@@ -108,8 +108,7 @@ def with_conditions(
     more = dict(unknowns or {})
     terms = _Terms(model, tuple(more), per)
     for name, given in (boundary or {}).items():
-        for condition in given if isinstance(given, Sequence) else [given]:
-            terms.through(name, condition)
+        terms.through(name, given)
     for name, source in (sources or {}).items():
         terms.gained(source.value, *_region(model, name, source.over))
     for name in more:
@@ -139,8 +138,8 @@ class _Terms:
         self.A: list[Any] = []
         self.B: list[Any] = []
 
-    def through(self, boundary: str, condition: Condition) -> None:
-        """Add a flux, or an exchange as two terms, so that the term in u reads no input."""
+    def through(self, boundary: str, given: Condition | Sequence[Condition]) -> None:
+        """Add fluxes and exchanges."""
         known = self.model.mesh.boundaries or {}
         if boundary not in known:
             raise ModelError(
@@ -151,14 +150,18 @@ class _Terms:
                 f"with_conditions: the boundary '{boundary}' has a value, so its flux is part of "
                 "the solution. Keep one of the two."
             )
-        if isinstance(condition, Flux):
-            return self.gained(condition.value, boundary)
-        h, ambient = self._divided(condition.coefficient), self._amount(condition.ambient)
-        given = condition.coefficient, condition.ambient
-        # A term in u that reads an input would make the matrix of a stage depend on time, and
-        # prevent the reuse of its factor.
-        self._add(boundary, lambda q, u, v, x: h(q, x) * u * v, given[0])
-        self._add(boundary, lambda q, _, v, x: -h(q, x) * ambient(q, x) * v, *given)
+        for condition in given if isinstance(given, Sequence) else [given]:
+            if isinstance(condition, Flux):
+                self.gained(condition.value, boundary)
+            else:
+                self._exchanged(boundary, condition.coefficient, condition.ambient)
+
+    def _exchanged(self, boundary: str, coefficient: Amount, ambient: Amount) -> None:
+        h, outside = self._divided(coefficient), self._amount(ambient)
+        # Two terms: a term in u that reads an input would make the matrix of a stage depend on
+        # time, and prevent the reuse of its factor.
+        self._add(boundary, lambda q, u, v, x: h(q, x) * u * v, coefficient)
+        self._add(boundary, lambda q, _, v, x: -h(q, x) * outside(q, x) * v, coefficient, ambient)
 
     def gained(
         self, value: Amount, where: str | None, inside: Callable[[Any], Any] = _everywhere

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from operator import attrgetter
 from typing import Any
 
@@ -144,30 +144,37 @@ def _model(
     # The equation is divided by an unknown heat capacity. The ratios are coefficients of the form,
     # which stays linear in them.
     divided = "C" in given
-    part = {key: attrgetter(f"{key}_per_C" if divided else key) for key in given}
-    D = part[equation.conductivity]
-    terms: list[Any] = [lambda q, u, v, x: D(q) * fem.dot(fem.grad(u), fem.grad(v))]
-    if "loss" in given:
-        terms += _exchange(part["loss"])
-    if "transfer" in given:
-        sides = _free_sides(equation, field)
-        terms += [fem.On(side, term) for side in sides for term in _exchange(part["transfer"])]
-    if "source" in given:
-        terms.append(lambda q, _, v, x: -part["source"](q) * v)
+    part = {key: attrgetter(key + "_per_C" * divided) for key in given}
     return Model(
         field,
         given,
-        A=terms,
+        A=_terms(equation, part, field),
         M=lambda u, v, x: capacity(x) * u * v,
         inputs=[AMBIENT] if {"loss", "transfer"} & set(given) else [],
-        coefficients=_ratios([key for key in given if key != "C"]) if divided else None,
+        coefficients=(lambda q: _ratios(q, part)) if divided else None,
         **equation.about(given),
     )
 
 
-def _ratios(names: Sequence[str]) -> Callable[[Any], dict[str, Any]]:
-    """Return the function of one over C, and of unknowns over C."""
-    return lambda q: {"per_C": 1.0 / q.C, **{f"{k}_per_C": getattr(q, k) / q.C for k in names}}
+def _ratios(q: Any, names: Iterable[str]) -> dict[str, Any]:
+    """Return one over C, and other unknowns over C."""
+    return {"per_C": 1.0 / q.C, **{f"{k}_per_C": getattr(q, k) / q.C for k in names if k != "C"}}
+
+
+def _terms(
+    equation: Equation, part: Mapping[str, Callable[[Any], Any]], field: fem.Field
+) -> list[Any]:
+    """Return the terms of A for unknowns by name, each a function of q."""
+    D = part[equation.conductivity]
+    terms: list[Any] = [lambda q, u, v, x: D(q) * fem.dot(fem.grad(u), fem.grad(v))]
+    if "loss" in part:
+        terms += _exchange(part["loss"])
+    if "transfer" in part:
+        sides = _free_sides(equation, field)
+        terms += [fem.On(side, term) for side in sides for term in _exchange(part["transfer"])]
+    if "source" in part:
+        terms.append(lambda q, _, v, x: -part["source"](q) * v)
+    return terms
 
 
 def _free_sides(equation: Equation, field: fem.Field) -> list[str]:
