@@ -12,6 +12,7 @@ import scipy.sparse as sp
 from livepde.errors import ModelError, ObservationError
 from livepde.fem import FieldBlock, Form, FunctionSpace, Integrand, Moment, Named, Normal, On
 from livepde.fem.field_blocks import base_name
+from livepde.fem.fields import placed
 from livepde.fem.measure import Measure
 from livepde.fem.space import LocalSpace
 from livepde.linalg import Array
@@ -78,8 +79,8 @@ class FunctionalsObserved(Observed):
         return self.observation.names(len(self.observation.integrands))
 
     def _form(self, name: str, spaces: Mapping[str, FunctionSpace]) -> Form:
-        given, inputs = self.observation.integrands[name], self.observation.inputs
-        g, where = (given.form, given.name) if isinstance(given, On) else (given, None)
+        inputs = self.observation.inputs
+        g, where = placed(self.observation.integrands[name])
 
         def integrand(w: Any, uq: Any, x: Any) -> Any:
             q = _jets(uq, PARAMETER, self.parameter)
