@@ -17,7 +17,7 @@ from livepde import runs
 from livepde.dashboard.view import with_readings
 from livepde.errors import RunError, optional
 from livepde.plots.style import sensor_names
-from livepde.runs import Run
+from livepde.runs import Journal, Run
 from livepde.runs.directory import CASE
 from livepde.runs.exported import into_place
 from livepde.runs.journal import Event
@@ -82,7 +82,7 @@ def page_of(run: Run) -> str:
 
 
 def _contents(run: Run) -> tuple[xr.Dataset, dict[str, Any]]:
-    """Return the estimates of a run, with readings unless it is long, its times and its events."""
+    """Return the estimates of a run, its times and its events."""
     from livepde.dashboard.figures.canvas import when_axis
 
     data, events, counts = run.dataset, list[Event](), dict[tuple[str, str], int]()
@@ -90,13 +90,7 @@ def _contents(run: Run) -> tuple[xr.Dataset, dict[str, Any]]:
         raise RunError(f"{run.path} contains no estimates yet, so there is nothing to report.")
     with run.reading() as journal:
         if journal is not None:
-            events, counts = journal.events, journal.counts
-        if journal is not None and len(journal) <= MOST_READINGS:
-            names = sensor_names(data)
-            known = dict(zip(*journal.readings(names), strict=True))
-            missing = np.full(len(names), np.nan)
-            readings = [known.get(t, missing) for t in data["time"].values.tolist()]
-            data = with_readings(data, np.array(readings))
+            data, events, counts = _with_readings(data, journal), journal.events, journal.counts
     axis, newest = when_axis(data), events[: -MOST_EVENTS - 1 : -1]
     return data, {
         "span": [axis.text(float(data["time"][k])) for k in (0, -1)],
@@ -104,3 +98,14 @@ def _contents(run: Run) -> tuple[xr.Dataset, dict[str, Any]]:
         "events": [(axis.text(e.t), e.kind, e.channel or "–", e.message) for e in newest],
         "counts": [(kind, channel or "–", number) for (kind, channel), number in counts.items()],
     }
+
+
+def _with_readings(data: xr.Dataset, journal: Journal) -> xr.Dataset:
+    """Return the estimates of a run with its readings, if they are not too many to be drawn."""
+    if len(journal) > MOST_READINGS:
+        return data
+    names = sensor_names(data)
+    known = dict(zip(*journal.readings(names), strict=True))
+    missing = np.full(len(names), np.nan)
+    readings = [known.get(t, missing) for t in data["time"].values.tolist()]
+    return with_readings(data, np.array(readings))

@@ -16,7 +16,7 @@ from skfem.element import ElementLineHermite, ElementQuadBFS, ElementTriArgyris
 from skfem.helpers import dd as hess
 from skfem.helpers import ddot, dot, grad
 
-from livepde.errors import SpaceError
+from livepde.errors import SpaceError, require_positive
 from livepde.linalg import Array, Pattern, analyse
 
 SMOOTH = (ElementLineHermite, ElementQuadBFS, ElementTriArgyris)  # of class C^1
@@ -77,8 +77,7 @@ class Sobolev:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.s) and self.s >= 0):
             raise SpaceError(f"Sobolev: the order s must be a number >= 0; got {self.s}.")
-        if not (np.isfinite(self.length) and self.length > 0):
-            raise SpaceError(f"Sobolev: length must be a positive number; got {self.length}.")
+        require_positive("Sobolev: length", self.length, SpaceError)
 
     def pointwise(self, dimension: int) -> Sobolev:
         """Return the inner product with `std` of a field as its pointwise standard deviation.
@@ -284,9 +283,9 @@ def random_field(
     length = LENGTH * float(np.ptp(vertices, axis=0).max()) if length is None else length
     if std is None and len(known) < 2:
         return ()
-    for name, value in (("std", std), ("length", length)):
-        if value is not None and not (np.isfinite(value) and value > 0.0):
-            raise SpaceError(f"random_field: {name} must be a positive number; got {value!r}.")
+    if std is not None:
+        require_positive("random_field: std", std, SpaceError)
+    require_positive("random_field: length", length, SpaceError)
     at = np.array([np.atleast_1d(place) for place in known]).reshape(-1, vertices.shape[1])
     points = vertices[:: -(-len(vertices) // CANDIDATES)]
     kernel = _Kernel(at, length, len(at))
@@ -310,12 +309,16 @@ def random_field(
             f"with length {length:g} and {len(at)} known values; expected {LEAST:.0%} or more: "
             "use a larger length, or fewer known values."
         )
-    return _functions(kernel, scale * mixes, vertices) if scale else ()
+    return _functions(kernel, scale, mixes, vertices)
 
 
-def _functions(kernel: _Kernel, mixes: Array, vertices: Array) -> tuple[Callable[..., Array], ...]:
+def _functions(
+    kernel: _Kernel, scale: float, mixes: Array, vertices: Array
+) -> tuple[Callable[..., Array], ...]:
     """Return mixes of the functions of a kernel; on an interval straight between the vertices."""
-    functions = [partial(kernel.mixed, mix) for mix in mixes]
+    if scale == 0.0:
+        return ()
+    functions = [partial(kernel.mixed, mix) for mix in scale * mixes]
     if vertices.shape[1] > 1:
         return tuple(functions)
     nodes = np.sort(vertices[:, 0])

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
-from livepde.errors import ObservationError
+from livepde.errors import ObservationError, require_positive
 from livepde.fem import FieldBlock, FunctionSpace, Moment, Place, Unknown, numbers
 from livepde.linalg import Array, IntArray, Mask, Memo
 from livepde.spaces import HilbertSpace
@@ -497,8 +497,8 @@ class Observed:
             raise ObservationError(
                 f"reconstruct: z has shape {z.shape}; the observation has {self.size} sensors."
             )
-        if delta is not None and not (np.isfinite(delta) and delta > 0):
-            raise ObservationError(f"reconstruct: delta must be a positive number; got {delta}.")
+        if delta is not None:
+            require_positive("reconstruct: delta", delta, ObservationError)
         asked = np.isfinite(z) if present is None else present
         if boundary is None:
             boundary = np.zeros(self.X.dim)
