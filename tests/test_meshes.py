@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from factories import observe
 from skfem import (
     ElementLineHermite,
     ElementLineP0,
@@ -367,21 +366,6 @@ def test_a_wave_once_around(element):
     assert model.X.norm(run[2] - model.initial(lambda x: f(x + 0.5))) < 0.01
 
 
-@pytest.mark.slow
-def test_the_speed_of_a_wave_is_found():
-    model = advection(ring(ElementLineHermite()), speed=0.7)
-    sensors = lp.Points([0.2, 0.5], noise=0.01)
-    truth = [
-        (t, [np.sin(2 * np.pi * (x - t)) for x in (0.2, 0.5)]) for t in np.arange(0.0, 1.51, 0.02)
-    ]
-    law = lp.SensitivityLaw()
-    start = lambda x: np.sin(2 * np.pi * x[0])  # noqa: E731
-    ident = lp.Identifier(model, sensors, law, u0=start, scheme=Alexander2())
-    for t, z in truth:
-        last = ident.step(t, z)
-    assert last.parameters["b"][0] == pytest.approx(1.0, abs=5e-3)
-
-
 def test_a_periodic_parameter_and_the_observation_of_all():
     field = ring(ElementLineP1(), inner="H1", prior=lp.Normal(1.0))
     state = lp.Field(field.mesh, ElementLineP2(), periodic=RING)
@@ -489,32 +473,6 @@ def test_a_linear_displacement_is_exact(element: str):
     points = np.array([[0.2, 0.55, 0.9], [0.7, 0.35, 0.1]])
     values = (model.state_block.probe(points) @ u).reshape(2, -1)
     np.testing.assert_allclose(values, exact(points, 0.0), atol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_modulus_is_identified_from_a_boundary_that_moves():
-    """Rollers on the left and below, a channel that pulls the right side, sensors on the top."""
-    pulled = {"left": (0.0, None), "bottom": (None, 0.0), "right": (lp.Channel("pull"), None)}
-    model, true = elastic(pulled), 1.6
-    at, axes = np.repeat([[0.3, 0.9], [0.7, 0.9]], 2, axis=0), [0, 1, 0, 1]  # both components
-    points = lp.Points(at, noise=1e-4, component=axes)
-    observed = observe(model, points)
-    forward, u, rng = ForwardStage(model), model.initial(0.0, Moment(0.0, Inputs({"pull": 0.0}))), 0
-    law, scheme = lp.SensitivityLaw(), lp.ImplicitEuler()  # one stage of which makes the truth
-    identifier = lp.Identifier(model, points, law, u0=0.0, scheme=scheme)
-    noise = np.random.default_rng(rng)
-    estimate = None
-    for k in range(60):
-        t = 0.1 * (k + 1)
-        pull = 0.1 * np.sin(t)
-        inputs = Inputs({"pull": pull})
-        u = forward.solve(u, np.array([true]), 0.1, Moment(t, inputs))
-        z = observed.G @ u
-        z = z + 1e-4 * noise.standard_normal(len(z))
-        estimate = identifier.step(t, z, {"pull": pull})
-    assert estimate is not None
-    mu, std = estimate.parameters["mu"]
-    assert abs(mu - true) < 4.0 * std < 0.2
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,6 @@ from skfem import (
 import livepde as lp
 from livepde import cases
 from livepde.fem import Inputs, Moment, box
-from livepde.streams import AbsoluteNoise, Twin
 
 REGIONS = {"core": lambda x: x[0] < 0.5}
 PLANE = MeshTri.init_tensor(np.linspace(0, 1, 6), np.linspace(0, 1, 5)).with_boundaries(
@@ -344,46 +343,6 @@ def heated(**more):
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
         f=[0.0, lp.On("left", lambda x, t: 1.0 + np.sin(3 * t))],
     )
-
-
-def identified(model, sensors, truth, noise, inputs=None, steps=120, check=None):
-    """Return estimate and deviation of every number."""
-    twin = Twin(
-        model=model,
-        observation=sensors,
-        q_true=truth,
-        u0=0.0,
-        times=0.05 * np.arange(steps + 1),
-        noise=AbsoluteNoise(noise),
-        inputs=inputs,
-    )
-    law = lp.SensitivityLaw()
-    identifier = lp.Identifier(model, sensors, law)
-    result = identifier.run(twin)
-    assert result.last.status.ok
-    found = result.last.parameters
-    for name, value in truth.items():
-        estimate, std = found[name]
-        assert abs(estimate - value) < 4 * std + 1e-3, (name, estimate, std)
-        assert std < 0.1, (name, std)
-    return found
-
-
-@pytest.mark.slow
-def test_a_boundary_flux_and_one_point_find_the_conductivity():
-    flux = lp.On("right", lambda q, u, x: -q.k * lp.dot(lp.grad(u), x.normal))
-    sensors = lp.Combined(
-        [lp.observation.Functionals({"flux": flux}, noise=0.01), lp.Points({"T": 0.4}, noise=0.01)]
-    )
-    identified(heated(), sensors, {"k": 0.6}, 0.01)
-
-
-@pytest.mark.long
-def test_a_moving_sensor_finds_the_conductivity():
-    def inputs(t):
-        return {"x": np.nan if t < 0.3 else 0.5 + 0.6 * np.sin(t)}  # out of the rod at times
-
-    identified(heated(), lp.observation.Moving({"T": "x"}, noise=0.01), {"k": 0.6}, 0.01, inputs)
 
 
 @pytest.mark.slow
