@@ -48,14 +48,11 @@ class Functionals(Observation):
     integrands: Mapping[str, Integrand | On]
     order: int | None = None
     portable = True
+    listed = ("integrands", "integrand")
 
     def __post_init__(self) -> None:
         self._sees_all("an integrand names its component, as u.c.")
-        if not self.integrands:
-            raise ObservationError("Functionals: give at least one integrand.")
-
-    def names(self, count: int) -> tuple[str, ...]:
-        return tuple(self.integrands)
+        super().__post_init__()
 
     def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
         return FunctionalsObserved(self, state, X, parameter)
@@ -175,13 +172,7 @@ class FluxPlates(Observation):
     points: Mapping[str, float | str]
     conductivity: str = "k"
     portable = True
-
-    def __post_init__(self) -> None:
-        if not self.points:
-            raise ObservationError("FluxPlates: give at least one place.")
-
-    def names(self, count: int) -> tuple[str, ...]:
-        return tuple(self.points)
+    listed = ("points", "place")
 
     def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
         return FluxPlatesObserved(self, state, X, parameter)
