@@ -21,20 +21,16 @@ def inside(x):
     return (x[0] > 0.25) & (x[0] < 0.8)
 
 
-def points(dim, fractions=(0.3, 0.55, 0.7)):
-    return [[f] + [0.3] * (dim - 1) for f in fractions]
+def points(model, *fractions):
+    return lp.Points([[f] + [0.3] * (model.state.mesh.dim() - 1) for f in fractions])
 
 
 KINDS = {
     "subdomain": lambda model: lp.Subdomain(inside),
     "full": lambda model: lp.Full(),
-    "points": lambda model: lp.Points(points(model.state.mesh.dim())),
-    "points repeated": lambda model: lp.Points(
-        points(model.state.mesh.dim(), (0.3, 0.3, 0.7, 0.3))
-    ),
-    "points on the boundary": lambda model: lp.Points(
-        points(model.state.mesh.dim(), (0.0, 0.4, 1.0))
-    ),
+    "points": lambda model: points(model, 0.3, 0.55, 0.7),
+    "points repeated": lambda model: points(model, 0.3, 0.3, 0.7, 0.3),
+    "points on the boundary": lambda model: points(model, 0.0, 0.4, 1.0),
     "averages": lambda model: lp.Averages({"in": inside, "all": lambda x: x[0] >= 0}),
     "matrix": lambda model: lp.observation.Matrix(
         np.random.default_rng(0).standard_normal((4, model.X.dim)), labels=list("abcd")
@@ -119,14 +115,6 @@ def test_omega_begins_and_ends_at_nodes_that_the_mesh_is_given(cells):
     ends = mesh.p[0][mesh.t[:, split.omega]]
     assert (ends.min(), ends.max()) == (0.3, 0.87)
     assert np.ptp(ends, axis=0).sum() == pytest.approx(0.57)
-
-
-def test_an_element_that_omega_cuts_is_left_out():
-    model = reaction(line(10), ElementLineP1())
-    cut = observe(model, lp.Subdomain(lambda x: (x[0] > 0.35) & (x[0] < 0.81)))
-    fits = observe(model, lp.Subdomain(lambda x: (x[0] > 0.4) & (x[0] < 0.8)))
-    np.testing.assert_array_equal(cut.G.toarray(), fits.G.toarray())
-    np.testing.assert_array_equal(cut.split().omega, fits.split().omega)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -287,22 +275,13 @@ def test_sensors_that_do_not_fit():
         (model, lambda: lp.Points({"T": -3.0}), r"sensors \['T'\]: number 0 at"),
         (model, lambda: lp.Points([[0.2, 0.3]]), "dimension 2; the mesh has 1"),
         (plane, lambda: lp.Points([[0.2, np.nan]]), "lies outside"),
-        (model, lambda: lp.Averages({}), "at least one region"),
         (model, lambda: lp.Averages({"r": lambda x: x[0] > 2}), "region 'r' contains no part"),
         (model, lambda: lp.observation.Matrix(np.eye(5)), "5 columns; the state has 13"),
         (model, lambda: lp.observation.Matrix(np.eye(13), labels=["a"]), "1 labels for 13 rows"),
         (model, lambda: lp.observation.Matrix(np.full((1, 13), np.nan)), "not finite"),
         (model, lambda: lp.observation.Matrix(np.eye(13)[:2], labels=["a", "a"]), "must differ"),
-        (
-            model,
-            lambda: lp.Subdomain(lambda x: x[0] > 30),
-            "no element of the mesh with a free coefficient",
-        ),
-        (
-            model,
-            lambda: lp.Subdomain(lambda x: x[0] == 0),
-            "no element of the mesh with a free coefficient",
-        ),
+        (model, lambda: lp.Subdomain(lambda x: x[0] > 30), "no element .* with a free coefficient"),
+        (model, lambda: lp.Subdomain(lambda x: x[0] == 0), "no element .* with a free coefficient"),
     ]
     for owner, build, message in bad:
         with pytest.raises(lp.errors.ObservationError, match=message):
@@ -387,15 +366,14 @@ def test_reach_bounds_the_newton_step():
 
 
 def test_bad_sensors():
-    with pytest.raises(lp.errors.ObservationError, match="reach must be positive; got 0"):
-        bound(*RADIATION, reach=0)
-    with pytest.raises(lp.errors.ObservationError, match="iterations must be at least 1; got 0"):
-        bound(*RADIATION, iterations=0)
-    with pytest.raises(lp.errors.ObservationError, match="give noise= to it and not to its base"):
-        bound(*RADIATION, base=lp.Points([0.2], noise=0.1))
-    with pytest.raises(
-        lp.errors.ObservationError, match=r"shape \(2,\) for values of shape \(3,\)"
+    for options, message in (
+        ({"reach": 0}, "reach must be positive; got 0"),
+        ({"iterations": 0}, "iterations must be at least 1; got 0"),
+        ({"base": lp.Points([0.2], noise=0.1)}, "give noise= to it and not to its base"),
     ):
+        with pytest.raises(ObservationError, match=message):
+            bound(*RADIATION, **options)
+    with pytest.raises(ObservationError, match=r"shape \(2,\) for values of shape \(3,\)"):
         bound(lambda T: T[:2]).predict(np.ones(13), np.zeros(13), START)
 
 
