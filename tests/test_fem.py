@@ -30,7 +30,7 @@ from skfem import (
 from skfem.helpers import dd, ddot, div, dot, grad
 
 import livepde as lp
-from livepde.errors import MissingInputError, ModelError, SpaceError
+from livepde.errors import MissingInputError, ModelError, ObservationError, SpaceError
 from livepde.fem import START, Form, FunctionSpace, Inputs, Moment, Place, upwind
 
 ORDER = 6
@@ -295,9 +295,7 @@ def test_piecewise_by_predicate_and_by_subdomain():
     assert abs(part[:, 0]).max() > 0
     np.testing.assert_array_equal(part[:, 1], 0.0)
 
-    with pytest.raises(
-        lp.errors.SpaceError, match="Region 'a': the mesh has no subdomain 'bottom'"
-    ):
+    with pytest.raises(SpaceError, match="Region 'a': the mesh has no subdomain 'bottom'"):
         lp.Model(state, lp.Piecewise({"a": "bottom"}, lp.Normal()), diffusion)
     edge = lp.Model(state, named, lp.On("left", lambda q, u, v, x: q * u * v))
     assert edge.A(np.ones(edge.X.dim)).matrix.nnz
@@ -333,16 +331,13 @@ def test_product_of_unknowns():
     stiffness = form(laplace, mesh, ElementLineP1()).matrix("v", "u")
     expected = 2 * (stiffness @ u) + 1.5 * model.mass @ u + regions
     np.testing.assert_allclose(model.A(u)(q), expected, atol=1e-12)
-    with pytest.raises(lp.errors.SpaceError, match=r"no unknown is called \['E'\]"):
-        model.initial_parameter({"E": 1.0})
-    with pytest.raises(
-        lp.errors.SpaceError, match=r"coefficients of shape \(3,\); expected \(22,\)"
+    for given, message in (
+        ({"E": 1.0}, r"no unknown is called \['E'\]"),
+        (np.zeros(3), r"coefficients of shape \(3,\); expected \(22,\)"),
+        ({"R": [1.0, 2.0, 3.0]}, r"'R': coefficients of shape \(3,\); expected \(2,\)"),
     ):
-        model.initial_parameter(np.zeros(3))
-    with pytest.raises(
-        lp.errors.SpaceError, match=r"'R': coefficients of shape \(3,\); expected \(2,\)"
-    ):
-        model.initial_parameter({"R": [1.0, 2.0, 3.0]})
+        with pytest.raises(SpaceError, match=message):
+            model.initial_parameter(given)
 
 
 def test_names_of_single_unknowns():
@@ -371,14 +366,13 @@ def test_probe_outside_of_the_mesh():
         ring.elements_satisfying(lambda x: (x[0] - 0.5) ** 2 + (x[1] - 0.5) ** 2 > 0.06)
     )
     block = lp.Model(lp.Field(ring, ElementTriP1()), lp.Normal(), product).state_block
-    with pytest.raises(lp.errors.ObservationError, match=r"point 1 at \[0.5, 0.5\] lies outside"):
-        block.probe(np.array([[0.1, 0.5], [0.1, 0.5]]))
-    with pytest.raises(lp.errors.ObservationError, match=r"point 0 at \[1.5, 0.5\].*unit"):
-        block.probe(np.array([[1.5], [0.5]]))
-    with pytest.raises(
-        lp.errors.ObservationError, match="coordinates of dimension 1; the mesh has 2"
+    for points, message in (
+        ([[0.1, 0.5], [0.1, 0.5]], r"point 1 at \[0.5, 0.5\] lies outside"),
+        ([[1.5], [0.5]], r"point 0 at \[1.5, 0.5\].*unit"),
+        ([[0.5]], "coordinates of dimension 1; the mesh has 2"),
     ):
-        block.probe(np.array([[0.5]]))
+        with pytest.raises(ObservationError, match=message):
+            block.probe(np.array(points))
 
 
 def test_place():
@@ -432,12 +426,8 @@ def test_exact_at_the_vertices_of_a_boundary_layer(kappa, b):
             (kappa + upwind(b, kappa, x.h)) * lp.dot(lp.grad(u), lp.grad(v)) + b * lp.grad(u)[0] * v
         ),
     )
-    s = mesh.p[0]
-    exact = (
-        np.expm1(b * s / kappa) / np.expm1(b / kappa)
-        if b * 1 / kappa < 500
-        else (np.exp(b * (s - 1) / kappa))
-    )
+    s, steep = mesh.p[0], b / kappa
+    exact = np.expm1(steep * s) / np.expm1(steep) if steep < 500 else np.exp(steep * (s - 1))
     values = model.state_block.at_vertices @ steady(model, np.zeros(model.X.dim))
     assert np.abs(values - exact).max() < 1e-10
 

@@ -9,7 +9,7 @@ from skfem import ElementLineP2
 
 import livepde as lp
 from livepde.cases import load
-from livepde.errors import CaseError, ModelError
+from livepde.errors import CaseError, ModelError, SpaceError
 from livepde.models import (
     EQUATIONS,
     advection_diffusion,
@@ -64,9 +64,9 @@ def test_geometric_interval():
     mesh = lp.interval(0.1, 10.0, 4, geometric=True)
     x = np.sort(mesh.p[0])
     assert np.allclose(x[1:] / x[:-1], 10**0.5)
-    with pytest.raises(lp.errors.SpaceError, match="start > 0"):
+    with pytest.raises(SpaceError, match="start > 0"):
         lp.interval(0.0, 1.0, 4, geometric=True)
-    with pytest.raises(lp.errors.SpaceError, match="rectangle"):
+    with pytest.raises(SpaceError, match="rectangle"):
         lp.rectangle((0, 1), (1, 0), (2, 2))
 
 
@@ -291,7 +291,7 @@ def test_the_energy_decays_only_by_damping(d):
 
 def test_a_moving_end_needs_its_velocity():
     moving = {"left": lambda x, t: np.sin(t)}
-    with pytest.raises(lp.errors.ModelError, match="give its time derivative"):
+    with pytest.raises(ModelError, match="give its time derivative"):
         wave(STRING, lp.Normal(1.0), dirichlet=moving)
     speed = {"left": lambda x, t: np.cos(t)}
     model = wave(STRING, lp.Normal(1.0), dirichlet=moving, velocity=speed)

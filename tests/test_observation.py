@@ -166,7 +166,7 @@ def test_regions_that_are_none_are_refused_in_a_sentence():
         ({}, "at least one region"),
     ]
     for regions, message in bad:
-        with pytest.raises(lp.errors.ObservationError, match=message):
+        with pytest.raises(ObservationError, match=message):
             lp.Averages(regions)
 
 
@@ -240,12 +240,10 @@ def test_sensors_that_see_the_parameter():
 
 def test_direct_parts_are_checked():
     model = borehole()
-    with pytest.raises(lp.errors.ObservationError, match="no sensor is called 'x'"):
+    with pytest.raises(ObservationError, match="no sensor is called 'x'"):
         observe(model, lp.Points({"a": 0.5}, direct={"x": lambda q, x: q.k}))
     affine = observe(model, lp.Points({"a": 0.5}, direct={"a": lambda q, x: q.k + 1}))
-    with pytest.raises(
-        lp.errors.ObservationError, match=r"must be linear in q; at q = 0 it gives 1\.0"
-    ):
+    with pytest.raises(ObservationError, match=r"must be linear in q; at q = 0 it gives 1\.0"):
         affine.predict(np.zeros(11), np.zeros(3), Moment())
 
 
@@ -259,10 +257,10 @@ def test_names_and_noise():
     np.testing.assert_array_equal(each.noise, [0.1, 0.2])
     assert observe(model, lp.Full()).noise is None
     for noise in ([0.1, 0.2, 0.3], [[0.1]]):
-        with pytest.raises(lp.errors.ObservationError, match="values for 2 sensors"):
+        with pytest.raises(ObservationError, match="values for 2 sensors"):
             _ = observe(model, lp.Points([0.2, 0.3], noise=noise)).noise
     for noise in (0.0, -1.0, np.nan, np.inf, [0.1, 0.0]):
-        with pytest.raises(lp.errors.ObservationError, match="must be positive numbers"):
+        with pytest.raises(ObservationError, match="must be positive numbers"):
             _ = observe(model, lp.Points([0.2, 0.3], noise=noise)).noise
 
 
@@ -284,7 +282,7 @@ def test_sensors_that_do_not_fit():
         (model, lambda: lp.Subdomain(lambda x: x[0] == 0), "no element .* with a free coefficient"),
     ]
     for owner, build, message in bad:
-        with pytest.raises(lp.errors.ObservationError, match=message):
+        with pytest.raises(ObservationError, match=message):
             observe(owner, build())
 
 
@@ -294,7 +292,7 @@ def test_an_observation_of_ones_own_must_fit():
         def matrix(self, state):
             return sp.eye_array(4)
 
-    with pytest.raises(lp.errors.ObservationError, match="4 columns; the state has 13"):
+    with pytest.raises(ObservationError, match="4 columns; the state has 13"):
         observe(reaction(line(), ElementLineP1()), Wrong())
 
 
@@ -325,7 +323,7 @@ def test_taylor(reading, given):
 def test_a_wrong_derivative_is_found():
     report = lp.diagnostics.check_observation(bound(lambda T: T**4, lambda T: 3 * T**3))
     assert [line.name for line in report.lines if not line.ok] == ["G'(u) by differences"]
-    with pytest.raises(lp.errors.ObservationError, match="must be that of function="):
+    with pytest.raises(ObservationError, match="must be that of function="):
         report.raise_if_failed()
 
 

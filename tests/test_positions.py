@@ -11,6 +11,7 @@ from skfem import ElementLineP1, ElementQuad1, ElementQuad2, ElementVector, Mesh
 
 import livepde as lp
 from livepde import cases
+from livepde.errors import CaseError, ObservationError
 from livepde.models import heat
 
 AT = {"T_1": 0.2, "T_2": 0.45, "T_3": 0.7}
@@ -138,22 +139,22 @@ def test_calibrated_sensors_keep_their_positions():
     ],
 )
 def test_a_deviation_that_makes_no_sense(std, text):
-    with pytest.raises(lp.errors.ObservationError, match=text):
+    with pytest.raises(ObservationError, match=text):
         lp.Points(AT, position_std=std)
 
 
 def test_what_does_not_go_together_is_refused():
     base = lp.Points(AT, position_std=0.1)
-    with pytest.raises(lp.errors.ObservationError, match="write the function into Calibrated"):
+    with pytest.raises(ObservationError, match="write the function into Calibrated"):
         lp.observation.Transformed(base, lambda y: y**2)
-    with pytest.raises(lp.errors.ObservationError, match="two parts have the unknown 'position'"):
+    with pytest.raises(ObservationError, match="two parts have the unknown 'position'"):
         lp.Identifier(
             rod(),
             lp.Combined([base, lp.Points({"z": 0.1}, position_std=0.1)], noise=0.1),
             lp.SensitivityLaw(),
         )
     model = rod()
-    with pytest.raises(lp.errors.ObservationError, match="no unknown 'position"):
+    with pytest.raises(ObservationError, match="no unknown 'position"):
         observe(model, base)
 
 
@@ -188,9 +189,9 @@ def test_a_case_states_it(tmp_path):
 
 
 def test_at_std_belongs_to_a_position(tmp_path):
-    with pytest.raises(lp.errors.CaseError, match="at_std requires at"):
+    with pytest.raises(CaseError, match="at_std requires at"):
         case(tmp_path, 'over = "left", at_std = "1 cm"')
-    with pytest.raises(lp.errors.CaseError, match="at_std: got '0 cm'"):
+    with pytest.raises(CaseError, match="at_std: got '0 cm'"):
         case(tmp_path, 'at = "30 cm", at_std = "0 cm"')
 
 
@@ -270,18 +271,18 @@ def test_a_position_of_a_component_may_be_uncertain():
     ],
 )
 def test_sensors_that_do_not_fit_a_vector_are_refused(sensors, named):
-    with pytest.raises(lp.errors.ObservationError, match=named):
+    with pytest.raises(ObservationError, match=named):
         observe(diffusing(), sensors)
 
 
 @pytest.mark.parametrize("component", [-1, 0.5, "x", [0], [0, 1, 1], True])
 def test_components_are_numbers_from_zero(component):
-    with pytest.raises(lp.errors.ObservationError, match="component must be the number"):
+    with pytest.raises(ObservationError, match="component must be the number"):
         lp.Points({"a": (0.5, 0.5), "b": (0.2, 0.5)}, component=component)
 
 
 def test_a_component_of_a_number_is_refused():
-    with pytest.raises(lp.errors.ObservationError, match="component = 0 requires a state that is"):
+    with pytest.raises(ObservationError, match="component = 0 requires a state that is"):
         observe(rod(), lp.Points([0.5], component=0))
 
 
@@ -330,7 +331,7 @@ def test_channels_of_a_case_name_their_component(tmp_path: Path):
     ],
 )
 def test_components_of_a_case_that_are_refused(tmp_path: Path, old: str, new: str, named: str):
-    with pytest.raises(lp.errors.CaseError) as error:
+    with pytest.raises(CaseError) as error:
         own_case(tmp_path, VECTOR_CASE.replace(old, new))
     assert named in str(error.value)
 
@@ -339,7 +340,7 @@ def test_a_case_without_components_says_so_when_it_is_prepared(tmp_path: Path):
     case = own_case(
         tmp_path, VECTOR_CASE.replace(", component = 0", "").replace(", component = 1", "")
     )
-    with pytest.raises(lp.errors.ObservationError, match="name the measured one"):
+    with pytest.raises(ObservationError, match="name the measured one"):
         case.prepare()
 
 

@@ -16,6 +16,7 @@ from skfem import (
 
 import livepde as lp
 from experiments import seed_excited_noise as noisy
+from livepde.errors import ObservationError
 from livepde.observation import Apriori, Discrepancy, Pseudoinverse, Tikhonov
 
 ELEMENTS = [ElementLineHermite, ElementLineP1, ElementLineP2]
@@ -282,7 +283,7 @@ def once(z, how, delta=None):
     ],
 )
 def test_wrong_settings_and_wrong_use(make, words):
-    with pytest.raises(lp.errors.ObservationError, match=words):
+    with pytest.raises(ObservationError, match=words):
         make()
 
 

@@ -23,6 +23,7 @@ from skfem import (
 
 import livepde as lp
 from livepde import cases
+from livepde.errors import ObservationError
 from livepde.fem import Inputs, Moment, box
 
 REGIONS = {"core": lambda x: x[0] < 0.5}
@@ -64,9 +65,7 @@ def test_averages_over_named_parts_and_boundaries():
     np.testing.assert_allclose(z, [0.25, 3.0, 1.75], rtol=1e-12)
     z = read(plate(), lp.Averages({"r": "right", "t": "top"}), lambda x: x[0] ** 2 + 3 * x[1] ** 2)
     np.testing.assert_allclose(z, [2.0, 1 / 3 + 3.0], rtol=1e-12)
-    with pytest.raises(
-        lp.errors.ObservationError, match=r"region 'a' is 'nowhere'; the mesh names"
-    ):
+    with pytest.raises(ObservationError, match=r"region 'a' is 'nowhere'; the mesh names"):
         observe(rod(), lp.Averages({"a": "nowhere"}))
 
 
@@ -114,13 +113,11 @@ def test_line_integrals_follow_kinks_from_cell_to_cell():
 
 
 def test_bad_lines():
-    with pytest.raises(lp.errors.ObservationError, match="line 'a' has no length"):
+    with pytest.raises(ObservationError, match="line 'a' has no length"):
         observe(rod(), lp.observation.LineIntegrals({"a": (0.2, 0.2)}))
-    with pytest.raises(
-        lp.errors.ObservationError, match=r"line 'a': point .* lies outside the mesh"
-    ):
+    with pytest.raises(ObservationError, match=r"line 'a': point .* lies outside the mesh"):
         observe(rod(), lp.observation.LineIntegrals({"a": (0.2, 1.2)}))
-    with pytest.raises(lp.errors.ObservationError, match="the mesh has 1 coordinates"):
+    with pytest.raises(ObservationError, match="the mesh has 1 coordinates"):
         observe(rod(), lp.observation.LineIntegrals({"a": ([0.2, 0.1], [0.3, 0.1])}))
 
 
@@ -142,11 +139,9 @@ def test_functionals_are_integrals_of_forms():
     assert H_u.shape == (3, 21)
     np.testing.assert_allclose(H_u.sum(axis=1), [0.0, 2.0, 3.0], atol=1e-11)
     np.testing.assert_allclose(H_q, [[0.0], [0.5], [0.0]], atol=1e-12)
-    with pytest.raises(lp.errors.ObservationError, match=r"no matrix G .* use SensitivityLaw"):
+    with pytest.raises(ObservationError, match=r"no matrix G .* use SensitivityLaw"):
         observed.split()
-    with pytest.raises(
-        lp.errors.ObservationError, match=r"sensor 'bad'.*failed at its first evaluation"
-    ):
+    with pytest.raises(ObservationError, match=r"sensor 'bad'.*failed at its first evaluation"):
         observe(rod(), lp.observation.Functionals({"bad": lambda q, u, x: q.nothing * u}))
 
 
@@ -182,9 +177,7 @@ def test_moving_sensors():
     scan = lp.observation.Moving({"s": ("x", "y")})
     z = read(plate(), scan, lambda x: x[0] * x[1], moment=at(x=0.31, y=0.72))
     np.testing.assert_allclose(z, [0.31 * 0.72], rtol=1e-12)
-    with pytest.raises(
-        lp.errors.ObservationError, match=r"position channels .*'x'.*has 2 coordinates"
-    ):
+    with pytest.raises(ObservationError, match=r"position channels .*'x'.*has 2 coordinates"):
         observe(plate(), lp.observation.Moving({"s": "x"}))
 
 
@@ -206,11 +199,11 @@ def test_combined_sensors():
     assert linear.linear
     lp.diagnostics.check_observation(linear).raise_if_failed()
     np.testing.assert_array_equal(observe(rod(), lp.Combined([lp.Full()], noise=2.0)).noise, 2.0)
-    with pytest.raises(lp.errors.ObservationError, match="names must differ"):
+    with pytest.raises(ObservationError, match="names must differ"):
         observe(rod(), lp.Combined([lp.Points({"a": 0.3}), lp.Points({"a": 0.4})]))
-    with pytest.raises(lp.errors.ObservationError, match="not to both"):
+    with pytest.raises(ObservationError, match="not to both"):
         lp.Combined(parts, noise=1.0)
-    with pytest.raises(lp.errors.ObservationError, match="at least one"):
+    with pytest.raises(ObservationError, match="at least one"):
         lp.Combined([])
 
 
@@ -245,9 +238,9 @@ def test_calibrated_sensors():
     H_u, H_q = seen.jacobian(np.ones(21), model.initial_parameter(), at(x=0.5))
     np.testing.assert_allclose(H_u.sum(axis=1), [1.2, 0.0], rtol=1e-12)
     np.testing.assert_allclose(H_q, [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], rtol=1e-12)
-    with pytest.raises(lp.errors.ObservationError, match="give noise= to it and not to its base"):
+    with pytest.raises(ObservationError, match="give noise= to it and not to its base"):
         lp.observation.Calibrated(lp.Points([0.3], noise=1.0), gained)
-    with pytest.raises(lp.errors.ObservationError, match=r"shape \(\) for 2 sensors"):
+    with pytest.raises(ObservationError, match=r"shape \(\) for 2 sensors"):
         read(model, lp.observation.Calibrated(lp.Points([0.3, 0.4]), lambda y, q, x: y.sum()), 0.0)
 
 
@@ -401,7 +394,7 @@ def test_positions_are_inputs_that_may_be_missing(tmp_path):
     ],
 )
 def test_a_component_that_says_nothing_is_refused(build):
-    with pytest.raises(lp.errors.ObservationError, match="of='u' has no effect"):
+    with pytest.raises(ObservationError, match="of='u' has no effect"):
         build()
 
 

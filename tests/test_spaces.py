@@ -22,6 +22,7 @@ from skfem import ElementLineHermite, ElementLineP1, ElementQuadBFS, ElementTriP
 import livepde as lp
 from livepde import spaces
 from livepde.diagnostics import check_space
+from livepde.errors import SpaceError
 from livepde.fem.sobolev import _balakrishnan
 from livepde.linalg import Leading
 from livepde.spaces import BorderedSpace, HilbertSpace
@@ -75,7 +76,7 @@ def test_std_divides_the_inner_product(inner):
 
 def test_singular_inner_product_is_one_sentence():
     model = reaction(line(), ElementLineP1(), inner=laplace)
-    with pytest.raises(lp.errors.SpaceError, match="Gram matrix of Q is singular") as caught:
+    with pytest.raises(SpaceError, match="Gram matrix of Q is singular") as caught:
         _ = model.Q.factor
     assert "zero-order term" in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -102,14 +103,14 @@ def test_indefinite_inner_products_are_refused():
         return u * v - 0.01 * lp.dot(lp.grad(u), lp.grad(v))
 
     for inner in (negative, weak):
-        with pytest.raises(lp.errors.SpaceError, match="not positive definite"):
+        with pytest.raises(SpaceError, match="not positive definite"):
             _ = reaction(line(30), ElementLineP1(), inner=inner).Q.factor
 
 
 def test_operator_must_fit_its_spaces():
     model = CASES["line P2 / P1"].model()
     A = model.A(np.ones(model.X.dim))
-    with pytest.raises(lp.errors.SpaceError, match=r"shape \(25, 13\).*need \(13, 25\)"):
+    with pytest.raises(SpaceError, match=r"shape \(25, 13\).*need \(13, 25\)"):
         lp.spaces.DualOperator(A.matrix, model.X, model.Q)
 
 
@@ -160,7 +161,7 @@ def test_modes_of_a_large_space_are_those_of_a_dense_solver():
 @pytest.mark.parametrize("count", [0, 14])
 def test_number_of_modes_must_exist(count):
     model = CASES["line P1"].model()
-    with pytest.raises(lp.errors.SpaceError, match=f"13 free coefficients; got modes={count}"):
+    with pytest.raises(SpaceError, match=f"13 free coefficients; got modes={count}"):
         model.Q.modes(count, model.parameter_mass)
 
 
@@ -204,7 +205,7 @@ NOT_FINITE = [[1.0, np.nan], [np.nan, 1.0]]
     ],
 )
 def test_what_is_no_space_or_prior_is_refused(message, make):
-    with pytest.raises(lp.errors.SpaceError, match=message):
+    with pytest.raises(SpaceError, match=message):
         make()
 
 
@@ -421,9 +422,7 @@ def test_modes_of_a_large_space_are_powers_of_those_of_H1(monkeypatch):
     phi, power = two.Q.modes(4, two.parameter_mass)
     np.testing.assert_allclose(power, first**1.5, rtol=1e-3)
     np.testing.assert_allclose(phi.T @ two.Q.dual(phi), np.eye(4), atol=1e-7)
-    with pytest.raises(
-        lp.errors.SpaceError, match="is dense and has 1089 rows; it is written out up to"
-    ):
+    with pytest.raises(SpaceError, match="is dense and has 1089 rows; it is written out up to"):
         _ = two.Q.gram
 
 
@@ -468,5 +467,5 @@ def test_the_prior_deviation_is_that_at_a_point(mesh, s):
     unit = np.zeros(model.Q.dim)
     unit[centre] = 1.0
     assert np.sqrt(model.Q.riesz(unit)[centre]) == pytest.approx(0.7, rel=0.05)
-    with pytest.raises(lp.errors.SpaceError, match="take a larger s"):
+    with pytest.raises(SpaceError, match="take a larger s"):
         lp.Sobolev(s).pointwise(2 * s)
