@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from skfem import ElementHex1, ElementLineHermite, ElementQuadBFS, ElementTriP2, MeshHex, MeshTri
+from skfem import ElementLineHermite, ElementQuadBFS, ElementTriP2, MeshTri
 
 import livepde as lp
 from experiments import dimensions
@@ -103,26 +103,3 @@ def test_meshes_and_elements():
     assert isinstance(smooth(lp.rectangle((0, 1), (0, 1), (1, 1))), ElementQuadBFS)
     with pytest.raises(lp.errors.SpaceError, match=r"class C\^1 for a mesh of type MeshTri1"):
         smooth(MeshTri())
-
-
-@pytest.mark.slow
-def test_hexahedra_with_a_ball_observed():
-    """A twin on hexes: q = 2 is found from u on a ball."""
-    mesh = MeshHex().refined(2)
-    model = lp.Model(
-        lp.Field(mesh, ElementHex1(), dirichlet={"boundary": lambda x, t: 1.0 + x[0] + 0.1 * t}),
-        lp.Field(mesh, ElementHex1(), inner=lp.Sobolev(2.0, length=0.5)),
-        A=lambda q, u, v, x: q * u * v,
-        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
-    )
-    sensors = lp.Subdomain(dimensions.ball)
-    twin = lp.streams.Twin(
-        scheme=lp.ImplicitEuler(),
-        model=model,
-        observation=sensors,
-        q_true=2.0,
-        u0=1.0,
-        times=0.05 * np.arange(21),
-    )
-    last = lp.Identifier(model, sensors, lp.GradientLaw(gain=1e4), u0=1.0).run(twin).last
-    assert twin.error(last.q) < 0.05

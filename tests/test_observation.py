@@ -401,26 +401,6 @@ def test_gradient_law(reading):
         assert found == pytest.approx(plain, rel=1e-6)
 
 
-@pytest.mark.slow
-def test_sensitivity_law_with_a_sensor_that_sees_the_parameter():
-    """z = (u + R Q)^2 with the direct part inside of g: R and k are both found."""
-    model = lp.Model(
-        lp.Field(lp.interval(0.0, 1.0, 20), ElementLineP1(), dirichlet={"left": 1.0}),
-        {"k": lp.Normal(0.5, std=0.3, bounds=(0.01, 5.0)), "R": lp.Normal(0.0, std=1.0)},
-        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) + 0.0 * q.R * v,
-        f=1.0,
-    )
-    base = lp.Points({"a": 0.4, "b": 1.0}, direct={"b": lambda q, x: 2.0 * q.R})
-    sensors = lp.observation.Transformed(base, lambda y: y**2, noise=1e-3)
-    q_true = {"k": 0.8, "R": 0.4}
-    twin = Twin(
-        model=model, observation=sensors, q_true=q_true, u0=1.0, times=0.02 * np.arange(101)
-    )
-    last = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=1.0).run(twin).last
-    for name, value in q_true.items():
-        assert last.parameters[name][0] == pytest.approx(value, rel=0.02)
-
-
 def test_a_calibration_that_does_more_than_to_add_is_found_out():
     model = heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": 0.0})
     for reading in (lambda y, q, x: 2.0 * y, lambda y, q, x: y + q.alpha**2):

@@ -291,7 +291,9 @@ def sensors_of_any_kind(draw):
         ),
         lp.observation.FluxPlates({"e": "left", "i": a}, "gain"),
         lp.observation.Moving({"m": "x", "n": "missing"}),
-        lp.observation.Transformed(lp.Points({"t": a}), lambda y: np.exp(c * y / 2)),
+        lp.observation.Transformed(
+            lp.Points({"t": a}, {"t": lambda q, x: 0.1 * q.gain}), lambda y: np.exp(c * y / 2)
+        ),
         lp.Full(),
         lp.Subdomain(lambda x: x[0] > 0.8 * a),
         lp.observation.Matrix(np.random.default_rng(power).standard_normal((3, 13)) + c),
