@@ -6,11 +6,12 @@ import json
 
 import numpy as np
 import pytest
+from factories import BODIES
 from skfem import ElementLineHermite, ElementQuadBFS, ElementTriP2, MeshTri
 
 import livepde as lp
 from experiments import dimensions
-from livepde.fem import Moment, box, quadratic, smooth
+from livepde.fem import Moment, box, linear, quadratic, smooth
 from livepde.runs import Outcome
 
 
@@ -99,6 +100,8 @@ def test_meshes_and_elements():
     with pytest.raises(lp.errors.SpaceError, match="needs increasing coordinates and cells >= 1"):
         box((0.0, 1.0), (0.0, 0.0), (0.0, 1.0), (1, 1, 1))
     assert isinstance(quadratic(MeshTri()), ElementTriP2)
+    for body in BODIES.values():
+        assert linear(body()).maxdeg < quadratic(body()).maxdeg
     assert isinstance(smooth(lp.interval(0, 1, 3)), ElementLineHermite)
     assert isinstance(smooth(lp.rectangle((0, 1), (0, 1), (1, 1))), ElementQuadBFS)
     with pytest.raises(lp.errors.SpaceError, match=r"class C\^1 for a mesh of type MeshTri1"):
