@@ -38,7 +38,7 @@ def save_state(
     viewer = petsc_module().Viewer().createMPIIO(str(beside), "w", comm=comm)
     for name, value in vars(state).items():
         if name in OF_Q + OF_U:
-            parts = value if isinstance(value, tuple) else [value][: value is not None]
+            parts = value if isinstance(value, tuple) else [] if value is None else [value]
             order = model.numbers_q if name in OF_Q else model.numbers_u
             for vector in parts:
                 _ordered(vector, order).view(viewer)
