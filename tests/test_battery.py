@@ -91,15 +91,13 @@ def test_diffusivity_follows_the_filling():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
-    [({"area": 0.0}, "area must be positive"), ({"c_max": -1.0}, "c_max must be positive")],
+    ("start", "area", "c_max", "message"),
+    [
+        (0.0, 0.0, FULL, "area must be positive"),
+        (0.0, AREA, -1.0, "c_max must be positive"),
+        (0.1 * R, AREA, FULL, "centre"),
+    ],
 )
-def test_options_that_make_no_sense_are_refused(change, message):
-    options = {"area": AREA, "c_max": FULL} | change
+def test_what_is_no_particle_is_refused(start, area, c_max, message):
     with pytest.raises(ModelError, match=message):
-        battery_particle(lp.interval(0.0, R, 10), lp.Normal(D, D), **options)
-
-
-def test_a_particle_begins_at_its_centre():
-    with pytest.raises(ModelError, match="centre"):
-        battery_particle(lp.interval(0.1 * R, R, 10), lp.Normal(D, D), area=AREA, c_max=FULL)
+        battery_particle(lp.interval(start, R, 10), lp.Normal(D, D), area=area, c_max=c_max)

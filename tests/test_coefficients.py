@@ -6,6 +6,7 @@ import pickle
 
 import numpy as np
 import pytest
+from factories import reaction
 
 import livepde as lp
 from livepde.errors import ConfigurationError, ModelError
@@ -14,6 +15,7 @@ from livepde.models import mobile_immobile, pumping_test
 from livepde.stepping import BandedStage, member_stage
 
 UNKNOWNS = {"k": lp.LogNormal(1.0, std=0.5), "C": lp.LogNormal(2.0, std=0.5)}
+LINE = lp.interval(0.0, 1.0, 12)
 
 
 def per_capacity(q):
@@ -21,9 +23,7 @@ def per_capacity(q):
 
 
 def rod(named: bool, unknowns=UNKNOWNS, **options):
-    state = lp.Field(
-        lp.interval(0.0, 1.0, 12), lp.linear(lp.interval(0.0, 1.0, 12)), dirichlet={"right": 0.0}
-    )
+    state = lp.Field(LINE, lp.linear(LINE), dirichlet={"right": 0.0})
     if named:
         A = [
             lambda q, u, v, x: q.diffusivity * lp.dot(lp.grad(u), lp.grad(v)),
@@ -88,26 +88,19 @@ def test_fluxes_and_errors_of_sensors_may_be_added():
     np.testing.assert_allclose(more.coefficients.slopes(q), [*np.eye(3), *by_hand])
 
 
+RADII = lp.interval(0.1, 100.0, 10, geometric=True)
+SHARE = lp.LogitNormal(0.5, std=0.1, bounds=(0.0, 1.0))
+
+
 @pytest.mark.parametrize(
     ("model", "q"),
     [
         (
-            pumping_test(
-                lp.interval(0.1, 100.0, 10, geometric=True),
-                lp.LogNormal(1e-3, std=1e-3),
-                lp.LogNormal(1e-4, std=1e-4),
-                b=3.0,
-            ),
+            pumping_test(RADII, lp.LogNormal(1e-3, 1e-3), lp.LogNormal(1e-4, 1e-4), b=3.0),
             [2e-3, 3e-4],
         ),
         (
-            mobile_immobile(
-                lp.interval(0.0, 30.0, 10),
-                lp.LogNormal(1.0, std=1.0),
-                lp.LogNormal(5.0, std=1.0),
-                lp.LogitNormal(0.5, std=0.1, bounds=(0.0, 1.0)),
-                lp.LogNormal(0.1, std=0.1),
-            ),
+            mobile_immobile(LINE, UNKNOWNS["k"], UNKNOWNS["C"], SHARE, UNKNOWNS["k"]),
             [2.0, 4.0, 0.3, 0.2],
         ),
     ],
@@ -142,12 +135,7 @@ def test_a_name_is_that_of_one_coefficient():
 
 def test_what_does_not_fit_is_refused():
     with pytest.raises(ModelError, match="named unknowns"):
-        lp.Model(
-            lp.Field(lp.interval(0.0, 1.0, 4), lp.linear(lp.interval(0.0, 1.0, 4))),
-            lp.LogNormal(1.0, std=0.5),
-            lambda q, u, v, x: q * u * v,
-            coefficients=lambda q: {"double": 2 * q},
-        )
+        reaction(LINE, lp.linear(LINE), coefficients=lambda q: {"double": 2 * q})
     with pytest.raises(ModelError, match="no dA"):
         rod(named=True, dA=lambda q, u, du, v, x: q.k * du * v)
 

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from factories import line, reaction
 from scipy.linalg import expm
+from skfem import ElementLineP1
 
 import livepde as lp
 from livepde.cases import load
@@ -102,13 +104,7 @@ def test_says_what_is_wrong_with_a_condition() -> None:
 
 
 def test_terms_beside_a_given_derivative_are_refused() -> None:
-    mesh = lp.interval(0.0, 1.0, 4)
-    model = lp.Model(
-        lp.Field(mesh, lp.linear(mesh)),
-        {"a": lp.Normal()},
-        A=lambda q, u, v, x: q.a * u * v,
-        dA=lambda q, u, du, v, x: q.a * du * v,
-    )
+    model = reaction(line(4), ElementLineP1(), dA=lambda q, u, du, v, x: q * du * v)
     with pytest.raises(ModelError, match="dA"):
         model.with_terms(A=[lambda q, u, v, x: v])
 
@@ -276,15 +272,8 @@ def test_one_input_is_constant_and_another_a_channel() -> None:
 
 
 def test_a_source_with_a_constant_input_is_assembled_once() -> None:
-    mesh = lp.interval(0.0, LENGTH, 4)
-    field = lp.Field(mesh, lp.linear(mesh))
-    source = lp.Model(
-        field,
-        {"a": lp.Normal()},
-        A=lambda q, u, v, x: q.a * u * v,
-        f=lp.On("left", lambda x, _: x.inputs["Q"]),
-        inputs=["Q"],
-    )
+    f = lp.On("left", lambda x, _: x.inputs["Q"])
+    source = reaction(line(4), ElementLineP1(), f=f, inputs=["Q"])
     assert source.with_constant_inputs({"Q": 2.0}).form_F.constant
     assert not source.form_F.constant
 
@@ -391,10 +380,10 @@ def test_an_unknown_heat_capacity_is_as_the_known_one_of_its_value(conditions, o
     assert states[1] == pytest.approx(states[0], abs=1e-9)
 
 
-@pytest.mark.parametrize("C", [lp.Scalars(["a", "b"], lp.Normal(1.0, 0.1))])
-def test_an_unknown_heat_capacity_is_one_number(C: Any) -> None:
+def test_an_unknown_heat_capacity_is_one_number() -> None:
+    two = lp.Scalars(["a", "b"], lp.Normal(1.0, 0.1))
     with pytest.raises(ModelError, match="an unknown C must be one number"):
-        conduction(lp.interval(0.0, 1.0, 8), lp.Normal(K, 1.0), C=C)
+        conduction(lp.interval(0.0, 1.0, 8), lp.Normal(K, 1.0), C=two)
 
 
 WALL = """

@@ -6,11 +6,12 @@ import json
 
 import numpy as np
 import pytest
-from skfem import ElementHex1, ElementLineHermite, ElementQuadBFS, ElementTriP2, MeshHex, MeshTri
+from factories import BODIES
+from skfem import ElementLineHermite, ElementQuadBFS, ElementTriP2, MeshTri
 
 import livepde as lp
 from experiments import dimensions
-from livepde.fem import Moment, box, quadratic, smooth
+from livepde.fem import Moment, box, linear, quadratic, smooth
 from livepde.runs import Outcome
 
 
@@ -99,30 +100,9 @@ def test_meshes_and_elements():
     with pytest.raises(lp.errors.SpaceError, match="needs increasing coordinates and cells >= 1"):
         box((0.0, 1.0), (0.0, 0.0), (0.0, 1.0), (1, 1, 1))
     assert isinstance(quadratic(MeshTri()), ElementTriP2)
+    for body in BODIES.values():
+        assert linear(body()).maxdeg < quadratic(body()).maxdeg
     assert isinstance(smooth(lp.interval(0, 1, 3)), ElementLineHermite)
     assert isinstance(smooth(lp.rectangle((0, 1), (0, 1), (1, 1))), ElementQuadBFS)
     with pytest.raises(lp.errors.SpaceError, match=r"class C\^1 for a mesh of type MeshTri1"):
         smooth(MeshTri())
-
-
-@pytest.mark.slow
-def test_hexahedra_with_a_ball_observed():
-    """A twin on hexes: q = 2 is found from u on a ball."""
-    mesh = MeshHex().refined(2)
-    model = lp.Model(
-        lp.Field(mesh, ElementHex1(), dirichlet={"boundary": lambda x, t: 1.0 + x[0] + 0.1 * t}),
-        lp.Field(mesh, ElementHex1(), inner=lp.Sobolev(2.0, length=0.5)),
-        A=lambda q, u, v, x: q * u * v,
-        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
-    )
-    sensors = lp.Subdomain(dimensions.ball)
-    twin = lp.streams.Twin(
-        scheme=lp.ImplicitEuler(),
-        model=model,
-        observation=sensors,
-        q_true=2.0,
-        u0=1.0,
-        times=0.05 * np.arange(21),
-    )
-    last = lp.Identifier(model, sensors, lp.GradientLaw(gain=1e4), u0=1.0).run(twin).last
-    assert twin.error(last.q) < 0.05

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from factories import rates
+from factories import observe, rates
 
 import livepde as lp
 from benchmarks import first_hour
@@ -30,12 +30,8 @@ def wall(cells: int = 16, **options: Any) -> lp.Model:
     return conduction(lp.interval(0.0, 1.0, cells), k, {"right": 0.0}, C=4.0, **options)
 
 
-def bound(model: lp.Model, plates: lp.observation.Observation) -> Any:
-    return plates.bind(model.state_space, model.X, model.parameter_space)
-
-
 def read(model: lp.Model, places: dict[str, Any], u: Any) -> np.ndarray:
-    seen = bound(model, FluxPlates(places))
+    seen = observe(model, FluxPlates(places))
     return seen.predict(model.state_space.interpolate(u), model.parameter_space.prior, NOW)
 
 
@@ -73,7 +69,7 @@ def test_a_field_of_conductivity_counts_where_the_plate_is() -> None:
     mesh = lp.interval(0.0, 1.0, 16)
     field = lp.Field(mesh, lp.linear(mesh), prior=lp.Normal(1.0, 1.0))
     model = conduction(mesh, field, {"right": 0.0}, C=1.0)
-    seen = bound(model, FluxPlates({"q": 0.5}))
+    seen = observe(model, FluxPlates({"q": 0.5}))
     q = np.sort(mesh.p[0])[np.argsort(np.argsort(model.parameter_space.fields["k"].doflocs[0]))]
     u = model.state_space.interpolate(lambda x: -2.0 * x[0])
     assert seen.predict(u, 1.0 + q, NOW)[0] == pytest.approx(3.0)
@@ -83,60 +79,36 @@ def test_each_sensor_keeps_its_unit() -> None:
     model = wall()
     plates = FluxPlates({"q": "left"}, noise=0.3, unit="W/m^2")
     both = Combined([lp.Points({"T": 0.5}, noise=0.1, unit="degC"), plates])
-    seen = bound(model, both)
+    seen = observe(model, both)
     assert seen.units == ("degC", "W/m^2")
     assert seen.unit == ""
     gained = lp.observation.Calibrated(both, lambda y, q, x: 2.0 * y)
-    assert bound(model, gained).units == seen.units
+    assert observe(model, gained).units == seen.units
+
+
+def plate() -> lp.Model:
+    mesh = lp.rectangle((0, 1), (0, 1), (4, 4))
+    return conduction(mesh, lp.Normal(1.0, 0.5), {"boundary": 0.0}, C=1.0)
 
 
 @pytest.mark.parametrize(
-    ("plates", "model", "text"),
+    ("places", "conductivity", "model", "text"),
     [
-        (lambda: FluxPlates({}), wall, "give at least one place"),
-        (lambda: FluxPlates({"q": 1.2}), wall, r"'q' is at 1.2, outside the mesh from 0 to 1"),
-        (
-            lambda: FluxPlates({"q": "top"}),
-            wall,
-            r"'q' is at 'top'; the mesh names \['left', 'right'\]",
-        ),
-        (lambda: FluxPlates({"q": 0.1}, "alpha"), wall, r"no unknown 'alpha'; it has \['k'\]"),
-        (lambda: FluxPlates({"q": 0.1}), lambda: wall(1), "two cells or more"),
+        ({}, "k", wall, "give at least one place"),
+        ({"q": 1.2}, "k", wall, r"'q' is at 1.2, outside the mesh from 0 to 1"),
+        ({"q": "top"}, "k", wall, r"'q' is at 'top'; the mesh names \['left', 'right'\]"),
+        ({"q": 0.1}, "alpha", wall, r"no unknown 'alpha'; it has \['k'\]"),
+        ({"q": 0.1}, "k", lambda: wall(1), "two cells or more"),
+        ({"q": "left"}, "k", plate, "requires a mesh of one dimension; use Functionals"),
     ],
 )
-def test_what_is_no_flux_is_refused(plates: Any, model: Any, text: str) -> None:
+def test_what_is_no_flux_is_refused(places: Any, conductivity: str, model: Any, text: str) -> None:
     with pytest.raises(ObservationError, match=text):
-        bound(model(), plates())
-
-
-def test_a_plate_needs_one_dimension() -> None:
-    mesh = lp.rectangle((0, 1), (0, 1), (4, 4))
-    model = conduction(mesh, lp.Normal(1.0, 0.5), {"boundary": 0.0}, C=1.0)
-    with pytest.raises(ObservationError, match="requires a mesh of one dimension; use Functionals"):
-        bound(model, FluxPlates({"q": "left"}))
-
-
-@pytest.mark.slow
-def test_a_member_of_a_fleet_reads_its_plate_as_a_single_run() -> None:
-    mesh = lp.interval(0.0, 1.0, 8)
-    model = conduction(mesh, lp.LogNormal(2.0, std=1.0), {"right": lp.Channel("T")}, C=4.0)
-    seen = Combined([lp.Points({"a": 0.5}, noise=0.1), FluxPlates({"q": "right"}, noise=0.1)])
-    singles = [lp.Identifier(model, seen, lp.SensitivityLaw(), u0=0.0) for _ in "ab"]
-    fleet = lp.fleet.Fleet(model, seen, lp.SensitivityLaw(), members=["a", "b"], u0=0.0)
-    for k in range(12):
-        T = math.sin(0.5 * k)
-        rows = [{"a": 0.2 * T, "q": 3.0 * T + b, "T": T} for b in (0.0, 0.3)]
-        if k == 5:
-            rows[1]["q"] = math.nan
-        found = fleet.step(0.1 * k, {name: [row[name] for row in rows] for name in rows[0]})
-        alone = [single.step(0.1 * k, row) for single, row in zip(singles, rows, strict=True)]
-        np.testing.assert_allclose(found.q, [one.q for one in alone], rtol=1e-9)
-    assert abs(found.q[0] - found.q[1]) > 1e-3
+        observe(model(), FluxPlates(places, conductivity))
 
 
 # --- in a case -----------------------------------------------------------------------------------
 
-R = "r = { prior = 1, std = 1"
 CASE = """
 equation = "conduction"
 initial = "interpolate"
@@ -185,40 +157,32 @@ def test_a_plate_as_a_sensor_determines_k_and_C(
     assert pytest.approx(0.24 / float(data["k"][-1])) == found.R
 
 
+HIDDEN = [
+    ('role = "sensor"', 'role = "validation"'),
+    (
+        'role = "boundary", column = "T_outside", at = "right"',
+        'role = "sensor", column = "T_outside", at = "24 cm"',
+    ),
+]
+FISHER = [
+    ('"conduction"', '"fisher_kpp"'),
+    ('initial = "interpolate"', "initial = 1\noptions.K = 1"),
+    ('k = { prior = "0.8 W/(m K)", std = "0.4 W/(m K)"', "D = { prior = 1, std = 1"),
+    ('C = { prior = "1.5e6 J/(m^3 K)", std = "0.5e6 J/(m^3 K)"', "r = { prior = 1, std = 1"),
+    ('noise = "0.3 W/m^2"', "noise = 1"),
+]
+
+
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        (
-            [('quantity = "flux", at = "left"', 'quantity = "flux"')],
-            "needs at = the name of an end",
-        ),
+        ([('at = "left", noise', "noise")], "needs at = the name of an end"),
         ([('at = "left", noise', 'at = "left", offset = "1 K", noise')], "offset is not possible"),
         ([('at = "left", noise', 'at = "top", noise')], "channels.q.at"),
-        (
-            [('role = "sensor", column = "q_inside"', 'role = "input", column = "q_inside"')],
-            "requires a sensor",
-        ),
+        ([('role = "sensor"', 'role = "input"')], "requires a sensor"),
         ([('noise = "0.3 W/m^2"', 'noise = "0.3 K"')], "channels.q.noise"),
-        (
-            [
-                ('role = "sensor"', 'role = "validation"'),
-                (
-                    'T_outside = { role = "boundary", column = "T_outside", at = "right" }',
-                    'T_outside = { role = "sensor", column = "T_outside", at = "24 cm" }',
-                ),
-            ],
-            "a sensor with quantity = 'flux'",
-        ),
-        (
-            [
-                ('"conduction"', '"fisher_kpp"'),
-                ('initial = "interpolate"', "initial = 1\noptions.K = 1"),
-                ('k = { prior = "0.8 W/(m K)", std = "0.4 W/(m K)"', "D = { prior = 1, std = 1"),
-                ('C = { prior = "1.5e6 J/(m^3 K)", std = "0.5e6 J/(m^3 K)"', R),
-                ('noise = "0.3 W/m^2"', "noise = 1"),
-            ],
-            "has no flux to measure",
-        ),
+        (HIDDEN, "a sensor with quantity = 'flux'"),
+        (FISHER, "has no flux to measure"),
     ],
 )
 def test_a_plate_that_a_case_cannot_have_is_refused(
@@ -312,23 +276,23 @@ def test_the_layers_of_a_case_have_their_thickness(tmp_path: Path) -> None:
     assert eval(attrs[LAYERS]) == {"k[a]": pytest.approx(0.08), "k[b]": pytest.approx(0.16)}
 
 
+FIELD = ('transform = "log" }\nC', 'transform = "log", field = true }\nC')
+
+
 @pytest.mark.parametrize(
-    ("given", "text"),
+    ("changes", "first", "text"),
     [
-        (["-0.1 m^2 K/W", "0 m^2 K/W"], "expected 0 or more"),
-        (["0.1 K", "0 m^2 K/W"], "surface_resistances"),
+        ([], "-0.1 m^2 K/W", "expected 0 or more"),
+        ([], "0.1 K", "surface_resistances"),
+        ([FIELD], "0.1 m^2 K/W", "requires a wall"),
     ],
 )
-def test_surface_resistances_are_checked(tmp_path: Path, given: list[str], text: str) -> None:
+def test_surface_resistances_are_checked(
+    tmp_path: Path, changes: list[tuple[str, str]], first: str, text: str
+) -> None:
+    settings = {"output.surface_resistances": [first, "0 m^2 K/W"]}
     with pytest.raises(CaseError, match=text):
-        load(case(tmp_path), settings={"output.surface_resistances": given})
-
-
-def test_surface_resistances_require_a_wall(tmp_path: Path) -> None:
-    field = ('transform = "log" }\nC', 'transform = "log", field = true }\nC')
-    settings = {"output.surface_resistances": ["0.1 m^2 K/W", "0 m^2 K/W"]}
-    with pytest.raises(CaseError, match="requires a wall"):
-        load(case(tmp_path, field), settings=settings)
+        load(case(tmp_path, *changes), settings=settings)
 
 
 # --- a report of a user --------------------------------------------------------------------------

@@ -290,6 +290,10 @@ def test_what_is_wrong_is_said():
             mobile_immobile(radii, T, T, varies, T)
     with pytest.raises(ModelError, match="needs a mesh of a plane"):
         groundwater(lp.interval(0.0, 1.0, 5), T, T, wells={"Q": (0.5,)})
+    with pytest.raises(ModelError, match="inlet='open'; expected one of flux, fixed"):
+        advection_dispersion(mesh, ONE, ONE, inlet="open")
+    with pytest.raises(ModelError, match="R must be at least 1"):
+        advection_dispersion(mesh, ONE, ONE, R=0.0)
 
 
 @pytest.mark.slow
@@ -386,11 +390,3 @@ def test_nothing_is_lost():
     whole = {"c": phi, "s": 1 - phi}
     stored = model.X.inner(u, model.state_space.interpolate(whole))
     assert stored == pytest.approx(V * 6.0, rel=1e-9)
-
-
-def test_what_is_refused():
-    mesh = lp.interval(0.0, 1.0, 4)
-    with pytest.raises(lp.errors.ModelError, match="inlet='open'; expected one of flux, fixed"):
-        advection_dispersion(mesh, ONE, ONE, inlet="open")
-    with pytest.raises(lp.errors.ModelError, match="R must be at least 1"):
-        advection_dispersion(mesh, ONE, ONE, R=0.0)

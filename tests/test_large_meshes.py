@@ -23,6 +23,7 @@ from skfem import (
 import livepde as lp
 from livepde.diagnostics import Spaces, noise_size, reconstruction_matrix
 from livepde.diagnostics.theory import error_bounds
+from livepde.errors import ObservationError
 from livepde.fem import Form, FunctionSpace, Moment, forms, measure
 from livepde.laws import information
 from livepde.observation import operator, reconstruction
@@ -249,7 +250,7 @@ def test_vector_fields_and_points_on_large_meshes(pieces):
     close(large.interpolate(twist), small.interpolate(twist))
     close(large.probe(points).toarray(), small.basis.probes(points).toarray())
     close(large.doflocs, small.basis.doflocs)
-    with pytest.raises(lp.errors.ObservationError, match=r"point 1 at \[1.5, 0.5\]"):
+    with pytest.raises(ObservationError, match=r"point 1 at \[1.5, 0.5\]"):
         large.probe(np.array([[0.5, 1.5], [0.5, 0.5]]))
 
 
@@ -301,14 +302,14 @@ def test_what_would_be_a_dense_matrix_of_a_field_is_refused(monkeypatch):
         lp.Identifier(model, averages, lp.GradientLaw("auto"))
     lp.Identifier(model, lp.Full(), lp.GradientLaw("auto"))
     monkeypatch.setattr(operator, "LARGEST_PROJECTION", 10_000)
-    with pytest.raises(lp.errors.ObservationError, match="169 rows with 121 entries each"):
+    with pytest.raises(ObservationError, match="169 rows with 121 entries each"):
         lp.Identifier(model, averages, lp.GradientLaw(1.0))
     lp.Identifier(model, averages, lp.SensitivityLaw(noise=0.1, modes=3))
     monkeypatch.setattr(reconstruction, "MOST_SENSORS", 100)
     smooth = lp.Full(reconstruction=lp.observation.Tikhonov("V", 0.1)).bind(
         model.state_space, model.X, model.parameter_space
     )
-    with pytest.raises(lp.errors.ObservationError, match=r"121 sensors; .* up to 100"):
+    with pytest.raises(ObservationError, match=r"121 sensors; .* up to 100"):
         smooth.reconstruct(np.ones(smooth.size))
 
 

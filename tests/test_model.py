@@ -18,7 +18,8 @@ from skfem import (
 )
 
 import livepde as lp
-from livepde.fem import START, Inputs, Moment
+from livepde.errors import ModelError, SpaceError
+from livepde.fem import Inputs, Moment
 from livepde.stepping import Advance, Alexander2, ForwardStage, simulate
 from livepde.streams import Twin
 
@@ -50,14 +51,6 @@ def test_dirichlet_constant_function_and_channel():
     np.testing.assert_allclose(np.delete(start, level.X.fixed), 1.0)
 
 
-def test_a_function_of_space_on_a_boundary():
-    mesh = MeshTri().refined(3).with_boundaries({"left": lambda x: x[0] == 0})
-    model = reaction(mesh, ElementTriP1(), dirichlet={"left": lambda x, t: x[1] ** 2 + t})
-    u = model.impose(np.zeros(model.X.dim), Moment(2.0))
-    nodes = model.X.fixed
-    np.testing.assert_allclose(u[nodes], mesh.p[1, nodes] ** 2 + 2.0)
-
-
 def test_channels_of_forms_and_boundaries_in_order():
     model = reaction(
         line(),
@@ -87,9 +80,9 @@ def test_mass_term():
     unit = reaction(mesh, ElementLineP1())
     np.testing.assert_allclose(heavy.mass.toarray(), 3 * unit.mass.toarray())
     np.testing.assert_array_equal(heavy.X.gram.toarray(), heavy.mass.toarray())
-    with pytest.raises(lp.errors.ModelError, match="M may not depend on time"):
+    with pytest.raises(ModelError, match="M may not depend on time"):
         reaction(mesh, ElementLineP1(), M=lambda u, v, x: (1 + x.t) * u * v)
-    with pytest.raises(lp.errors.SpaceError, match="of X is singular"):
+    with pytest.raises(SpaceError, match="of X is singular"):
         _ = reaction(mesh, ElementLineP1(), M=lambda u, v, x: (x[0] > 0.5) * u * v).X.factor
 
 
@@ -106,7 +99,7 @@ def test_bilinear_operators():
     model = reaction(line(6), ElementLineP1())
     stiffness = model.bilinear(laplace)
     np.testing.assert_allclose(stiffness @ np.ones(7), 0.0, atol=1e-13)
-    with pytest.raises(lp.errors.ModelError, match="may not depend on time"):
+    with pytest.raises(ModelError, match="may not depend on time"):
         model.bilinear(lambda u, v, x: x.t * u * v)
 
 
@@ -118,29 +111,8 @@ def test_initial_parameter():
     np.testing.assert_allclose(q[1:-1], 1 + mesh.p[0, 1:-1], atol=1e-12)
     bounded = lp.Model(lp.Field(mesh, ElementLineP1()), lp.Normal(1.0, bounds=(0.0, 2.0)), product)
     assert bounded.initial_parameter() == [1.0]
-    with pytest.raises(lp.errors.ModelError, match="outside the bounds"):
+    with pytest.raises(ModelError, match="outside the bounds"):
         bounded.initial_parameter(3.0)
-
-
-def test_parameter_boundary_values_must_be_zero():
-    with pytest.raises(lp.errors.ModelError, match="parameter 'q': only zero boundary values"):
-        reaction(line(), ElementLineP1(), q_dirichlet={"boundary": 1.0})
-
-
-def test_initial_state_of_a_wrong_shape():
-    with pytest.raises(
-        lp.errors.SpaceError, match=r"'u': coefficients of shape \(3,\); expected \(13,\)"
-    ):
-        reaction(line(), ElementLineP1()).initial(np.zeros(3))
-
-
-def test_a_name_that_is_no_unknown_is_said():
-    with pytest.raises(lp.errors.ModelError, match=r"there is no 'd'; there are \['D', 'r'\]"):
-        lp.Model(
-            lp.Field(line(), ElementLineP1()),
-            {"D": lp.Normal(1.0), "r": lp.Normal(1.0)},
-            A=lambda q, u, v, x: q.d * u * v,
-        )
 
 
 def heated(source):
@@ -283,9 +255,9 @@ def test_sensors_name_their_component(mesh):
         (lp.Subdomain(lambda x: x[0] > 0.9, of="s"), [0.1, 0.0]),
     ):
         assert sensor.bind(*spaces).G @ u == pytest.approx(expected, abs=1e-9)
-    with pytest.raises(lp.errors.SpaceError, match=r"components \['c', 's'\]: specify one"):
+    with pytest.raises(SpaceError, match=r"components \['c', 's'\]: specify one"):
         lp.Points([0.25]).bind(*spaces)
-    with pytest.raises(lp.errors.SpaceError, match="of='w'"):
+    with pytest.raises(SpaceError, match="of='w'"):
         lp.Points([0.25], of="w").bind(*spaces)
 
 
@@ -385,23 +357,51 @@ def test_vector_fields():
     assert set(data["w_x"].dims) == {"snapshot", "vertex"}
 
 
-def test_bad_states(mesh):
-    good, other = lp.Field(mesh, ElementLineP1()), lp.Field(lp.interval(0, 1, 10), ElementLineP1())
-    A = lambda q, u, v, x: q * u.a * v.a  # noqa: E731
-    with pytest.raises(lp.errors.ModelError, match="share one mesh object"):
-        lp.Model({"a": good, "b": other}, lp.Normal(), A)
-    with pytest.raises(lp.errors.ModelError, match="must be a Field"):
-        lp.Model({"a": good, "b": lp.Normal()}, lp.Normal(), A)
-    with pytest.raises(lp.errors.ModelError, match=r"both called \['a'\]"):
-        lp.Model({"a": good, "b": good}, {"a": lp.Normal()}, A)
-    with pytest.raises(lp.errors.ModelError, match="give a mapping"):
-        lp.Model({"a": good, "b": good}, lp.Normal(), A, f=1.0)
-    model = lp.Model({"a": good, "b": good}, lp.Normal(), A)
-    with pytest.raises(lp.errors.SpaceError, match="a function for each"):
-        model.initial(lambda x: x[0])
-    with pytest.raises(lp.errors.SpaceError, match="specify one"):
-        _ = model.state_block
-    assert np.allclose(model.initial(2.0, START), 2.0)
+GOOD, OTHER = (lp.Field(line(10), ElementLineP1()) for _ in range(2))
+NO = lp.Normal()
+
+
+def coupled(u: Any, q: Any = NO, **options: Any) -> lp.Model:
+    return lp.Model(u, q, lambda q, u, v, x: 1.0 * u.a * v.a, **options)
+
+
+@pytest.mark.parametrize(
+    ("error", "message", "build"),
+    [
+        (ModelError, "share one mesh object", lambda: coupled({"a": GOOD, "b": OTHER})),
+        (ModelError, "must be a Field", lambda: coupled({"a": GOOD, "b": NO})),
+        (ModelError, r"both called \['a'\]", lambda: coupled({"a": GOOD, "b": GOOD}, {"a": NO})),
+        (ModelError, "give a mapping", lambda: coupled({"a": GOOD, "b": GOOD}, f=1.0)),
+        (
+            SpaceError,
+            "a function for each",
+            lambda: coupled({"a": GOOD, "b": GOOD}).initial(lambda x: x[0]),
+        ),
+        (SpaceError, "specify one", lambda: coupled({"a": GOOD, "b": GOOD}).state_block),
+        (
+            SpaceError,
+            r"'u': coefficients of shape \(3,\); expected \(11,\)",
+            lambda: lp.Model(GOOD, NO, product).initial(np.zeros(3)),
+        ),
+        (
+            ModelError,
+            "parameter 'q': only zero boundary values",
+            lambda: reaction(line(), ElementLineP1(), q_dirichlet={"boundary": 1.0}),
+        ),
+        (
+            ModelError,
+            r"there is no 'd'; there are \['D', 'r'\]",
+            lambda: lp.Model(GOOD, {"D": NO, "r": NO}, A=lambda q, u, v, x: q.d * u * v),
+        ),
+    ],
+)
+def test_bad_states_and_unknowns(error: Any, message: str, build: Any):
+    with pytest.raises(error, match=message):
+        build()
+
+
+def test_a_number_is_the_initial_value_of_all_components():
+    np.testing.assert_allclose(coupled({"a": GOOD, "b": GOOD}).initial(2.0), 2.0)
 
 
 MESH = lp.interval(0.0, 1.0, 16)

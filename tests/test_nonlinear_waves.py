@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -40,23 +41,40 @@ def error(model, q, exact, times):
     return np.abs(found).max()
 
 
-def orders(build, q, exact, cells, stop):
-    """Return errors for a number of cells, and for twice as many with half the steps."""
-    return [error(build(n), q, exact, np.linspace(0.0, stop, n + 1)) for n in (cells, 2 * cells)]
+def ring(function, length, *given):
+    return lambda n: function(lp.interval(0.0, length, n), *given)
 
 
 @pytest.mark.slow
-def test_burgers_is_the_solution_of_cole_and_hopf():
-    nu, a = 0.3, 1.0
-    coarse, fine = orders(
-        lambda n: burgers(lp.interval(0.0, 2 * np.pi, n), ONE, ONE),
-        [a, nu],
-        lambda x, t: cole_hopf(x, t, nu),
-        20,
-        3.0,
+@pytest.mark.parametrize(
+    ("build", "q", "exact", "cells", "stop", "bound"),
+    [
+        (ring(burgers, 2 * np.pi, ONE, ONE), [1.0, 0.3], partial(cole_hopf, nu=0.3), 20, 3.0, 2e-5),
+        (
+            ring(kdv, 40.0, ONE, ONE),
+            [6.0, 1.0],
+            partial(soliton, a=6.0, b=1.0, speed=1.0, start=15.0),
+            80,
+            8.0,
+            1e-3,  # of a height of 0.5
+        ),
+        (
+            lambda n: allen_cahn(lp.interval(-2.0, 3.0, n), ONE, ONE, dirichlet={}),
+            [0.02, 3.0],
+            partial(front, D=0.02, r=3.0),
+            40,
+            2.0,
+            1e-3,
+        ),
+    ],
+    ids=["burgers", "soliton", "front"],
+)
+def test_exact_solutions_at_second_order_in_time(build, q, exact, cells, stop, bound):
+    coarse, fine = (
+        error(build(n), q, exact, np.linspace(0.0, stop, n + 1)) for n in (cells, 2 * cells)
     )
-    assert fine < 2e-5
-    assert coarse / fine > 3.5  # second order in time
+    assert fine < bound
+    assert coarse / fine > 3.5
 
 
 @pytest.mark.slow
@@ -66,34 +84,6 @@ def test_burgers_scales_with_its_advection():
     model = burgers(mesh, ONE, a)
     scaled = lambda x, t: cole_hopf(x, t, nu) / a  # noqa: E731
     assert error(model, [nu], scaled, np.linspace(0, 3, 61)) < 2e-5
-
-
-@pytest.mark.slow
-def test_a_soliton_keeps_its_height():
-    a, b = 6.0, 1.0
-    coarse, fine = orders(
-        lambda n: kdv(lp.interval(0.0, 40.0, n), ONE, ONE),
-        [a, b],
-        lambda x, t: soliton(x, t, a, b, 1.0, 15.0),
-        80,
-        8.0,
-    )
-    assert fine < 1e-3  # of a height of 0.5
-    assert coarse / fine > 3.5
-
-
-@pytest.mark.slow
-def test_the_front_of_allen_cahn():
-    D, r = 0.02, 3.0
-    coarse, fine = orders(
-        lambda n: allen_cahn(lp.interval(-2.0, 3.0, n), ONE, ONE, dirichlet={}),
-        [D, r],
-        lambda x, t: front(x, t, D, r),
-        40,
-        2.0,
-    )
-    assert fine < 1e-3
-    assert coarse / fine > 3.5
 
 
 @pytest.mark.slow

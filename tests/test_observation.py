@@ -21,20 +21,16 @@ def inside(x):
     return (x[0] > 0.25) & (x[0] < 0.8)
 
 
-def points(dim, fractions=(0.3, 0.55, 0.7)):
-    return [[f] + [0.3] * (dim - 1) for f in fractions]
+def points(model, *fractions):
+    return lp.Points([[f] + [0.3] * (model.state.mesh.dim() - 1) for f in fractions])
 
 
 KINDS = {
     "subdomain": lambda model: lp.Subdomain(inside),
     "full": lambda model: lp.Full(),
-    "points": lambda model: lp.Points(points(model.state.mesh.dim())),
-    "points repeated": lambda model: lp.Points(
-        points(model.state.mesh.dim(), (0.3, 0.3, 0.7, 0.3))
-    ),
-    "points on the boundary": lambda model: lp.Points(
-        points(model.state.mesh.dim(), (0.0, 0.4, 1.0))
-    ),
+    "points": lambda model: points(model, 0.3, 0.55, 0.7),
+    "points repeated": lambda model: points(model, 0.3, 0.3, 0.7, 0.3),
+    "points on the boundary": lambda model: points(model, 0.0, 0.4, 1.0),
     "averages": lambda model: lp.Averages({"in": inside, "all": lambda x: x[0] >= 0}),
     "matrix": lambda model: lp.observation.Matrix(
         np.random.default_rng(0).standard_normal((4, model.X.dim)), labels=list("abcd")
@@ -121,14 +117,6 @@ def test_omega_begins_and_ends_at_nodes_that_the_mesh_is_given(cells):
     assert np.ptp(ends, axis=0).sum() == pytest.approx(0.57)
 
 
-def test_an_element_that_omega_cuts_is_left_out():
-    model = reaction(line(10), ElementLineP1())
-    cut = observe(model, lp.Subdomain(lambda x: (x[0] > 0.35) & (x[0] < 0.81)))
-    fits = observe(model, lp.Subdomain(lambda x: (x[0] > 0.4) & (x[0] < 0.8)))
-    np.testing.assert_array_equal(cut.G.toarray(), fits.G.toarray())
-    np.testing.assert_array_equal(cut.split().omega, fits.split().omega)
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_omega_is_where_the_observed_coefficients_give_all_of_the_state(name):
     """w = u_alpha + P u is known there: no function that the sensors do not see reaches it."""
@@ -178,7 +166,7 @@ def test_regions_that_are_none_are_refused_in_a_sentence():
         ({}, "at least one region"),
     ]
     for regions, message in bad:
-        with pytest.raises(lp.errors.ObservationError, match=message):
+        with pytest.raises(ObservationError, match=message):
             lp.Averages(regions)
 
 
@@ -252,12 +240,10 @@ def test_sensors_that_see_the_parameter():
 
 def test_direct_parts_are_checked():
     model = borehole()
-    with pytest.raises(lp.errors.ObservationError, match="no sensor is called 'x'"):
+    with pytest.raises(ObservationError, match="no sensor is called 'x'"):
         observe(model, lp.Points({"a": 0.5}, direct={"x": lambda q, x: q.k}))
     affine = observe(model, lp.Points({"a": 0.5}, direct={"a": lambda q, x: q.k + 1}))
-    with pytest.raises(
-        lp.errors.ObservationError, match=r"must be linear in q; at q = 0 it gives 1\.0"
-    ):
+    with pytest.raises(ObservationError, match=r"must be linear in q; at q = 0 it gives 1\.0"):
         affine.predict(np.zeros(11), np.zeros(3), Moment())
 
 
@@ -271,10 +257,10 @@ def test_names_and_noise():
     np.testing.assert_array_equal(each.noise, [0.1, 0.2])
     assert observe(model, lp.Full()).noise is None
     for noise in ([0.1, 0.2, 0.3], [[0.1]]):
-        with pytest.raises(lp.errors.ObservationError, match="values for 2 sensors"):
+        with pytest.raises(ObservationError, match="values for 2 sensors"):
             _ = observe(model, lp.Points([0.2, 0.3], noise=noise)).noise
     for noise in (0.0, -1.0, np.nan, np.inf, [0.1, 0.0]):
-        with pytest.raises(lp.errors.ObservationError, match="must be positive numbers"):
+        with pytest.raises(ObservationError, match="must be positive numbers"):
             _ = observe(model, lp.Points([0.2, 0.3], noise=noise)).noise
 
 
@@ -287,25 +273,16 @@ def test_sensors_that_do_not_fit():
         (model, lambda: lp.Points({"T": -3.0}), r"sensors \['T'\]: number 0 at"),
         (model, lambda: lp.Points([[0.2, 0.3]]), "dimension 2; the mesh has 1"),
         (plane, lambda: lp.Points([[0.2, np.nan]]), "lies outside"),
-        (model, lambda: lp.Averages({}), "at least one region"),
         (model, lambda: lp.Averages({"r": lambda x: x[0] > 2}), "region 'r' contains no part"),
         (model, lambda: lp.observation.Matrix(np.eye(5)), "5 columns; the state has 13"),
         (model, lambda: lp.observation.Matrix(np.eye(13), labels=["a"]), "1 labels for 13 rows"),
         (model, lambda: lp.observation.Matrix(np.full((1, 13), np.nan)), "not finite"),
         (model, lambda: lp.observation.Matrix(np.eye(13)[:2], labels=["a", "a"]), "must differ"),
-        (
-            model,
-            lambda: lp.Subdomain(lambda x: x[0] > 30),
-            "no element of the mesh with a free coefficient",
-        ),
-        (
-            model,
-            lambda: lp.Subdomain(lambda x: x[0] == 0),
-            "no element of the mesh with a free coefficient",
-        ),
+        (model, lambda: lp.Subdomain(lambda x: x[0] > 30), "no element .* with a free coefficient"),
+        (model, lambda: lp.Subdomain(lambda x: x[0] == 0), "no element .* with a free coefficient"),
     ]
     for owner, build, message in bad:
-        with pytest.raises(lp.errors.ObservationError, match=message):
+        with pytest.raises(ObservationError, match=message):
             observe(owner, build())
 
 
@@ -315,7 +292,7 @@ def test_an_observation_of_ones_own_must_fit():
         def matrix(self, state):
             return sp.eye_array(4)
 
-    with pytest.raises(lp.errors.ObservationError, match="4 columns; the state has 13"):
+    with pytest.raises(ObservationError, match="4 columns; the state has 13"):
         observe(reaction(line(), ElementLineP1()), Wrong())
 
 
@@ -346,7 +323,7 @@ def test_taylor(reading, given):
 def test_a_wrong_derivative_is_found():
     report = lp.diagnostics.check_observation(bound(lambda T: T**4, lambda T: 3 * T**3))
     assert [line.name for line in report.lines if not line.ok] == ["G'(u) by differences"]
-    with pytest.raises(lp.errors.ObservationError, match="must be that of function="):
+    with pytest.raises(ObservationError, match="must be that of function="):
         report.raise_if_failed()
 
 
@@ -387,15 +364,14 @@ def test_reach_bounds_the_newton_step():
 
 
 def test_bad_sensors():
-    with pytest.raises(lp.errors.ObservationError, match="reach must be positive; got 0"):
-        bound(*RADIATION, reach=0)
-    with pytest.raises(lp.errors.ObservationError, match="iterations must be at least 1; got 0"):
-        bound(*RADIATION, iterations=0)
-    with pytest.raises(lp.errors.ObservationError, match="give noise= to it and not to its base"):
-        bound(*RADIATION, base=lp.Points([0.2], noise=0.1))
-    with pytest.raises(
-        lp.errors.ObservationError, match=r"shape \(2,\) for values of shape \(3,\)"
+    for options, message in (
+        ({"reach": 0}, "reach must be positive; got 0"),
+        ({"iterations": 0}, "iterations must be at least 1; got 0"),
+        ({"base": lp.Points([0.2], noise=0.1)}, "give noise= to it and not to its base"),
     ):
+        with pytest.raises(ObservationError, match=message):
+            bound(*RADIATION, **options)
+    with pytest.raises(ObservationError, match=r"shape \(2,\) for values of shape \(3,\)"):
         bound(lambda T: T[:2]).predict(np.ones(13), np.zeros(13), START)
 
 
@@ -423,26 +399,6 @@ def test_gradient_law(reading):
     assert found < 1.5 * plain
     if reading[0](2.0) == 2.0:
         assert found == pytest.approx(plain, rel=1e-6)
-
-
-@pytest.mark.slow
-def test_sensitivity_law_with_a_sensor_that_sees_the_parameter():
-    """z = (u + R Q)^2 with the direct part inside of g: R and k are both found."""
-    model = lp.Model(
-        lp.Field(lp.interval(0.0, 1.0, 20), ElementLineP1(), dirichlet={"left": 1.0}),
-        {"k": lp.Normal(0.5, std=0.3, bounds=(0.01, 5.0)), "R": lp.Normal(0.0, std=1.0)},
-        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) + 0.0 * q.R * v,
-        f=1.0,
-    )
-    base = lp.Points({"a": 0.4, "b": 1.0}, direct={"b": lambda q, x: 2.0 * q.R})
-    sensors = lp.observation.Transformed(base, lambda y: y**2, noise=1e-3)
-    q_true = {"k": 0.8, "R": 0.4}
-    twin = Twin(
-        model=model, observation=sensors, q_true=q_true, u0=1.0, times=0.02 * np.arange(101)
-    )
-    last = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=1.0).run(twin).last
-    for name, value in q_true.items():
-        assert last.parameters[name][0] == pytest.approx(value, rel=0.02)
 
 
 def test_a_calibration_that_does_more_than_to_add_is_found_out():

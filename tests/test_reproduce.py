@@ -12,7 +12,7 @@ from livepde import progress
 from livepde.reproduce import EXPERIMENTS, seed, seed_excited
 from livepde.reproduce.experiment import track
 from livepde.runs import Outcome
-from livepde.streams import RelativeNoise, Twin
+from livepde.streams import RelativeNoise
 
 pytestmark = pytest.mark.study
 
@@ -128,20 +128,10 @@ def test_seed_excited_reaches_its_bounds(excited: Outcome) -> None:
 
 @pytest.mark.parametrize("level", [1e-2, 1e-5])
 def test_no_noise_level_told_to_the_filter_does_harm(level: float) -> None:
-    model, full = seed_excited.build()
-    stream = Twin(
-        scheme=lp.ImplicitEuler(),
-        model=model,
-        observation=full,
-        q_true=seed_excited.q_true,
-        u_true=seed_excited.u_true,
-        times=seed_excited.TIMES,
-    )
-    law = lp.SensitivityLaw(modes=12, noise=level)
-    start = lambda x: seed_excited.u_true(x, 0.0)  # noqa: E731
-    identifier = lp.Identifier(model, full, law, u0=start, scheme=stream.scheme)
-    found = track(identifier, stream, "")
-    assert found.error(60.0) < 3.6e-4
+    twin, law = seed_excited.twin_of(), lp.SensitivityLaw(modes=12, noise=level)
+    options = {"u0": seed_excited.start, "scheme": twin.scheme}
+    identifier = lp.Identifier(twin.model, twin.observation, law, **options)
+    assert track(identifier, twin, "").error(60.0) < 3.6e-4
 
 
 def test_seed_excited_with_exact_data_checks_nothing() -> None:
@@ -173,19 +163,9 @@ def test_progress_shows_a_bar_for_every_run(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_track_counts_failed_and_divided_steps() -> None:
-    model, omega = seed.build()
-    stream = Twin(
-        scheme=lp.ImplicitEuler(),
-        model=model,
-        observation=omega,
-        q_true=seed.q_true,
-        u_true=seed.u_true,
-        times=seed.TIMES[:6],
-        noise=RelativeNoise(0.01),
-    )
-    divided = lp.Identifier(
-        model, omega, lp.GradientLaw(), u0=lambda x: seed.u_true(x, 0.0), dt_max=0.3
-    )
+    stream = seed.twin_of(times=seed.TIMES[:6], noise=RelativeNoise(0.01))
+    model, omega = stream.model, stream.observation
+    divided = lp.Identifier(model, omega, lp.GradientLaw(), u0=seed.start, dt_max=0.3)
     assert track(divided, stream, "").divided == 5
     never = lp.stepping.Newton(tolerance=0.0, iterations=1)
     failing = lp.Identifier(model, omega, lp.GradientLaw(newton=never), u0=1.0)

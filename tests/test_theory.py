@@ -28,7 +28,7 @@ from livepde.laws.damping import (
 )
 from livepde.observation import Tikhonov
 from livepde.reproduce import seed, seed_excited
-from livepde.streams import RelativeNoise, Twin
+from livepde.streams import RelativeNoise
 
 # The functions of the same names hide these modules in their package.
 constants_module = importlib.import_module("livepde.diagnostics.theory.constants")
@@ -274,16 +274,8 @@ def follow(twin, law, u0, c=None):
 
 
 def twin_of(module, samples, **options):
-    model, observation = module.build()
-    defaults = {
-        "model": model,
-        "observation": observation,
-        "q_true": module.q_true,
-        "u_true": module.u_true,
-        "times": module.TIMES[:samples],
-        "scheme": lp.GradientLaw.scheme,
-    }
-    return Twin(**defaults | options)
+    times = options.pop("times", module.TIMES[:samples])
+    return module.twin_of(times=times, scheme=lp.GradientLaw.scheme, **options)
 
 
 def constants_of(twin, gain):

@@ -143,9 +143,19 @@ def test_latent_coefficients_round_trip_and_report_what_is_outside():
         latent.inverse(q)
 
 
+HALVES = {"l": lambda x: x[0] < 0.5, "r": lambda x: x[0] >= 0.5}
+
+
+def halves(**own: Any) -> lp.Piecewise:
+    return lp.Piecewise(HALVES, lp.Normal(), own=own)
+
+
 @pytest.mark.parametrize(
     ("build", "words"),
     [
+        (lambda: halves(c=lp.Normal()), "the name of a region, one of"),
+        (lambda: halves(l=2.0), "and a prior or a Scalar"),
+        (lambda: rod(halves(l=lp.Normal())), "needs a name"),
         (lambda: lp.LogNormal(0.0, 1.0), r"median 0.0 must .* strictly inside \(0.0, inf\)"),
         (lambda: lp.LogNormal(-1.0, 1.0), r"median -1.0 is outside its bounds \(0.0, inf\)"),
         (lambda: lp.LogNormal(1.0, 1.0, bounds=(0, 2)), "with an upper one take LogitNormal"),
@@ -380,9 +390,6 @@ def test_functions_with_kinks_have_their_derivatives(kink: Any):
     check_model(rod({"a": lp.Normal(0.4, 0.1)}, A), u=0.1, spread=1e-3).raise_if_failed()
 
 
-HALVES = {"l": lambda x: x[0] < 0.5, "r": lambda x: x[0] >= 0.5}
-
-
 @pytest.mark.long
 def test_priors_of_their_own_that_equal_the_common_one_change_nothing():
     common = {"prior": lp.LogNormal(0.5, 0.2), "evolution": lp.RandomWalk(0.01)}
@@ -417,19 +424,3 @@ def test_jumps_of_a_region_or_of_all():
     assert reduction.stay == [("a[l]", 0), ("a[r]", 1)]
     assert reduction.named(["a"], "Jumps").tolist() == [True, True]
     assert reduction.named(["a[r]"], "Jumps").tolist() == [False, True]
-
-
-@pytest.mark.parametrize(
-    ("build", "words"),
-    [
-        (
-            lambda: lp.Piecewise(HALVES, lp.Normal(), own={"c": lp.Normal()}),
-            "the name of a region, one of",
-        ),
-        (lambda: lp.Piecewise(HALVES, lp.Normal(), own={"l": 2.0}), "and a prior or a Scalar"),
-        (lambda: rod(lp.Piecewise(HALVES, lp.Normal(), own={"l": lp.Normal()})), "needs a name"),
-    ],
-)
-def test_priors_of_regions_that_are_refused(build: Any, words: str):
-    with pytest.raises(SpaceError, match=words):
-        build()

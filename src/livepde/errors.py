@@ -23,6 +23,7 @@ A step that fails numerically is not an exception: it is reported as `Status` of
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -113,6 +114,12 @@ class RunError(LivepdeError, OSError):
 
 class LinearAlgebraError(LivepdeError, ArithmeticError):
     """A matrix that is singular to working precision."""
+
+
+def require_positive(what: str, value: float, kind: type[LivepdeError]) -> None:
+    """Raise an error of a kind unless a number is finite and above zero."""
+    if not (math.isfinite(value) and value > 0):
+        raise kind(f"{what} must be a positive number; got {value}.")
 
 
 @contextmanager

@@ -77,9 +77,8 @@ def chip(seen: RunView) -> list[Any]:
 def facts(seen: RunView) -> str:
     """Return how far a run is, in a line."""
     parts = [f"{seen.samples} sample{'s' * (seen.samples != 1)}"]
-    if seen.dataset is not None and seen.dataset.sizes["time"]:
-        last = float(seen.dataset["time"][-1])
-        parts.append(f"newest at {when_axis(seen.dataset).text(last)}")
+    if (data := seen.estimates) is not None:
+        parts.append(f"newest at {when_axis(data).text(float(data['time'][-1]))}")
     if seen.reading:
         parts.append("reading earlier samples")
     elif seen.ended:
@@ -102,9 +101,10 @@ def summary(seen: RunView) -> str:
     data = seen.dataset
     if data is None:
         return "No estimates yet."
-    names = []
-    for name, labels in groups(data).items():
-        names.append(name if labels == [name] else f"{name} ({len(labels)} values)")
+    names = [
+        name if labels == [name] else f"{name} ({len(labels)} values)"
+        for name, labels in groups(data).items()
+    ]
     names += [f"{name} (field)" for name in field_names(data)]
     sensors, validation = (data.sizes.get(size, 0) for size in ("sensor", "validation"))
     found = f"Estimates {', '.join(names) or 'the state only'} from {sensors} sensor"
@@ -160,15 +160,13 @@ def _failures(seen: RunView) -> Iterator[str]:
         yield f"{text}: `livepde run CASE --out RUN --resume`."
     if seen.status == "silent":
         # The page holds the newest events only, and this one may be older.
-        messages = [event.message for event in seen.events if event.kind == "silent"]
-        yield f"The source is silent{''.join(f': {text}' for text in messages[-1:])}."
+        messages = ["", *(f": {one.message}" for one in seen.events if one.kind == "silent")]
+        yield f"The source is silent{messages[-1]}."
     if seen.unwell:
         yield f"Unhealthy: {seen.unwell}."
-    if seen.dataset is not None and seen.dataset.sizes["time"]:
-        code = STATUS_CODES[int(seen.dataset["status"].values[-1])]
-        if code != "ok":
-            text = f"The last step failed ({code.replace('_', ' ')})"
-            yield f"{text}. The estimate is from the last successful step."
+    if seen.estimates is not None and (code := int(seen.estimates["status"].values[-1])):
+        text = f"The last step failed ({STATUS_CODES[code].replace('_', ' ')})"
+        yield f"{text}. The estimate is from the last successful step."
 
 
 def _remarks(seen: RunView) -> Iterator[str]:
@@ -283,24 +281,22 @@ def event_tables(seen: RunView) -> list[Any]:
 
 def sensor_tables(seen: RunView) -> list[Any]:
     """Return the table of the sensors, if there are estimates."""
-    data, last = seen.dataset, dict[str, float]()
-    if data is None or not data.sizes["time"]:
+    if (data := seen.estimates) is None:
         return []
-    for variable, dimension in ERRORS:
-        if variable in data:
-            names = [str(name) for name in data[dimension].values]
-            last |= dict(zip(names, data[variable].values[-1].tolist(), strict=True))
-    rows = [
-        (
-            name,
-            "used" if role == "assimilated" else role,
-            f"{last[name]:+.3g}" if math.isfinite(last[name]) else "missing",
-            refused or "–",
-            f"{float(errors.mean()):+.2g}" if len(errors) else "–",
-            f"{float(np.sqrt((errors**2).mean())):.3g}" if len(errors) else "–",
-        )
-        for name, (role, errors, _, refused) in channel_errors(data).items()
-    ]
+    last = {
+        str(name): float(error)
+        for variable, dimension in ERRORS
+        if variable in data
+        for name, error in zip(data[dimension].values, data[variable].values[-1], strict=True)
+    }
+    rows = []
+    for name, (role, errors, _, refused) in channel_errors(data).items():
+        newest = f"{last[name]:+.3g}" if math.isfinite(last[name]) else "missing"
+        mean, root = "–", "–"
+        if len(errors):
+            mean, root = f"{errors.mean():+.2g}", f"{np.sqrt((errors**2).mean()):.3g}"
+        used = "used" if role == "assimilated" else role
+        rows.append((name, used, newest, refused or "–", mean, root))
     title = axis_label(data, "innovation", "Measured minus predicted")
     columns = ("Channel", "Role", "Last", "Rejected", "Mean", "Root mean square")
     return [_table(title, columns, rows)]

@@ -164,8 +164,7 @@ def _steer(app: dash.Dash, view: View) -> None:
         prevent_initial_call=True,
     )
     def steer(_: int | None, wanted: float, __: int, before: float | None) -> tuple[Any, ...]:
-        data = view.look().dataset
-        if data is None or not data.sizes["time"]:
+        if (data := view.look().estimates) is None:
             return None, 0, 1, 1, 1, True, ""
         low, high = (float(data["time"].values[k]) for k in (0, -1))
         step = (high - low) / STOPS or 1.0
@@ -322,8 +321,8 @@ def _title(data: xr.Dataset, label: str) -> str:
 
 
 def _cells(name: str, one: RunView, level: tuple[cards.Level, str], shown: list[str]) -> list[Any]:
-    data, newest, values = one.dataset, "–", ["–"] * len(shown)
-    if data is not None and data.sizes["time"]:
+    newest, values = "–", ["–"] * len(shown)
+    if (data := one.estimates) is not None:
         newest = when_axis(data).text(float(data["time"][-1]))
         known = scalars(data)
         values = [_value(data, label) if label in known else "–" for label in shown]

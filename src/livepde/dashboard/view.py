@@ -97,6 +97,11 @@ class RunView:
     ended: str = ""  # date when the run ended, "" before
     problem: str = ""
 
+    @property
+    def estimates(self) -> xr.Dataset | None:
+        """The dataset if it has an estimate."""
+        return None if self.dataset is None or not self.dataset.sizes["time"] else self.dataset
+
 
 def with_readings(data: xr.Dataset, readings: Array) -> xr.Dataset:
     """Return a dataset with the readings of its sensors and validation sensors, `READINGS`.
@@ -142,18 +147,17 @@ class View:
             except (RunError, ValueError, TypeError, KeyError, IndexError) as error:
                 self._failures += 1
                 if self._failures > 1:  # the first time it may be just being made
-                    self._seen = self._unreadable(error)
+                    why = error if isinstance(error, RunError) else f"it is damaged ({error})."
+                    problem, self._mark = f"The run cannot be read: {why}", None
+                    self._seen = replace(
+                        self._seen,
+                        version=self._seen.version + (self._seen.problem != problem),
+                        status="unreadable",
+                        problem=problem,
+                        reading=False,
+                    )
             self._looked = time.monotonic()
             return self._seen
-
-    def _unreadable(self, error: Exception) -> RunView:
-        said = str(error) if isinstance(error, RunError) else f"it is damaged ({error})."
-        problem = f"The run cannot be read: {said}"
-        self._mark = None
-        version = self._seen.version + (self._seen.problem != problem)
-        return replace(
-            self._seen, version=version, status="unreadable", problem=problem, reading=False
-        )
 
     def _begin(self, run: runs.Run) -> None:
         self._started = run.record.get("started")
@@ -170,7 +174,7 @@ class View:
         journal = self.path / JOURNAL
         live = journal.is_file()
         latest = written(journal) if live else 0.0
-        status = self._status(run, journal if live else None, latest)
+        status = _status(run, journal if live else None, latest)
         mark = (latest, status, str(run.record))
         if mark == self._mark and not self._seen.reading:
             return self._seen
@@ -188,21 +192,9 @@ class View:
             seen = replace(seen, dataset=None)
         else:
             seen = replace(seen, dataset=run.dataset, samples=run.dataset.sizes["time"])
-        seen = self._judged(seen, run)
+        seen = _judged(seen, run)
         self._mark = mark  # last, so that after an error all is read again
         return seen
-
-    def _judged(self, seen: RunView, run: runs.Run) -> RunView:
-        """Return the contents with findings; of an ended run with its notes and checks."""
-        found = [] if seen.dataset is None else runs.doubts(seen.dataset)
-        if run.status == "running":
-            return replace(seen, doubts=found, notes=[], checks=[], ended="")
-        # The dataset is thinned, while what the run itself has said is of all its samples.
-        if found and seen.gap > 1:
-            found = run.notes
-        notes = [note for note in run.notes if note not in found]
-        ended = str(run.record.get("ended", ""))
-        return replace(seen, doubts=found, notes=notes, checks=run.checks, ended=ended)
 
     def _follow(self, seen: RunView, path: Path) -> RunView:
         with Journal.open(path) as journal:
@@ -214,15 +206,11 @@ class View:
             verdict = journal.verdict
         names = [*layout.sensors, *(layout.validation or ())]
         for number, record in new:
-            self._add(number, record)
-            values = readings.get(number, {})
-            self._readings[number] = np.array([values.get(name, np.nan) for name in names])
+            self._add(number, record, names, readings.get(number, {}))
         status = seen.status
-        heard = [event.kind for event in events if event.kind in HEARING]
-        if status == "running" and not count:
-            status = "waiting"
-        elif status == "running" and heard[-1:] == ["silent"]:
-            status = "silent"
+        if status == "running":
+            heard = ["heard", *(event.kind for event in events if event.kind in HEARING)]
+            status = "waiting" if not count else "silent" if heard[-1] == "silent" else "running"
         return replace(
             seen,
             status=status,
@@ -235,8 +223,11 @@ class View:
             unwell=unwell if status == "running" else "",
         )
 
-    def _add(self, number: int, record: Record) -> None:
+    def _add(
+        self, number: int, record: Record, names: Sequence[str], values: Mapping[str, float]
+    ) -> None:
         self._number = number
+        self._readings[number] = np.array([values.get(name, np.nan) for name in names])
         if record.snapshot is not None:
             # Fields take most of the memory, so that their number depends on their size.
             size = 8 * sum(values.size for values in record.snapshot.profiles.values())
@@ -248,22 +239,36 @@ class View:
         self._rows.add(number, plain)
 
     def _dataset(self, layout: Layout, verdict: str) -> xr.Dataset | None:
-        kept = {**dict(self._rows), **dict(self._notable), **dict(self._fields)}
+        kept = dict(
+            sorted({**dict(self._rows), **dict(self._notable), **dict(self._fields)}.items())
+        )
         if not kept:
             return None
-        numbers = sorted(kept)
-        data = layout.dataset([kept[number] for number in numbers])
-        self._readings = {number: self._readings[number] for number in numbers}
+        data = layout.dataset([*kept.values()])
+        self._readings = {number: self._readings[number] for number in kept}
         data = with_readings(data, np.array([*self._readings.values()]))
         if verdict:
             data.attrs["verdict"] = verdict
         return data
 
-    def _status(self, run: runs.Run, journal: Path | None, latest: float) -> str:
-        if run.status != "running":
-            return run.status
-        if journal is None:
-            return "waiting"
-        if time.time() - latest > QUIET and not in_use(journal):
-            return "stopped"
-        return "running"
+
+def _judged(seen: RunView, run: runs.Run) -> RunView:
+    """Return the contents with findings; of an ended run with its notes and checks."""
+    found = [] if seen.dataset is None else runs.doubts(seen.dataset)
+    if run.status == "running":
+        return replace(seen, doubts=found, notes=[], checks=[], ended="")
+    # The dataset is thinned, while what the run itself has said is of all its samples.
+    if found and seen.gap > 1:
+        found = run.notes
+    notes = [note for note in run.notes if note not in found]
+    ended = str(run.record.get("ended", ""))
+    return replace(seen, doubts=found, notes=notes, checks=run.checks, ended=ended)
+
+
+def _status(run: runs.Run, journal: Path | None, latest: float) -> str:
+    if run.status != "running":
+        return run.status
+    if journal is None:
+        return "waiting"
+    stopped = time.time() - latest > QUIET and not in_use(journal)
+    return "stopped" if stopped else "running"

@@ -29,11 +29,7 @@ _known: WeakValueDictionary[bytes, Scatter] = WeakValueDictionary()
 
 def shared(array: IntArray) -> IntArray:
     """Return a canonical array equal to this one: the same object for all equal arrays."""
-    key = _digest(array)
-    found = _arrays.get(key)
-    if found is None:
-        _arrays[key] = found = array
-    return found
+    return _arrays.setdefault(_digest(array), array)
 
 
 def scatter(pairs: Pairs, shape: tuple[int, int]) -> Scatter:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 from typing import Any
@@ -401,6 +400,14 @@ class FieldBlock(Block):
         dofs = self.at(None if name == "boundary" else name, names)
         return np.unique(self._tied(dofs))
 
+    def _values_on(self, name: str) -> IntArray:
+        """Return the coefficients that an essential condition fixes.
+
+        Derivatives (u_x, u_n, ...) stay free unless the field is clamped.
+        """
+        values = [n for n in (self.field.element.dofnames or []) if "_" not in n]
+        return self._dofs_on(name, None if self.field.clamped else values)
+
     def _axes(self, where: str) -> list[int]:
         """Return the axes whose component of a vector is a coefficient."""
         names = self.field.element.dofnames or []
@@ -415,14 +422,11 @@ class FieldBlock(Block):
     def _valued(self, name: str, value: Any) -> list[tuple[IntArray, Any]]:
         """Return the Dirichlet conditions of a boundary, one per component of a vector."""
         if not (isinstance(value, tuple) or (callable(value) and self.vector)):
-            # Essential conditions fix values only; derivative degrees of freedom (u_x, u_n, ...)
-            # stay free unless the field is clamped.
-            values = [n for n in (self.field.element.dofnames or []) if "_" not in n]
-            return [(self._dofs_on(name, None if self.field.clamped else values), value)]
+            return [(self._values_on(name), value)]
         where = f"dirichlet: '{name}'"
         axes = self._axes(where)
         if callable(value):
-            value = [_Component(value, k, len(axes), where) for k in axes]
+            value = [_component(value, k, len(axes), where) for k in axes]
         if len(value) != len(axes):
             raise SpaceError(
                 f"{where} has {len(value)} values; expected {len(axes)}, one for each component, "
@@ -600,25 +604,21 @@ class FieldBlock(Block):
         return self.probe(mesh.p, "vertex")
 
 
-@dataclass(frozen=True)
-class _Component:
-    """One component of vector boundary values g(x, t), which have a row for each, or one row."""
+def _component(g: Any, axis: int, count: int, where: str) -> Any:
+    """Return one component of boundary values g(x, t), which have a row for each, or one row."""
 
-    g: Callable[[Array, float], Any]
-    axis: int
-    count: int
-    where: str
-
-    def __call__(self, x: Array, t: float) -> Any:
-        values = self.g(x, t)
+    def component(x: Array, t: float) -> Any:
+        values = g(x, t)
         if not isinstance(values, list | tuple) and np.ndim(values) < 2:
             return values
-        if len(values) != self.count:
+        if len(values) != count:
             raise SpaceError(
-                f"{self.where}: g(x, t) has {len(values)} components; expected {self.count}, as in "
+                f"{where}: g(x, t) has {len(values)} components; expected {count}, as in "
                 "lambda x, t: (t * x[1], 0.0)."
             )
-        return values[self.axis]
+        return values[axis]
+
+    return component
 
 
 def _factor(mass: sp.csr_array) -> Factor:

@@ -71,6 +71,11 @@ class On:
     form: Integrand
 
 
+def placed(integrand: Integrand | On) -> tuple[Integrand, str | None]:
+    """Return an integrand, and the boundary or subdomain of its integral; None: all cells."""
+    return (integrand.form, integrand.name) if isinstance(integrand, On) else (integrand, None)
+
+
 def ignores(function: Any, position: int) -> bool:
     """Return whether a function declares by the name `_` that it ignores an argument.
 

@@ -30,7 +30,7 @@ import scipy.sparse as sp
 
 from livepde.errors import LivepdeError, ModelError
 from livepde.fem.elementwise import ElementTensor, Scatter, TensorTerm, scatter
-from livepde.fem.fields import Integrand, On, ignores
+from livepde.fem.fields import Integrand, On, ignores, placed
 from livepde.fem.measure import START, Inputs, Measure, Moment, Place
 from livepde.fem.space import FunctionSpace, LocalSpace
 from livepde.linalg import Array, IntArray, Pattern
@@ -57,11 +57,15 @@ LARGEST_TENSOR = 5_000_000
 
 @dataclass(frozen=True, eq=False)
 class _Term:
-    """One integrand on one measure, with the local space of every argument."""
+    """One integrand on one measure, with the local space of every argument.
+
+    `derivative` is the integrand of its derivative in the nonlinear argument, if it is given.
+    """
 
     integrand: Integrand
     measure: Measure
     over: Mapping[str, FunctionSpace]
+    derivative: Integrand | None
 
     @cached_property
     def spaces(self) -> dict[str, LocalSpace]:
@@ -167,34 +171,32 @@ class Form(FormMatrices):
         parameter: str | None = None,
     ) -> None:
         items = integrands if isinstance(integrands, Sequence) else [integrands]
-        self.name = name
-        self.spaces = dict(spaces)
-        self.nonlinear = nonlinear
-        self.terms: list[_Term] = []
-        for item in items:
-            integrand, where = (item.form, item.name) if isinstance(item, On) else (item, None)
-            self.terms.append(_Term(integrand, Measure(mesh, order, where), self.spaces))
         given = derivative if isinstance(derivative, Sequence) else [derivative] * len(items)
         if len(given) != len(items):
             raise ModelError(
                 f"Form {name}: give one derivative for each of its {len(items)} terms."
             )
-        self.derivatives = list(given)
+        self.name = name
+        self.spaces = dict(spaces)
+        self.nonlinear = nonlinear
+        self.parameter = parameter
+        self.terms: list[_Term] = []
+        for item, one in zip(items, given, strict=True):
+            integrand, where = placed(item)
+            self.terms.append(_Term(integrand, Measure(mesh, order, where), self.spaces, one))
         self._inputs = Inputs(dict.fromkeys(inputs, 1.0))
         self._forget()
         self._moving: list[bool] = []  # terms that read time or inputs, and the nonlinear argument
         self.uses: frozenset[str] = self._probe()
-        self.parameter = parameter
         for slot in self.spaces:
             if slot not in (nonlinear, parameter):
                 self._check_linear(slot)
         self.linear_in_parameter = parameter is None or self._affine(parameter, homogeneous=True)
-        curved = {nonlinear} if self.linear_in_parameter else {nonlinear, parameter}
-        self._curved = frozenset(key for key in curved if key is not None)
+        self._curved = {nonlinear} if self.linear_in_parameter else {nonlinear, parameter}
 
     def _forget(self) -> None:
         self._constants: dict[tuple[str, str], Array] = {}
-        self._affine_parts: dict[str, tuple[sp.csr_array, Array]] = {}
+        self._affine_parts: dict[tuple[str, str], tuple[sp.csr_array, Array]] = {}
         self._tensors: dict[tuple[str, str], Tensor] = {}
         self._scatters: dict[tuple[str, str], Scatter] = {}
         self._products: list[TensorTerm] | None = None
@@ -206,10 +208,8 @@ class Form(FormMatrices):
         patterns contain only the couplings of these cells.
         """
         part = copy(self)
-        measures = [term.measure.on(cells) for term in self.terms]
-        here = [k for k, measure in enumerate(measures) if measure.shape[0]]
-        part.terms = [replace(self.terms[k], measure=measures[k]) for k in here]
-        part.derivatives = [self.derivatives[k] for k in here]
+        terms = [replace(term, measure=term.measure.on(cells)) for term in self.terms]
+        part.terms = [term for term in terms if term.measure.shape[0]]
         part._forget()
         return part
 
@@ -388,18 +388,22 @@ class Form(FormMatrices):
     def vector(self, slot: str, moment: Moment = START, **coefficients: Array) -> Array:
         """Return the derivative in the linear argument `slot`, shape (dim of its space,)."""
         others = [key for key in self.spaces if key != slot]
-        if self._trilinear and others:
-            linear = [key for key in others if key != self.nonlinear]
-            if not linear:  # B(u) = B(0) + B' u
-                if slot not in self._affine_parts:
-                    zero = {key: np.zeros(space.dim) for key, space in self.spaces.items()}
-                    slope = self.matrix(slot, others[0], moment)
-                    self._affine_parts[slot] = slope, self.traced(slot, START, **zero)[0]
-                slope, offset = self._affine_parts[slot]
-                return slope @ coefficients[others[0]] + offset
-            rest = {key: coefficients[key] for key in others if key != linear[0]}
-            return self.product(slot, linear[0], coefficients[linear[0]], moment, **rest)
-        return self.traced(slot, moment, **coefficients)[0]
+        if not (self._trilinear and others):
+            return self.traced(slot, moment, **coefficients)[0]
+        if others == [self.nonlinear]:  # B(u) = B(0) + B' u
+            slope, offset = self._affine_part(slot, others[0])
+            return slope @ coefficients[others[0]] + offset
+        linear = next(key for key in others if key != self.nonlinear)
+        rest = {key: coefficients[key] for key in others if key != linear}
+        return self.product(slot, linear, coefficients[linear], moment, **rest)
+
+    def _affine_part(self, slot: str, other: str) -> tuple[sp.csr_array, Array]:
+        """Return the slope and the offset of an affine form of one argument, cached."""
+        if (slot, other) not in self._affine_parts:
+            zero = {key: np.zeros(space.dim) for key, space in self.spaces.items()}
+            offset = self.traced(slot, START, **zero)[0]
+            self._affine_parts[slot, other] = self.matrix(slot, other), offset
+        return self._affine_parts[slot, other]
 
     def traced(
         self, slot: str, moment: Moment = START, **coefficients: Array
@@ -476,9 +480,9 @@ class Form(FormMatrices):
     ) -> Array:
         places = self._scatter(rows, cols)
         result = np.zeros(places.pattern.nnz)
-        for number, (whole, given) in enumerate(zip(self.terms, self.derivatives, strict=True)):
+        for number, whole in enumerate(self.terms):
             for at, term in whole.pieces():
-                density = self._density(term, rows, cols, moment, coefficients, given)
+                density = self._density(term, rows, cols, moment, coefficients)
                 r, c = term.spaces[rows], term.spaces[cols]
                 local = r.paired(density, term.measure.weights, c)
                 places.add(result, number, at, local, keep or whole.measure.kept)
@@ -491,7 +495,6 @@ class Form(FormMatrices):
         cols: str,
         moment: Moment,
         coefficients: Mapping[str, Array],
-        given: Integrand | None,
     ) -> Array:
         """Return the integrand's derivative in `rows`, `cols`: (components, components, E, P).
 
@@ -501,8 +504,7 @@ class Form(FormMatrices):
         exact.
         """
         place = term.measure.place(moment)
-        if self.nonlinear not in (rows, cols):
-            given = None
+        given = term.derivative if self.nonlinear in (rows, cols) else None
         stepped, shifted = self._differenced(rows, cols, given)
 
         def evaluate(shift: float) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import SpaceError
-from livepde.fem.fields import Declaration, Integrand, On, Scalars
+from livepde.fem.fields import Declaration, Integrand, On, Scalars, placed
 from livepde.fem.forms import STEP, Form, FormMatrices
 from livepde.fem.measure import START, Moment
 from livepde.fem.priors import Evolution, Identity, Normal, Transform
@@ -99,14 +99,13 @@ class Coefficients:
         """Return terms of the unknowns alone, which compute the numbers at each point."""
 
         def one(term: Any) -> Any:
-            if isinstance(term, On):
-                return On(term.name, one(term.form))
+            form, where = placed(term)
 
-            @wraps(term)  # so that the names of its arguments stay
+            @wraps(form)  # so that the names of its arguments stay
             def integrand(q: Any, *others: Any) -> Any:
-                return term(Named(**vars(q), **self.function(q)), *others)
+                return form(Named(**vars(q), **self.function(q)), *others)
 
-            return integrand
+            return integrand if where is None else On(where, integrand)
 
         return [one(term) for term in (terms if isinstance(terms, Sequence) else [terms])]
 

@@ -33,7 +33,7 @@ from skfem.element import (
 )
 from skfem.element.element_global import ElementGlobal
 
-from livepde.errors import SpaceError, optional
+from livepde.errors import SpaceError, optional, require_positive
 from livepde.fem.fields import Field, Predicate, with_sides
 from livepde.linalg import Array, IntArray
 
@@ -199,8 +199,7 @@ def read_mesh(path: str | Path, scale: float = 1.0) -> Mesh:
     >>> mesh = lp.read_mesh("plate.msh")  # doctest: +SKIP
     """
     path = Path(path)
-    if not (np.isfinite(scale) and scale > 0):
-        raise SpaceError(f"read_mesh: scale must be a positive number; got {scale}.")
+    require_positive("read_mesh: scale", scale, SpaceError)
     if not path.is_file():
         raise SpaceError(f"read_mesh: there is no file '{path}'.")
     with optional("mesh", "read_mesh needs meshio, which is not installed", SpaceError):

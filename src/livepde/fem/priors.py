@@ -14,13 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from livepde.errors import SpaceError
+from livepde.errors import SpaceError, require_positive
 from livepde.linalg import Array
-
-
-def _positive(what: str, value: float) -> None:
-    if not (np.isfinite(value) and value > 0):
-        raise SpaceError(f"{what} must be a positive number; got {value}.")
 
 
 @dataclass(frozen=True)
@@ -75,7 +70,7 @@ class RandomWalk(Evolution):
     rate: float
 
     def __post_init__(self) -> None:
-        _positive("RandomWalk: rate", self.rate)
+        require_positive("RandomWalk: rate", self.rate, SpaceError)
 
     def growth(self, h: float, std: float) -> Array:
         # The variance rate^2 h, relative to std^2.
@@ -97,7 +92,7 @@ class MeanReverting(Evolution):
     time: float
 
     def __post_init__(self) -> None:
-        _positive("MeanReverting: time", self.time)
+        require_positive("MeanReverting: time", self.time, SpaceError)
 
     @property
     def generator(self) -> Array:
@@ -123,7 +118,7 @@ class Periodic(Evolution):
     harmonics: int = 1
 
     def __post_init__(self) -> None:
-        _positive("Periodic: period", self.period)
+        require_positive("Periodic: period", self.period, SpaceError)
         if self.harmonics < 1:
             raise SpaceError(f"Periodic: harmonics must be at least 1; got {self.harmonics}.")
 
@@ -366,8 +361,7 @@ class Prior(ABC):
     def _check(self, centre: str) -> None:
         """Raise an error for numbers that are no distribution; `centre` is its name, as "mean"."""
         what, at = type(self).__name__, self.centre
-        if not (np.isfinite(self.std) and self.std > 0):
-            raise SpaceError(f"{what}: std must be a positive number; got {self.std}.")
+        require_positive(f"{what}: std", self.std, SpaceError)
         lower, upper = self.bounds
         if not lower < upper:
             raise SpaceError(

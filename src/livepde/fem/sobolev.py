@@ -16,7 +16,7 @@ from skfem.element import ElementLineHermite, ElementQuadBFS, ElementTriArgyris
 from skfem.helpers import dd as hess
 from skfem.helpers import ddot, dot, grad
 
-from livepde.errors import SpaceError
+from livepde.errors import SpaceError, require_positive
 from livepde.linalg import Array, Pattern, analyse
 
 SMOOTH = (ElementLineHermite, ElementQuadBFS, ElementTriArgyris)  # of class C^1
@@ -77,8 +77,7 @@ class Sobolev:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.s) and self.s >= 0):
             raise SpaceError(f"Sobolev: the order s must be a number >= 0; got {self.s}.")
-        if not (np.isfinite(self.length) and self.length > 0):
-            raise SpaceError(f"Sobolev: length must be a positive number; got {self.length}.")
+        require_positive("Sobolev: length", self.length, SpaceError)
 
     def pointwise(self, dimension: int) -> Sobolev:
         """Return the inner product with `std` of a field as its pointwise standard deviation.
@@ -142,10 +141,14 @@ def _border(s: float, M: Any, K: Any) -> Any:
         corner = sp.csr_array((n, inner.shape[0]))
         mass = sp.vstack([-M, sp.csr_array((rest, n))])
         return sp.block_array([[None, corner, K], [corner.T, inner, mass], [K, mass.T, None]])
-    if s in (0.0, 1.0):
-        return M if s == 0 else K
     if s == 2:
         return sp.block_array([[None, K], [K, -M]])
+    if s in (0.0, 1.0):
+        return M if s == 0 else K
+    return _fractional_border(s, M, K)
+
+
+def _fractional_border(s: float, M: Any, K: Any) -> Any:
     # With one auxiliary field for each pole the Schur complement E - sum F H^{-1} F is
     # lambda^s = lambda^{s - sigma} (c + sum w lambda/(lambda + b)).
     largest = _largest(M, K)
@@ -276,18 +279,17 @@ def random_field(
     >>> np.sqrt(sum(function(x) ** 2 for function in field)).round(2)
     array([0., 2., 0.])
     """
-    vertices = np.asarray(mesh.p, dtype=float).T
-    side = float(np.ptp(vertices, axis=0).max())
-    length = LENGTH * side if length is None else length
-    if std is None and len(known or ()) < 2:
+    vertices, known = np.asarray(mesh.p, dtype=float).T, known or {}
+    length = LENGTH * float(np.ptp(vertices, axis=0).max()) if length is None else length
+    if std is None and len(known) < 2:
         return ()
-    for name, value in (("std", std), ("length", length)):
-        if value is not None and not (np.isfinite(value) and value > 0.0):
-            raise SpaceError(f"random_field: {name} must be a positive number; got {value!r}.")
-    at = np.array([np.atleast_1d(place) for place in known or ()]).reshape(-1, vertices.shape[1])
+    if std is not None:
+        require_positive("random_field: std", std, SpaceError)
+    require_positive("random_field: length", length, SpaceError)
+    at = np.array([np.atleast_1d(place) for place in known]).reshape(-1, vertices.shape[1])
     points = vertices[:: -(-len(vertices) // CANDIDATES)]
     kernel = _Kernel(at, length, len(at))
-    left = np.ones(len(points)) - (_explained(kernel, points) if kernel.known else 0.0)
+    left = 1.0 - _explained(kernel, points)
     if left.max(initial=0.0) < ROUNDING:  # each vertex has a known value
         return ()
     kernel = _with_pivots(kernel, points, left, 3 * most)
@@ -298,19 +300,25 @@ def random_field(
     count = min(int(np.searchsorted(share, KEPT)) + 1, most, len(share))
     mixes = vectors[:, ::-1][:, :count].T
     if std is None:
-        scale = _spread(kernel, np.array([*(known or {}).values()], dtype=float))
-        if scale == 0.0:
-            return ()
-    else:
-        if share[count - 1] < LEAST:
-            raise SpaceError(
-                f"random_field: {count} functions represent {share[count - 1]:.0%} of the variance "
-                f"with length {length:g} and {len(at)} known values; expected {LEAST:.0%} or more: "
-                "use a larger length, or fewer known values."
-            )
+        scale = _spread(kernel, np.array([*known.values()], dtype=float))
+    elif share[count - 1] >= LEAST:
         scale = std / float(np.sqrt(((mixes @ features) ** 2).sum(axis=0).max()))
-    mixes = scale * mixes
-    functions = [partial(kernel.mixed, mix) for mix in mixes]
+    else:
+        raise SpaceError(
+            f"random_field: {count} functions represent {share[count - 1]:.0%} of the variance "
+            f"with length {length:g} and {len(at)} known values; expected {LEAST:.0%} or more: "
+            "use a larger length, or fewer known values."
+        )
+    return _functions(kernel, scale, mixes, vertices)
+
+
+def _functions(
+    kernel: _Kernel, scale: float, mixes: Array, vertices: Array
+) -> tuple[Callable[..., Array], ...]:
+    """Return mixes of the functions of a kernel; on an interval straight between the vertices."""
+    if scale == 0.0:
+        return ()
+    functions = [partial(kernel.mixed, mix) for mix in scale * mixes]
     if vertices.shape[1] > 1:
         return tuple(functions)
     nodes = np.sort(vertices[:, 0])
@@ -333,6 +341,8 @@ def _with_pivots(kernel: _Kernel, points: Array, left: Array, most: int) -> _Ker
 
 def _explained(kernel: _Kernel, points: Array) -> Array:
     """Return the share of the variance at points that all places of a kernel explain."""
+    if not len(kernel.places):
+        return np.zeros(len(points))
     whole = _Kernel(kernel.places, kernel.length, 0)
     return np.asarray((whole.features(points) ** 2).sum(axis=0))
 

@@ -444,27 +444,28 @@ class FunctionSpace:
             return result
         if self.single:
             return self._interpolate(next(iter(self.blocks)), value)
-        if len(self.fields) == len(self.blocks) and np.ndim(value) == 0 and not callable(value):
-            return np.concatenate([block.interpolate(value) for block in self.blocks.values()])
         if callable(value):
             raise SpaceError(
                 f"a function of x for {list(self.blocks)}: give a mapping, a function for each."
             )
-        array = np.asarray(value, dtype=float)
-        if array.shape != (self.dim,):
-            raise SpaceError(f"coefficients of shape {array.shape}; expected ({self.dim},).")
-        return array.copy()
+        if len(self.fields) == len(self.blocks) and np.ndim(value) == 0:
+            return np.concatenate([block.interpolate(value) for block in self.blocks.values()])
+        return _coefficients(value, self.dim)
 
     def _interpolate(self, name: str, value: Any) -> Array:
         block, part = self.blocks.get(name), self.part(name)
         if isinstance(block, FieldBlock) and (callable(value) or np.ndim(value) == 0):
             return block.interpolate(value)
-        array, size = np.asarray(value, dtype=float), part.stop - part.start
-        if array.ndim == 0:
-            return np.full(size, float(array))
-        if array.shape != (size,):
-            raise SpaceError(f"'{name}': coefficients of shape {array.shape}; expected ({size},).")
-        return array.copy()
+        size = part.stop - part.start
+        return _coefficients(np.full(size, value) if np.ndim(value) == 0 else value, size, name)
+
+
+def _coefficients(value: Any, size: int, name: str = "") -> Array:
+    array = np.array(value, dtype=float)
+    if array.shape != (size,):
+        whose = f"'{name}': " if name else ""
+        raise SpaceError(f"{whose}coefficients of shape {array.shape}; expected ({size},).")
+    return array
 
 
 def _product(block: FieldBlock) -> Callable[[Any, Any], Any]:

@@ -114,21 +114,14 @@ def with_conditions(
     ('k', 'J')
     """
     more = dict(unknowns or {})
-    if per is not None and per not in model.parameter_space.labels:
-        raise ModelError(
-            f"with_conditions: per='{per}' is not an unknown of the model; it has "
-            f"{list(model.parameter_space.labels)}."
-        )
-    inverse = f"per_{per}" if f"per_{per}" in model.computed else None
-    terms = _Terms(tuple(more), per, inverse)
+    terms = _Terms(model, tuple(more), per)
     for name, given in (boundary or {}).items():
-        _check_boundary(model, name)
-        for condition in given if isinstance(given, Sequence) else [given]:
-            terms.through(name, condition)
+        terms.through(name, given)
     for name, source in (sources or {}).items():
         terms.gained(source.value, *_region(model, name, source.over))
-    if unused := [name for name in more if name not in terms.named]:
-        raise ModelError(f"with_conditions: no condition names the unknown '{unused[0]}'.")
+    for name in more:
+        if name not in terms.named:
+            raise ModelError(f"with_conditions: no condition names the unknown '{name}'.")
     whole = model.with_unknowns(more) if more else model
     return whole.with_terms(terms.A, terms.B, terms.inputs)
 
@@ -140,29 +133,48 @@ def _everywhere(x: Place) -> float:
 class _Terms:
     """Additional terms of A, which contain unknowns, and of B, which do not."""
 
-    def __init__(self, unknowns: tuple[str, ...], per: str | None, inverse: str | None) -> None:
-        self.unknowns, self.per, self.inverse = unknowns, per, inverse
+    def __init__(self, model: Model, unknowns: tuple[str, ...], per: str | None) -> None:
+        if per is not None and per not in model.parameter_space.labels:
+            raise ModelError(
+                f"with_conditions: per='{per}' is not an unknown of the model; it has "
+                f"{list(model.parameter_space.labels)}."
+            )
+        self.model, self.unknowns, self.per = model, unknowns, per
+        self.inverse = f"per_{per}" if f"per_{per}" in model.computed else None
         self.named: set[str] = set()
         self.inputs: list[str] = []
         self.A: list[Any] = []
         self.B: list[Any] = []
 
-    def through(self, boundary: str, condition: Condition) -> None:
-        """Add a flux, or an exchange as two terms, so that the term in u reads no input."""
-        if isinstance(condition, Flux):
-            return self.gained(condition.value, boundary)
-        known = condition.coefficient
-        if isinstance(known, int | float) and known < 0.0:
+    def through(self, boundary: str, given: Condition | Sequence[Condition]) -> None:
+        """Add fluxes and exchanges."""
+        known = self.model.mesh.boundaries or {}
+        if boundary not in known:
             raise ModelError(
-                f"with_conditions: the exchange at '{boundary}' has the coefficient {known}; "
+                f"with_conditions: the mesh has no boundary '{boundary}'; it has {sorted(known)}."
+            )
+        if {boundary, "boundary"} & set(self.model.state_block.field.dirichlet):
+            raise ModelError(
+                f"with_conditions: the boundary '{boundary}' has a value, so its flux is part of "
+                "the solution. Keep one of the two."
+            )
+        for condition in given if isinstance(given, Sequence) else [given]:
+            if isinstance(condition, Flux):
+                self.gained(condition.value, boundary)
+            else:
+                self._exchanged(boundary, condition.coefficient, condition.ambient)
+
+    def _exchanged(self, boundary: str, coefficient: Amount, ambient: Amount) -> None:
+        if isinstance(coefficient, int | float) and coefficient < 0.0:
+            raise ModelError(
+                f"with_conditions: the exchange at '{boundary}' has the coefficient {coefficient}; "
                 "expected 0 or more. The flux into the domain is coefficient (ambient - u)."
             )
-        h, ambient = self._divided(condition.coefficient), self._amount(condition.ambient)
-        given = condition.coefficient, condition.ambient
-        # A term in u that reads an input would make the matrix of a stage depend on time, and
-        # prevent the reuse of its factor.
-        self._add(boundary, lambda q, u, v, x: h(q, x) * u * v, given[0])
-        self._add(boundary, lambda q, _, v, x: -h(q, x) * ambient(q, x) * v, *given)
+        h, outside = self._divided(coefficient), self._amount(ambient)
+        # Two terms: a term in u that reads an input would make the matrix of a stage depend on
+        # time, and prevent the reuse of its factor.
+        self._add(boundary, lambda q, u, v, x: h(q, x) * u * v, coefficient)
+        self._add(boundary, lambda q, _, v, x: -h(q, x) * outside(q, x) * v, coefficient, ambient)
 
     def gained(
         self, value: Amount, where: str | None, inside: Callable[[Any], Any] = _everywhere
@@ -180,11 +192,11 @@ class _Terms:
             return term(None, None, v, x)
 
         # B and f may not read q, so a term belongs to A as soon as one amount is an unknown.
-        unknown = self.per is not None or any(
-            isinstance(amount, str | Multiple) for amount in amounts
-        )
-        form = term if unknown else driving if ignores(term, 1) else known
-        (self.A if unknown else self.B).append(form if where is None else On(where, form))
+        if self.per is not None or any(isinstance(one, str | Multiple) for one in amounts):
+            form, terms = term, self.A
+        else:
+            form, terms = driving if ignores(term, 1) else known, self.B
+        terms.append(form if where is None else On(where, form))
 
     def _divided(self, value: Amount) -> Callable[[Any, Place], Any]:
         """Return an amount over the unknown that divides the equation, if one does."""
@@ -218,19 +230,6 @@ class _Terms:
             )
         self.named.add(value)
         return lambda q, x: getattr(q, value)
-
-
-def _check_boundary(model: Model, name: str) -> None:
-    known = model.mesh.boundaries or {}
-    if name not in known:
-        raise ModelError(
-            f"with_conditions: the mesh has no boundary '{name}'; it has {sorted(known)}."
-        )
-    if {name, "boundary"} & set(model.state_block.field.dirichlet):
-        raise ModelError(
-            f"with_conditions: the boundary '{name}' has a value, so its flux is part of the "
-            "solution. Keep one of the two."
-        )
 
 
 def _region(model: Model, name: str, over: Any) -> tuple[str | None, Callable[[Any], Any]]:

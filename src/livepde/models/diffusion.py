@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from numbers import Real
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -131,13 +132,12 @@ def conduction(
     """
     unknowns = {"k": k, "loss": loss, "transfer": transfer, "source": source}
     one_number("conduction", C=C)
-    if isinstance(C, fem.Scalar | fem.Prior):
-        unknowns["C"] = C
-        return _model(CONDUCTION, mesh, unknowns, dirichlet, lambda x: 1.0, element, unit)
     given: Any = C
-    if not callable(C) and not (isinstance(given, Real) and float(given) > 0.0):
+    if isinstance(C, fem.Scalar | fem.Prior):
+        unknowns["C"], given = C, 1.0
+    elif not callable(C) and not (isinstance(given, Real) and float(given) > 0.0):
         raise ModelError(f"conduction: the heat capacity C must be positive; got {C!r:.60}.")
-    capacity = C if callable(C) else lambda x: given
+    capacity = given if callable(given) else lambda x: given
     least = float(np.min(capacity(Measure(mesh, 1).place(START))))
     if not least > 0.0:
         raise ModelError(
@@ -156,53 +156,64 @@ def _model(
     element: Any,
     unit: str,
 ) -> Model:
-    held = dict(dirichlet or {})
     everywhere(equation.name, mesh, **{equation.conductivity: unknowns[equation.conductivity]})
+    field = fem.Field(mesh, element or fem.linear(mesh), dirichlet=dict(dirichlet or {}), unit=unit)
     # A term without an unknown of its own is left out of the form, and its input with it.
     given = {key: unknown for key, unknown in unknowns.items() if unknown is not None}
-
     # The equation is divided by an unknown heat capacity. The ratios are coefficients of the form,
     # which stays linear in them.
-    own, divided = [key for key in given if key != "C"], "C" in given
-
-    def ratios(q: Any) -> dict[str, Any]:
-        return {"per_C": 1.0 / q.C, **{f"{key}_per_C": getattr(q, key) / q.C for key in own}}
-
-    def part(q: Any, key: str) -> Any:
-        return getattr(q, f"{key}_per_C" if divided else key)
-
-    terms: list[Any] = [
-        lambda q, u, v, x: part(q, equation.conductivity) * fem.dot(fem.grad(u), fem.grad(v))
-    ]
-    if "loss" in given:
-        terms += _exchange("loss", part)
-    if "transfer" in given:
-        sides = [] if "boundary" in held else [*(mesh.boundaries or {})]
-        free = [side for side in sides if side not in held]
-        if not free:
-            raise ModelError(
-                f"{equation.name}: transfer acts at named boundaries without a value, and there is "
-                "none: leave it out, or leave one out of dirichlet."
-            )
-        terms += [fem.On(side, term) for side in free for term in _exchange("transfer", part)]
-    if "source" in given:
-        terms.append(lambda q, _, v, x: -part(q, "source") * v)
+    divided = "C" in given
+    part = {key: attrgetter(key + "_per_C" * divided) for key in given}
     return Model(
-        fem.Field(mesh, element or fem.linear(mesh), dirichlet=held, unit=unit),
+        field,
         given,
-        A=terms,
+        A=_terms(equation, part, field),
         M=lambda u, v, x: capacity(x) * u * v,
         inputs=[AMBIENT] if {"loss", "transfer"} & set(given) else [],
-        coefficients=ratios if divided else None,
+        coefficients=(lambda q: _ratios(q, part)) if divided else None,
         **equation.about(given),
     )
 
 
-def _exchange(coefficient: str, part: Callable[[Any, str], Any]) -> list[Any]:
+def _ratios(q: Any, names: Iterable[str]) -> dict[str, Any]:
+    """Return one over C, and other unknowns over C."""
+    return {"per_C": 1.0 / q.C, **{f"{k}_per_C": getattr(q, k) / q.C for k in names if k != "C"}}
+
+
+def _terms(
+    equation: Equation, part: Mapping[str, Callable[[Any], Any]], field: fem.Field
+) -> list[Any]:
+    """Return the terms of A for unknowns by name, each a function of q."""
+    D = part[equation.conductivity]
+    terms: list[Any] = [lambda q, u, v, x: D(q) * fem.dot(fem.grad(u), fem.grad(v))]
+    if "loss" in part:
+        terms += _exchange(part["loss"])
+    if "transfer" in part:
+        sides = _free_sides(equation, field)
+        terms += [fem.On(side, term) for side in sides for term in _exchange(part["transfer"])]
+    if "source" in part:
+        terms.append(lambda q, _, v, x: -part["source"](q) * v)
+    return terms
+
+
+def _free_sides(equation: Equation, field: fem.Field) -> list[str]:
+    """Return the named boundaries without a value, at which heat transfer acts."""
+    held = field.dirichlet
+    sides = [] if "boundary" in held else [*(field.mesh.boundaries or {})]
+    free = [side for side in sides if side not in held]
+    if not free:
+        raise ModelError(
+            f"{equation.name}: transfer acts at named boundaries without a value, and there is "
+            "none: leave it out, or leave one out of dirichlet."
+        )
+    return free
+
+
+def _exchange(coefficient: Callable[[Any], Any]) -> list[Any]:
     """Return coefficient (u - ambient) v as two terms, so that the term in u reads no input."""
     return [
-        lambda q, u, v, x: part(q, coefficient) * u * v,
-        lambda q, _, v, x: -part(q, coefficient) * x.inputs[AMBIENT] * v,
+        lambda q, u, v, x: coefficient(q) * u * v,
+        lambda q, _, v, x: -coefficient(q) * x.inputs[AMBIENT] * v,
     ]
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.errors import ModelError
+from livepde.errors import ModelError, require_positive
 from livepde.fem import Field, Source, Unknown, dot, grad, hermite, linear, positive
 from livepde.model import Model
 from livepde.models.description import (
@@ -102,7 +102,7 @@ def fisher_kpp(
     >>> fisher_kpp(lp.interval(0.0, 1.9, 38), D, r, K=1700.0).affine
     False
     """
-    _check("fisher_kpp", K)
+    require_positive("fisher_kpp: the carrying capacity K", K, ModelError)
     everywhere("fisher_kpp", mesh, D=D)
     return Model(
         _state(mesh, dirichlet, element, unit),
@@ -140,7 +140,7 @@ def porous_fisher(
         m is below 1, when the derivative of the diffusivity at u = 0 is infinite; or K is not
         positive.
     """
-    _check("porous_fisher", K)
+    require_positive("porous_fisher: the carrying capacity K", K, ModelError)
     if not (np.isfinite(m) and m >= 1):
         raise ModelError(f"porous_fisher: the exponent m must be at least 1; got {m}.")
 
@@ -153,11 +153,6 @@ def porous_fisher(
         ),
         **POROUS_FISHER.about(),
     )
-
-
-def _check(name: str, K: float) -> None:
-    if not (np.isfinite(K) and K > 0):
-        raise ModelError(f"{name}: the carrying capacity K must be a positive number; got {K}.")
 
 
 def _state(mesh: Any, dirichlet: Mapping[str, Any] | None, element: Any, unit: str) -> Field:

@@ -49,11 +49,11 @@ class Combined(Observation):
     """
 
     parts: Sequence[Observation]
+    listed = ("parts", "observation")
 
     def __post_init__(self) -> None:
         self._sees_all("give of= to the observations it is made of.")
-        if not self.parts:
-            raise ObservationError("Combined: give at least one observation.")
+        super().__post_init__()
         if self.noise is not None and any(part.noise is not None for part in self.parts):
             raise ObservationError("Combined: give noise= to it or to its parts, not to both.")
         self._reads(name for part in self.parts for name in part.inputs)

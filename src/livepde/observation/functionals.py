@@ -12,6 +12,7 @@ import scipy.sparse as sp
 from livepde.errors import ModelError, ObservationError
 from livepde.fem import FieldBlock, Form, FunctionSpace, Integrand, Moment, Named, Normal, On
 from livepde.fem.field_blocks import base_name
+from livepde.fem.fields import placed
 from livepde.fem.measure import Measure
 from livepde.fem.space import LocalSpace
 from livepde.linalg import Array
@@ -47,14 +48,11 @@ class Functionals(Observation):
     integrands: Mapping[str, Integrand | On]
     order: int | None = None
     portable = True
+    listed = ("integrands", "integrand")
 
     def __post_init__(self) -> None:
         self._sees_all("an integrand names its component, as u.c.")
-        if not self.integrands:
-            raise ObservationError("Functionals: give at least one integrand.")
-
-    def names(self, count: int) -> tuple[str, ...]:
-        return tuple(self.integrands)
+        super().__post_init__()
 
     def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
         return FunctionalsObserved(self, state, X, parameter)
@@ -78,8 +76,8 @@ class FunctionalsObserved(Observed):
         return self.observation.names(len(self.observation.integrands))
 
     def _form(self, name: str, spaces: Mapping[str, FunctionSpace]) -> Form:
-        given, inputs = self.observation.integrands[name], self.observation.inputs
-        g, where = (given.form, given.name) if isinstance(given, On) else (given, None)
+        inputs = self.observation.inputs
+        g, where = placed(self.observation.integrands[name])
 
         def integrand(w: Any, uq: Any, x: Any) -> Any:
             q = _jets(uq, PARAMETER, self.parameter)
@@ -174,13 +172,7 @@ class FluxPlates(Observation):
     points: Mapping[str, float | str]
     conductivity: str = "k"
     portable = True
-
-    def __post_init__(self) -> None:
-        if not self.points:
-            raise ObservationError("FluxPlates: give at least one place.")
-
-    def names(self, count: int) -> tuple[str, ...]:
-        return tuple(self.points)
+    listed = ("points", "place")
 
     def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
         return FluxPlatesObserved(self, state, X, parameter)

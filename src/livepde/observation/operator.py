@@ -6,13 +6,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
-from livepde.errors import ObservationError
+from livepde.errors import ObservationError, require_positive
 from livepde.fem import FieldBlock, FunctionSpace, Moment, Place, Unknown, numbers
 from livepde.linalg import Array, IntArray, Mask, Memo
 from livepde.spaces import HilbertSpace
@@ -191,7 +191,8 @@ class Observation:
     """Abstract observation operator: z = G u, plus a direct part D q.
 
     Subclasses define G by `matrix`; sensors that are nonlinear in the state return their own bound
-    object from `bind`.
+    object from `bind`. If a field contains the sensors, in order or by name, `listed` is its name,
+    and the name of one of them.
 
     Parameters
     ----------
@@ -214,6 +215,13 @@ class Observation:
     noise: float | Sequence[float] | None = None
     unit: str = ""
     reconstruction: Reconstruction = field(default_factory=Pseudoinverse)
+
+    listed: ClassVar[tuple[str, str]] = ("", "")
+
+    def __post_init__(self) -> None:
+        sensors, one = self.listed
+        if sensors and not len(getattr(self, sensors)):
+            raise ObservationError(f"{type(self).__name__}: give at least one {one}.")
 
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
         """Return G on the coefficients of the state, shape (sensors, n)."""
@@ -252,7 +260,8 @@ class Observation:
 
     def names(self, count: int) -> tuple[str, ...]:
         """Return a name for each sensor."""
-        return tuple(f"z{k}" for k in range(count))
+        sensors = getattr(self, self.listed[0], None)
+        return tuple(sensors if isinstance(sensors, Mapping) else (f"z{k}" for k in range(count)))
 
     @property
     def places(self) -> Array | None:
@@ -497,8 +506,8 @@ class Observed:
             raise ObservationError(
                 f"reconstruct: z has shape {z.shape}; the observation has {self.size} sensors."
             )
-        if delta is not None and not (np.isfinite(delta) and delta > 0):
-            raise ObservationError(f"reconstruct: delta must be a positive number; got {delta}.")
+        if delta is not None:
+            require_positive("reconstruct: delta", delta, ObservationError)
         asked = np.isfinite(z) if present is None else present
         if boundary is None:
             boundary = np.zeros(self.X.dim)

@@ -21,7 +21,7 @@ import scipy
 import scipy.linalg as sl
 import scipy.sparse as sp
 
-from livepde.errors import ObservationError
+from livepde.errors import ObservationError, require_positive
 from livepde.fem import FieldBlock, Form, Integrand, ddot, dot, grad, hess
 from livepde.linalg import Array, Mask
 from livepde.observation.operator import (
@@ -41,7 +41,19 @@ MOST_SENSORS = 10_000
 
 
 class Alpha(ABC):
-    """Abstract parameter choice rule for alpha."""
+    """Abstract parameter choice rule for alpha.
+
+    The noise level in Z is `delta`, or `level` relative to ||z||_Z; both None: that of the
+    observation.
+    """
+
+    delta: float | None
+    level: float | None
+
+    def _check(self, **values: float) -> None:
+        for name, value in {**values, "delta": self.delta, "level": self.level}.items():
+            if value is not None:
+                require_positive(f"{type(self).__name__}: {name}", value, ObservationError)
 
     @abstractmethod
     def choose(self, misfit: Callable[[float], float], delta: float, scale: float) -> float:
@@ -50,17 +62,6 @@ class Alpha(ABC):
         `misfit` is the function alpha -> ||G u_alpha - z||_Z, nondecreasing; `scale` the alpha at
         which both terms have equal weight.
         """
-
-    @property
-    @abstractmethod
-    def given(self) -> tuple[float | None, float | None]:
-        """Noise level in Z, and relative to ||z||_Z; None if the observation must supply it."""
-
-
-def _check(owner: str, **values: float | None) -> None:
-    for name, value in values.items():
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise ObservationError(f"{owner}: {name} must be a positive number; got {value}.")
 
 
 @dataclass(frozen=True)
@@ -78,16 +79,12 @@ class Apriori(Alpha):
     level: float | None = None
 
     def __post_init__(self) -> None:
-        _check("Apriori", factor=self.factor, delta=self.delta, level=self.level)
+        self._check(factor=self.factor)
         if not 0 < self.power < 2:
             raise ObservationError(
                 f"Apriori: power must lie between 0 and 2, so that alpha and delta^2/alpha vanish "
                 f"with the noise; got {self.power}."
             )
-
-    @property
-    def given(self) -> tuple[float | None, float | None]:
-        return self.delta, self.level
 
     def choose(self, misfit: Callable[[float], float], delta: float, scale: float) -> float:
         return float(self.factor * delta**self.power)
@@ -109,11 +106,7 @@ class Discrepancy(Alpha):
     level: float | None = None
 
     def __post_init__(self) -> None:
-        _check("Discrepancy", tau=self.tau, delta=self.delta, level=self.level)
-
-    @property
-    def given(self) -> tuple[float | None, float | None]:
-        return self.delta, self.level
+        self._check(tau=self.tau)
 
     def choose(self, misfit: Callable[[float], float], delta: float, scale: float) -> float:
         target = self.tau * delta
@@ -263,11 +256,10 @@ class Spectral(Reconstructor):
         rule = self.config.alpha
         if not isinstance(rule, Alpha):
             return (self.level if delta is None else delta), float(rule)
-        if delta is None:
-            absolute, relative = rule.given
-            delta = absolute
-            if delta is None:
-                delta = self.level if relative is None else relative * data_norm(z, self.weights)
+        delta = rule.delta if delta is None else delta
+        if delta is None and rule.level is not None:
+            delta = rule.level * data_norm(z, self.weights)
+        delta = self.level if delta is None else delta
         if delta is None:
             raise ObservationError(
                 f"Tikhonov: {type(rule).__name__} needs the noise level: give noise= to the "

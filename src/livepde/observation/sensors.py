@@ -51,10 +51,10 @@ class Moving(Observation):
 
     positions: Mapping[str, str | Sequence[str]]
     portable = True
+    listed = ("positions", "sensor")
 
     def __post_init__(self) -> None:
-        if not self.positions:
-            raise ObservationError("Moving: give at least one sensor.")
+        super().__post_init__()
         self._reads(name for names in self.channels for name in names)
 
     @property
@@ -62,9 +62,6 @@ class Moving(Observation):
         """Channels of the coordinates of each sensor."""
         given = self.positions.values()
         return [(names,) if isinstance(names, str) else tuple(names) for names in given]
-
-    def names(self, count: int) -> tuple[str, ...]:
-        return tuple(self.positions)
 
     @property
     def optional(self) -> frozenset[str]:
@@ -171,10 +168,10 @@ class Points(Observation):
     position_std: float | Mapping[str, float] | None = None
     component: int | Sequence[int] | None = None
     portable = True
+    listed = ("points", "position")
 
     def __post_init__(self) -> None:
-        if len(self.points) == 0:
-            raise ObservationError("Points: give at least one position.")
+        super().__post_init__()
         self._check_component()
         given = self.position_std
         if given is None:
@@ -232,11 +229,6 @@ class Points(Observation):
     def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
         kind = Observed if self.position_std is None else PlacedObserved
         return kind(self, state, X, parameter)
-
-    def names(self, count: int) -> tuple[str, ...]:
-        if isinstance(self.points, Mapping):
-            return tuple(self.points)
-        return super().names(count)
 
     @property
     def places(self) -> Array:
@@ -442,6 +434,7 @@ class Averages(Observation):
 
     regions: Mapping[str, Predicate | str]
     portable = True
+    listed = ("regions", "region")
 
     def __post_init__(self) -> None:
         given: Any = self.regions
@@ -450,17 +443,13 @@ class Averages(Observation):
                 "Averages: expected a mapping, sensor name -> predicate on x or name of a boundary "
                 f"or subdomain, as in Averages({{'core': lambda x: x[0] < 0.1}}); got {given!r}."
             )
-        if not given:
-            raise ObservationError("Averages: give at least one region.")
+        super().__post_init__()
         for name, region in given.items():
             if not (isinstance(name, str) and (isinstance(region, str) or callable(region))):
                 raise ObservationError(
                     f"Averages: {name!r}: {region!r} is not a region; expected the name of a "
                     "sensor and a predicate on x, or a boundary or subdomain of the mesh."
                 )
-
-    def names(self, count: int) -> tuple[str, ...]:
-        return tuple(self.regions)
 
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
         block = self.scalar_block(state)
@@ -537,13 +526,7 @@ class LineIntegrals(Observation):
     lines: Mapping[str, tuple[Any, Any]]
     mean: bool = False
     portable = True
-
-    def __post_init__(self) -> None:
-        if not self.lines:
-            raise ObservationError("LineIntegrals: give at least one line.")
-
-    def names(self, count: int) -> tuple[str, ...]:
-        return tuple(self.lines)
+    listed = ("lines", "line")
 
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
         block = self.scalar_block(state)

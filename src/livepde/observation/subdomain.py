@@ -108,22 +108,20 @@ class Subdomain(Observation):
         found = self.selected(block)
         points, fit = block.fitted(self.elements(block))
         what = f"{type(self).__name__}.sample"
+        values: Any
         if callable(given):
-            values = np.asarray(given(points), dtype=float)
-            several = False
+            values, several = np.asarray(given(points), dtype=float)[None], False
         else:
             values, several = _interpolated(given, points, what)
-        components = len(block.variables("u"))
-        if not several:
-            values = values[None]
-        if components > 1 and (several or values.shape[1:] != (components, points.shape[1])):
+        shape = len(block.variables("u")), points.shape[1]
+        if shape[0] > 1 and values.shape[1:] != shape:
             raise ObservationError(
                 f"{what}: the state is a vector field: give a function of x that returns a row for "
-                f"each of {components} components, shape {(components, points.shape[1])}."
+                f"each of {shape[0]} components, shape {shape}."
             )
         try:
-            wide = (len(values), components, points.shape[1])
-            values = np.broadcast_to(values.reshape(len(values), components, -1), wide)
+            rows = values.reshape(len(values), shape[0], -1)
+            values = np.broadcast_to(rows, (len(values), *shape))
         except ValueError:
             raise ObservationError(
                 f"{what}: the function returns shape {values.shape[1:]} for x of shape "
@@ -145,7 +143,7 @@ class Subdomain(Observation):
 
 
 def _interpolated(given: Any, points: Array, what: str) -> tuple[Array, bool]:
-    """Return values of a DataArray at points, (points,) or (samples, points), and which of them."""
+    """Return values of a DataArray at points, (samples, points), and whether it has samples."""
     import xarray as xr
 
     axes = ["x", "y", "z"][: len(points)]
@@ -171,7 +169,7 @@ def _interpolated(given: Any, points: Array, what: str) -> tuple[Array, bool]:
             )
         at[axis] = xr.DataArray(np.clip(x, low, high), dims="at the points")
     found = given.interp(at).transpose(*more, "at the points")
-    return np.asarray(found.values, dtype=float), bool(more)
+    return np.atleast_2d(np.asarray(found.values, dtype=float)), bool(more)
 
 
 def _everywhere(x: object) -> bool:

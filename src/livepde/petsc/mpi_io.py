@@ -38,7 +38,7 @@ def save_state(
     viewer = petsc_module().Viewer().createMPIIO(str(beside), "w", comm=comm)
     for name, value in vars(state).items():
         if name in OF_Q + OF_U:
-            parts = value if isinstance(value, tuple) else () if value is None else (value,)
+            parts = value if isinstance(value, tuple) else [] if value is None else [value]
             order = model.numbers_q if name in OF_Q else model.numbers_u
             for vector in parts:
                 _ordered(vector, order).view(viewer)
@@ -48,10 +48,11 @@ def save_state(
     viewer.destroy()
     # One rank replaces the file, and then removes the vectors to which the replaced one referred.
     if comm.rank == 0:
-        old = _read(path)["vectors"] if path.exists() else None
+        old = path.parent / _read(path)["vectors"] if path.exists() else None
         write_bytes(path, json.dumps(numbers).encode(), sync=True)
-        for name in () if old is None else (old, f"{old}.info"):
-            (path.parent / name).unlink(missing_ok=True)
+        if old is not None:
+            old.unlink(missing_ok=True)
+            Path(f"{old}.info").unlink(missing_ok=True)
     comm.barrier()
 
 

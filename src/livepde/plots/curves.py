@@ -39,11 +39,16 @@ LOOP_LINES = {
 }
 
 
-def _snapshots(data: xr.Dataset, times: Sequence[float] | int) -> list[int]:
-    """Return indices of the snapshots nearest to given times, or of a number of them.
+def _snapshots(data: xr.Dataset, name: str, times: Sequence[float] | int) -> list[int]:
+    """Return indices of a field's snapshots nearest to given times, or of a number of them.
 
     Their spacing is quadratic, because an estimate changes most at the start.
     """
+    fields = [str(key) for key in data if data[key].dims == ("snapshot", "vertex")]
+    if name not in fields:
+        raise ConfigurationError(f"the dataset has no field '{name}'; it has {fields}.")
+    if "y" in data.coords:
+        raise ConfigurationError("profiles are for one space dimension; use overview for maps.")
     available = data["snapshot"].values
     if not len(available):
         raise ConfigurationError("the dataset contains no snapshots: run with at least one sample.")
@@ -89,14 +94,8 @@ def profiles(
     ConfigurationError
         The field does not exist, has more than one space dimension, or Matplotlib is not installed.
     """
-    fields = [str(key) for key in data if data[key].dims == ("snapshot", "vertex")]
-    if name not in fields:
-        raise ConfigurationError(f"the dataset has no field '{name}'; it has {fields}.")
-    if "y" in data.coords:
-        raise ConfigurationError("profiles are for one space dimension; use overview for maps.")
-    ax = panel(ax)
-    chosen = _snapshots(data, times)
-    x = data["x"].values
+    chosen = _snapshots(data, name, times)
+    ax, x = panel(ax), data["x"].values
     if observed is not None:
         ax.axvspan(*observed, color=GREY, alpha=0.12, linewidth=0, label="observed")
     truth = np.asarray([] if exact is None else exact, dtype=float)
@@ -116,7 +115,7 @@ def profiles(
         ax.fill_between(x, low, high, color=shades[-1], alpha=0.25, linewidth=0, label="95 %")
     if truth.ndim == 2:
         ax.plot([], [], color=GREY, linewidth=1.0, label="exact")
-    elif exact is not None:
+    elif len(truth):
         ax.plot(x, truth, color="black", linewidth=2.0, zorder=1.5, label="exact")
     ax.set_xlabel(axis_label(data, "x"))
     ax.set_ylabel(axis_label(data, name))

@@ -148,10 +148,7 @@ def measured_and_predicted(
         There is no such sensor, or the sensors have several units.
     """
     ax, names = panel(ax), sensor_names(data)
-    shown = names if sensors is None else list(sensors)
-    if unknown := [name for name in shown if name not in names]:
-        raise ConfigurationError(f"there is no sensor '{unknown[0]}'; there are {names}.")
-    units = sensor_units(data)
+    shown, units = _chosen(sensors, names, "there is no sensor"), sensor_units(data)
     several = list(dict.fromkeys(units[name] for name in shown))
     if len(several) > 1:
         raise ConfigurationError(
@@ -167,11 +164,10 @@ def measured_and_predicted(
     for n, name in enumerate(shown[:MOST_LINES]):
         i, colour = names.index(name), PALETTE[n % len(PALETTE)]
         ax.plot(at, measured[:, i], ".", color=colour, markersize=3, alpha=0.5)
-        validation = i >= data.sizes.get("sensor", 0)
-        style: dict[str, Any] = {"label": name}
-        if validation:
-            style = {"label": f"{name} (validation)", "linestyle": "--"}
-        ax.plot(at[known], expected[:, i], color=colour, linewidth=1.2, **style)
+        label, dash = name, "-"
+        if i >= data.sizes.get("sensor", 0):
+            label, dash = f"{name} (validation)", "--"
+        ax.plot(at[known], expected[:, i], dash, color=colour, linewidth=1.2, label=label)
     time_axis(ax, data)
     ax.set_ylabel(labelled("", "".join(several)).strip())
     some = f", {MOST_LINES} of {len(shown)} sensors" if len(shown) > MOST_LINES else ""
@@ -244,8 +240,7 @@ def field(data: xr.Dataset, name: str, *, std: bool = False, ax: Axes | None = N
         There is no such field, or no map of a standard deviation.
     """
     known = [*field_names(data), *str(data.attrs.get("state", "")).split()]
-    if name not in known:
-        raise ConfigurationError(f"plots: there is no field '{name}'; there are {known}.")
+    _chosen([name], known, "plots: there is no field")
     panels = _field_panels(data, name, 5)
     if std and len(panels) < 2:
         raise ConfigurationError(
@@ -272,29 +267,32 @@ def corner(draws: xr.Dataset, names: Sequence[str] | None = None, *, axes: Any =
         The matrix of axes; those above the diagonal are hidden.
     """
     numbers = [str(name) for name in draws.data_vars if draws[name].dims == ("draw",)]
-    shown = numbers if names is None else list(names)
-    if unknown := [name for name in shown if name not in numbers]:
-        raise ConfigurationError(f"plots: there is no number '{unknown[0]}'; there are {numbers}.")
+    shown = _chosen(names, numbers, "plots: there is no number")
     if not shown:
         raise ConfigurationError("plots: there is no unknown number to draw.")
     size = len(shown)
     if axes is None:
         axes = empty(size, size, "").subplots(size, size, squeeze=False)
     for i, of in enumerate(shown):
-        for k, against in enumerate(shown):
-            ax: Axes = axes[i][k]
-            if k > i:
-                ax.set_visible(False)
-            elif k == i:
-                ax.hist(draws[of].values, bins=40, color=PALETTE[0], alpha=0.7)
-            else:
-                x, y = draws[against].values, draws[of].values
-                ax.plot(x, y, ".", color=PALETTE[0], markersize=2, alpha=0.3)
-            if i == size - 1:
-                ax.set_xlabel(axis_label(draws, against))
-            if k == 0 and i:
-                ax.set_ylabel(axis_label(draws, of))
+        values = draws[of].values
+        axes[i][i].hist(values, bins=40, color=PALETTE[0], alpha=0.7)
+        axes[size - 1][i].set_xlabel(axis_label(draws, of))
+        if i:
+            axes[i][0].set_ylabel(axis_label(draws, of))
+        for k in range(i):
+            x = draws[shown[k]].values
+            axes[i][k].plot(x, values, ".", color=PALETTE[0], markersize=2, alpha=0.3)
+            axes[k][i].set_visible(False)
     return axes
+
+
+def _chosen(names: Sequence[str] | None, known: list[str], what: str) -> list[str]:
+    """Return names of what is to be drawn, default all; `what` begins the message for others."""
+    shown = known if names is None else list(names)
+    for name in shown:
+        if name not in known:
+            raise ConfigurationError(f"{what} '{name}'; there are {known}.")
+    return shown
 
 
 class RunPlots:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -52,13 +52,6 @@ class Experiment:
         return self.conduct(truth, progress)
 
 
-class Failing(Protocol):
-    """A run that counts its failed steps."""
-
-    @property
-    def failed(self) -> int: ...
-
-
 @dataclass(frozen=True, eq=False)
 class Track:
     """Run with the errors against its truth.
@@ -86,10 +79,9 @@ class Track:
         return float(self.errors[np.abs(self.times - t).argmin()])
 
 
-def failures(runs: Iterable[Failing], where: str = "", most: int = 0) -> Check:
-    """Return the check that at most so many steps failed, in all runs together."""
-    failed = float(sum(run.failed for run in runs))
-    return Check(f"failed steps{where}", failed, float(most), "<=")
+def failures(runs: Iterable[Any], where: str = "", most: int = 0) -> Check:
+    """Return the check that at most so many steps `failed`, in all runs together."""
+    return Check(f"failed steps{where}", float(sum(run.failed for run in runs)), float(most), "<=")
 
 
 def track(identifier: Identifier, twin: Twin, what: str, progress: bool = False) -> Track:

@@ -136,9 +136,7 @@ def _field_panels(data: xr.Dataset, at: float | None, cut: float) -> Iterator[Pa
     k = canvas.at_time(data, "snapshot", at)
     when = canvas.when_axis(data).text(float(data["snapshot"].values[k]))
     draw, hint = drawn_by(data, cut)
-    for name in [*unknown, *state]:
-        if name not in data:
-            continue
+    for name in filter(data.__contains__, [*unknown, *state]):
         title = f"{'Unknown field' if name in unknown else 'State'} {name}"
         deviates = f"{name}_std" in data and bool(data[f"{name}_std"].values[k].any())
         profile = draw is field_profile
