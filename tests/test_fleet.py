@@ -172,10 +172,10 @@ def compare(model, law, stream=samples, members=4, sensors=SENSORS, **options):
         ]
         assert_equal(estimate, others)
     for k, one in enumerate(separate):  # verdicts count failed steps and gaps of each
-        mine = fleet.identifier(k)
-        assert mine._steps.counts.tolist() == one._steps.counts.tolist()
+        mine, own = fleet.identifier(k)._so_far, one._so_far
+        assert mine.steps.counts.tolist() == own.steps.counts.tolist()
         for name in ("counts", "held", "unstated"):
-            assert getattr(mine._gaps, name).tolist() == getattr(one._gaps, name).tolist()
+            assert getattr(mine.gaps, name).tolist() == getattr(own.gaps, name).tolist()
     return fleet, estimate
 
 

@@ -106,7 +106,7 @@ def test_a_forecast_begins_where_nothing_was_measured_yet():
         identifier.forecast(1.0, {"heat": 1.0})
     inputs = {"T_end": 1.0, "heat": 1.0}
     found = identifier.forecast(0.5, inputs)
-    assert not identifier._inputs
+    assert not identifier._so_far.inputs
     with pytest.raises(lp.errors.MissingInputError):
         identifier.estimate()
     identifier.step(0.0, inputs)

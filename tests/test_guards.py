@@ -210,7 +210,7 @@ def test_a_log_that_is_continued_twice_keeps_both_apart():
     )
     taken = np.ones(1, dtype=bool)
     whole = np.ones(1, dtype=np.int64)
-    log = added(opened(empty_log(1, 1, 0), span), span, taken, whole)
+    log = added(opened(empty_log(1, 0), span), span, taken, whole)
     one, two = added(log, span, taken, whole), added(log, other, taken, whole)
     assert one[0, -1, 1] == 1.0
     assert two[0, -1, 1] == 2.0

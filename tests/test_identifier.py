@@ -43,7 +43,7 @@ def sample(t=0.1, **changes):
 
 def frozen(ident):
     """Everything that must not change when a sample is refused."""
-    return ident.t, ident._samples, ident._state
+    return ident.t, ident._so_far.samples, ident._state
 
 
 @pytest.mark.slow

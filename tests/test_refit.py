@@ -16,7 +16,8 @@ from scipy.special import erfc, erfcx
 
 import livepde as lp
 from livepde.laws import refit as refit_module
-from livepde.laws.refit import near_neighbours, refitted
+from livepde.laws.gate import near_neighbours
+from livepde.laws.refit import refitted
 from livepde.laws.stored_samples import StoredSamples
 from livepde.models import heat
 

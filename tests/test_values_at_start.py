@@ -63,7 +63,7 @@ def differences(start: float, end: float, begin: float, duration: float) -> floa
 def seen(who: lp.Identifier, t: float, z: dict[str, float]) -> float:
     """Return the reading at 0.9 that is predicted for the end of a step."""
     estimate = who.step(t, z)
-    moment = lp.fem.Moment(t, who._inputs)
+    moment = lp.fem.Moment(t, who._so_far.inputs)
     return float(who.observed.predict(estimate.u, estimate.q, moment)[0])
 
 

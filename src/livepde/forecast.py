@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from livepde.errors import SampleError
+from livepde.errors import SampleError, TimeOrderError
 from livepde.fem import Moment
 from livepde.laws import AnyLaw, Belief, Problem, Status
 from livepde.linalg import Array
 from livepde.observation import Observed
-from livepde.stepping import Interval
+from livepde.stepping import MOST_SUBSTEPS, Advance, Interval
 
-__all__ = ["Forecast", "ahead", "seen_rows"]
+__all__ = ["Forecast", "ahead", "future_times", "seen_rows"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -49,8 +49,24 @@ class Forecast:
             raise SampleError(
                 f"forecast: no sensor is called '{name}'; there are {list(self.names)}."
             )
-        column: Array = self.z[:, self.names.index(name)]
-        return column
+        return self.z[:, self.names.index(name)]
+
+
+def future_times(times: Array, given: object, t: float, control: Advance) -> list[float]:
+    """Return the times of a forecast after the last sample at t, checked; `given` as they were."""
+    if times.ndim != 1 or not np.isfinite(times).all():
+        raise SampleError(f"forecast: times must be finite numbers; got {given!r}.")
+    if not len(times) or times[0] < t or np.any(np.diff(times) <= 0.0):
+        raise TimeOrderError(
+            f"forecast: times must increase from the last sample at t = {t!r} on; got "
+            f"{times.tolist()}."
+        )
+    if any(map(control.stretches, np.diff(times, prepend=t).tolist())):
+        raise SampleError(
+            f"forecast: two times are more than {MOST_SUBSTEPS} substeps of dt_max = "
+            f"{control.dt_max:g} apart; give times in between, or a longer dt_max."
+        )
+    return [float(one) for one in times]
 
 
 def ahead(
@@ -63,10 +79,7 @@ def ahead(
 ) -> Forecast:
     """Return predicted readings at the ends of intervals, starting from the state of a law.
 
-    Parameters
-    ----------
-    intervals
-        Consecutive intervals; the first may have zero length.
+    The intervals are consecutive; the first may have zero length.
     """
     names = tuple(name for each in sensors for name in each.names)
     z, std = np.full((2, len(intervals), len(names)), np.nan)

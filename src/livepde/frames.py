@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -175,16 +175,40 @@ def draws(
     return q, belief.u + (0.0 if u_factor is None else xi @ u_factor.T)
 
 
-def prior_draws(
-    space: FunctionSpace, n: int, seed: int | np.random.Generator | None
-) -> dict[str, Array]:
-    """Return draws of the numbers among the unknowns from their priors, each of shape (n,)."""
+def draws_dataset(
+    model: Model, q: Array, u: Array, coordinates: Mapping[str, Sequence[float]]
+) -> xr.Dataset:
+    """Return draws of the coefficients as numbers, fields and state: see `Result.sample`."""
+    import xarray as xr
+
+    space, order = model.parameter_space, vertex_order(model)
+    numbers = {
+        label: ("draw", q[:, k], {"units": space.unknown_of(label).unit})
+        for label, k in space.labels.items()
+    }
+    fields: dict[str, Any] = {}
+    for of, values in ((space, q), (model.state_space, u)):
+        for name, block in of.fields.items():
+            names = block.variables(name)
+            parts = (block.at_vertices @ values[:, of.part(name)].T).reshape(len(names), -1, len(q))
+            fields |= {
+                key: (("draw", "vertex"), part[order].T)
+                for key, part in zip(names, parts, strict=True)
+            }
+    axes = {axis: ("vertex", np.array(x)) for axis, x in coordinates.items()}
+    return xr.Dataset({**numbers, **fields}, axes)
+
+
+def prior_draws(space: FunctionSpace, n: int, seed: int | np.random.Generator | None) -> xr.Dataset:
+    """Return draws of the numbers among the unknowns from their priors."""
+    import xarray as xr
+
     rng, found = np.random.default_rng(seed), {}
     for label in space.labels:
         prior = space.unknown_of(label).prior
         latent = prior.latent_mean + prior.latent_std * rng.standard_normal(n)
-        found[label] = np.clip(prior.transform.value(latent), *prior.bounds)
-    return found
+        found[label] = ("draw", np.clip(prior.transform.value(latent), *prior.bounds))
+    return xr.Dataset(found)
 
 
 def predictive(

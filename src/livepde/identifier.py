@@ -10,69 +10,44 @@ from dataclasses import replace
 from datetime import datetime
 from functools import cache, partial
 from itertools import pairwise
-from numbers import Real
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from livepde import checkpoint
 from livepde.checkpoint import Fingerprint, fingerprint
-from livepde.dates import origin_at, since_1970, stamp_of
-from livepde.errors import (
-    ConfigurationError,
-    LawError,
-    MissingInputError,
-    RunError,
-    SampleError,
-    TimeOrderError,
-)
+from livepde.dates import stamp_of
+from livepde.errors import ConfigurationError, MissingInputError, RunError, SampleError
 from livepde.fem import Inputs, Moment
-from livepde.forecast import Forecast, ahead, seen_rows
-from livepde.hindsight import Hindsight, LinearReadings
-from livepde.laws import (
-    AnyLaw,
-    Belief,
-    InitialReading,
-    Law,
-    Problem,
-    Report,
-    SensitivityLaw,
-    Status,
-    numerical,
-    stepped,
-)
+from livepde.forecast import Forecast, ahead, future_times, seen_rows
+from livepde.laws import AnyLaw, Belief, Report, SensitivityLaw, Status, numerical, stepped
 from livepde.laws.later import then
 from livepde.laws.step_diagnostics import Diagnostics
-from livepde.laws.verdict import StepLedger
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.model import Model
-from livepde.observation import Observation, Observed
-from livepde.records import Layout
-from livepde.result import Estimate, Result
-from livepde.samples import (
-    Channels,
-    Readings,
-    Sample,
-    check_noise,
-    is_tabular,
-    number,
-    numbers,
-    sample_of,
+from livepde.observation import Observation
+from livepde.result import Estimate
+from livepde.samples import Channels, Readings, numbers
+from livepde.showing import listed, options_of
+from livepde.start import (
+    check_ignored,
+    check_kinds,
+    check_parts,
+    check_start,
+    stated_problem,
+    time_option,
+    with_sensors,
 )
-from livepde.showing import Shown, listed, options_of
-from livepde.stepping import MOST_SUBSTEPS, Advance, Between, End, Held, Interval, Scheme
-from livepde.units import conversion
-from livepde.verdict import InputLedger, ValidationLedger, Verdict
-
-if TYPE_CHECKING:
-    import xarray as xr
+from livepde.stepping import Advance, Between, End, Held, Interval, Scheme
+from livepde.stream_runs import StreamRuns
+from livepde.taken import TakenSamples
+from livepde.verdict import Verdict
 
 FORMAT = 13  # of the checkpoint
-INPUTS = ("inputs", "known")  # of the last accepted sample, and those that hold now
 
 
-class Identifier(Shown):
+class Identifier(StreamRuns):
     """Identifies parameter and state of a model, sample by sample.
 
     Parameters
@@ -167,66 +142,50 @@ class Identifier(Shown):
         u0_errors: Iterable[Any] = (),
     ) -> None:
         law = SensitivityLaw() if law is None else law
-        _check_parts(model, observation, law)
-        t0, dt_max = _time("t0", t0), _time("dt_max", dt_max)
+        check_parts(model, observation, law)
+        check_kinds(validation, scheme)
+        t0, dt_max = time_option("t0", t0), time_option("dt_max", dt_max)
         if not dt_max > 0:
             raise ConfigurationError(f"dt_max must be positive; got {dt_max}.")
-        for what, part, kind, expected in (
-            ("validation", validation, Observation, "an observation, such as Points"),
-            ("scheme", scheme, Scheme, "a time scheme, such as Alexander2()"),
-        ):
-            if part is not None and not isinstance(part, kind):
-                raise ConfigurationError(f"{what}: got {part!r:.80}; expected {expected}.")
         u0_errors = tuple(u0_errors)
-        _check_start(model, t0, u0, {"u0_from": u0_from, "u0_errors": u0_errors})
+        check_start(model, t0, u0, {"u0_from": u0_from, "u0_errors": u0_errors})
         # Unknowns of the sensors, as an offset, join those of the model: laws treat both alike.
-        known = model.parameter_space.unknowns
-        own = {name: item for name, item in observation.unknowns.items() if name not in known}
-        model = model.with_unknowns(own) if own else model
-        self.model = model
+        self.model = model = with_sensors(model, observation)
         self.law = law
         spaces = (model.state_space, model.X, model.parameter_space)
-        self.observed: Observed = observation.bind(*spaces)
+        self.observed = observation.bind(*spaces)
         self.validation = validation.bind(*spaces) if validation is not None else None
         self.ignored = tuple(ignored)
-        known_names = self.validation.names if self.validation is not None else ()
-        for name in self.ignored:
-            if name not in known_names:
-                raise ConfigurationError(
-                    f"ignored: '{name}' is none of the sensors in validation, {list(known_names)}."
-                )
         self._channels = Channels(model.channels, self.observed, self.validation)
+        hidden = self._channels.hidden
+        check_ignored(self.ignored, hidden)
         # Positions of moving sensors are no inputs of the process: they move on lines.
-        held = Held.of(between or {}, [c for c in self.inputs if c not in self._optional_inputs])
+        optional = self._channels.optional
+        held = Held.of(between or {}, [c for c in self.inputs if c not in optional])
         # The first steps after the start are short where intervals have to hold their error.
         start = float(t0) if law.graded_start else math.nan
         control = Advance(scheme or law.scheme, dt_max, halvings, held, start=start)
-        noise, readings = (
-            self._input_noise(input_noise or {}),
-            self._initial_readings(u0_from or {}),
+        parts = model, self.observed, control, u0
+        self.problem = stated_problem(
+            *parts, input_noise=input_noise, u0_from=u0_from, u0_errors=u0_errors
         )
-        errors = self._initial_errors(u0_errors)
-        self.problem = Problem(model, self.observed, control, noise, readings, errors, u0)
-        self.assimilate_from = _time("assimilate_from", assimilate_from)
+        self.assimilate_from = time_option("assimilate_from", assimilate_from)
         self._work = law.prepare(self.problem)
         self._q0 = model.initial_parameter(q0)
         self._u0 = model.initial_values(0.0 if u0 is None else u0)
         self._stated = model.boundary_readings(u0)  # at t0
-        self._state: Any = None
-        self._t = float(t0)
-        self._origin = math.nan  # seconds from 1970 to t = 0, where times are dates
-        self._z = np.full(self.observed.size, np.nan)
-        self._inputs: Inputs = Inputs({})
-        self._known = self._inputs  # the same, or what holds since the sample of a failed step
-        self._samples = 0
         self._fingerprint = self._lazy_fingerprint()
-        self._validation = ValidationLedger.start(self.validation.size if self.validation else 0)
-        self._gaps = InputLedger.start(len(self.inputs))
-        self._steps = StepLedger.start()
+        sizes = self.observed.size, len(hidden), len(self.inputs)
+        self._so_far = TakenSamples.start(t0, *sizes)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Go back to the start, as far as the law is concerned."""
+        self._state: Any = None
         # Boundary values may come with the first sample; the initial state has to wait for them
         # then.
         if not self.inputs:
-            self._begin(self._inputs)
+            self._begin(self._so_far.inputs)
 
     def _shown(self) -> tuple[str, Mapping[str, str]]:
         _, model = self.model._shown()
@@ -237,10 +196,10 @@ class Identifier(Shown):
                 rows[kind] = listed(sensors.names)
         if self.inputs:
             rows["inputs"] = listed(self.inputs)
-        rows["time"] = f"{self._t:g} {self.model.time_unit}".rstrip()
+        rows["time"] = f"{self.t:g} {self.model.time_unit}".rstrip()
         if self.origin is not None:
             rows["time"] += f" since {self.origin} UTC"
-        return f"Identifier after {self._samples} samples", rows
+        return f"Identifier after {self._so_far.samples} samples", rows
 
     def _lazy_fingerprint(self) -> Callable[[], Fingerprint]:
         parts = self.law, self.problem, self.validation
@@ -263,70 +222,23 @@ class Identifier(Shown):
         `state` is None before the first sample; `ends` is that of one member in `Fleet.ends`.
         """
         other = copy.copy(self)
-        other._state, other._samples = state, samples
-        other._t, other._z = float(ends["t"]), ends["z"]
-        other._gaps = InputLedger(
-            ends["held_counts"].astype(np.int64), ends["held"], ends["unstated"]
-        )
-        other._steps = StepLedger(ends["steps"].astype(np.int64), np.zeros(2))
+        other._state = state
         names = self.inputs if state is not None else ()
-        other._inputs, other._known = (
-            Inputs(dict(zip(names, ends[part].tolist(), strict=bool(names)))) for part in INPUTS
-        )
+        other._so_far = self._so_far.placed(ends, names, samples)
         return other
-
-    def _input_noise(self, given: Mapping[str, float]) -> dict[str, float]:
-        """Return the noise of input channels, checked."""
-        stds: Mapping[str, Any] = given
-        for name, std in stds.items():
-            if name not in self.model.channels:
-                raise ConfigurationError(
-                    f"input_noise: the model has no channel '{name}'; it has "
-                    f"{list(self.model.channels)}. Specify the noise of sensors in the observation."
-                )
-            if not (isinstance(std, Real) and 0.0 < float(std) < math.inf):
-                raise ConfigurationError(
-                    f"input_noise of '{name}' must be a positive number; got {std!r}."
-                )
-        return dict(given)
-
-    def _initial_readings(self, u0_from: Mapping[str, Any]) -> dict[str, InitialReading]:
-        """Return the readings that u0 was made of, each with the derivative of u0 in it."""
-        known = {*self.observed.names, *self.model.channels}
-        for name in u0_from:
-            if name not in known:
-                raise ConfigurationError(
-                    f"u0_from: '{name}' is neither an assimilated sensor nor a channel of the "
-                    f"model; these are {sorted(known)}."
-                )
-        space = self.model.state_space
-        found = {}
-        for name, given in u0_from.items():
-            weight, noise = given if isinstance(given, tuple) else (given, math.nan)
-            found[name] = InitialReading(space.interpolate(weight), check_noise(name, noise))
-        return found
-
-    def _initial_errors(self, u0_errors: Iterable[Any]) -> Array:
-        """Return coefficients of the errors of u0, shape (errors, n)."""
-        space = self.model.state_space
-        found = np.array([space.interpolate(error) for error in u0_errors])
-        found = found.reshape(-1, self.model.X.dim)
-        if not np.isfinite(found).all():
-            raise ConfigurationError("u0_errors: an error of u0 is not finite; give finite values.")
-        return found
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Identifier:
         """Return an identifier that continues independently; model, law and matrices are shared."""
         other = copy.copy(self)
-        other._state, other._z = copy.deepcopy((self._state, self._z), memo)
+        other._state, other._so_far = copy.deepcopy((self._state, self._so_far), memo)
         return other
 
     def _begin(self, inputs: Inputs) -> None:
         self._state = self._start(inputs)
-        self._inputs = self._known = inputs
+        self._so_far = replace(self._so_far, inputs=inputs, known=inputs)
 
     def _start(self, inputs: Inputs) -> Any:
-        moment = Moment(self._t, inputs)
+        moment = Moment(self.t, inputs)
         if self.model.form_initial is not None:
             u0 = self.model.initial_state(self._q0, moment)
         else:
@@ -341,12 +253,7 @@ class Identifier(Shown):
     @property
     def t(self) -> float:
         """Time of the last accepted sample."""
-        return self._t
-
-    @property
-    def origin(self) -> datetime | None:
-        """The date of t = 0 in UTC, once a sample with a date was taken; the first is at t0."""
-        return None if math.isnan(self._origin) else origin_at(self._origin)
+        return self._so_far.t
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -357,11 +264,6 @@ class Identifier(Shown):
     def inputs(self) -> tuple[str, ...]:
         """Channels that the model and the sensors read."""
         return self._channels.inputs
-
-    @property
-    def _optional_inputs(self) -> frozenset[str]:
-        """Inputs that may be missing: positions of moving sensors."""
-        return self._channels.optional
 
     def step(
         self,
@@ -403,96 +305,37 @@ class Identifier(Shown):
         self, t: Any, z: Readings, inputs: Mapping[str, float] | None
     ) -> tuple[Estimate, Interval]:
         """Take one sample; return the estimate, and the interval that the law was given."""
-        t, origin = self._counted(t)
-        t = self._time_of_next(t)
+        t, origin = self._so_far.counted(t, self.model.time_unit)
+        t = self._so_far.time_of_next(t)
         measured, noise, validation, named = self._channels.parse(z, inputs)
-        if noise is not None:
-            self._check_weighs(noise)
+        self._check_weighs(noise)
         values, held = self._filled(named)
         unstated = self._begun_by(values, t) if self._state is None else ()
         # Spin-up: inputs drive the state, readings are only compared with it.
         used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
-        names, gaps = self._channels.inputs, {}
-        if names:
-            missing = np.array(list(map(held.__contains__, names)), dtype=float)
-            if held or np.count_nonzero(self._gaps.held):
-                gaps = self._gaps.gaps(names, missing)
+        before, names = self._so_far, self._channels.inputs
+        missing = np.array(list(map(held.__contains__, names)), dtype=float)
+        gaps = before.gaps.gaps(names, missing)
         now = End(t=t, inputs=values, z=used, noise=noise, gaps=gaps)
         # A first sample at the initial time has an empty interval: both ends are the sample.
-        interval = Interval.between(self._last if t > self._t else now, now)
+        interval = Interval.between(before.last if t > before.t else now, now)
         parts = self.law, self._work, self.problem
         self._state, report = stepped(*parts, self._state, interval)
-        self._samples += 1
-        self._origin = origin
-        stretched = self.problem.control.stretches(t - self._t)
-        self._steps = self._steps.add(report.status.code, t - self._t, stretched)
-        if report.status.taken:
-            if names:
-                self._gaps = self._gaps.add(t - self._t, missing)
-            self._t, self._z, self._inputs = t, used, values
-            self._known = values
-        else:  # a value that holds until the next reading may not be read again
-            last = {name: values[name] for name in self.problem.control.held.last}
-            self._known = Inputs({**self._known, **last})
+        self._so_far = before.after(now, report.status, missing, self.problem.control, origin)
         held = (*held, *unstated)
         estimate = self._estimate(t, measured, validation, values, report, held, scored=True)
         return estimate, replace(interval, parts=report.parts)
 
     def _filled(self, named: Mapping[str, float]) -> tuple[Inputs, tuple[str, ...]]:
         """Return all inputs, and those whose missing value is replaced by the last one."""
-        values, missing = self._channels.filled(named, self._known)
+        values, missing = self._channels.filled(named, self._so_far.known)
         # A value that holds until the next reading is not missing.
         known = self.problem.control.held.last
         return values, tuple(name for name in missing if name not in known) if known else missing
 
-    @property
-    def _last(self) -> End:
-        """The last accepted sample, where the next interval begins."""
-        return End(t=self._t, inputs=self._inputs, z=self._z)
-
-    def _counted(self, t: Any) -> tuple[Any, float]:
-        """Return a time in the unit of the model, and the origin from which a date counts."""
-        if type(t) is float or (stamp := stamp_of(t)) is None:
-            return t, self._origin
-        return self._since(stamp)
-
-    def _since(self, stamp: float) -> tuple[float, float]:
-        """Return the time of a date in seconds since 1970, and the origin from which it counts."""
-        unit = self.model.time_unit
-        if not unit:
-            raise ConfigurationError(
-                "the time is a date, and the model has no unit of time: name it, as in "
-                'Model(..., time_unit="s").'
-            )
-        second = conversion("s", unit, "time_unit").factor
-        if not self._samples:
-            return self._t, stamp - self._t / second
-        if math.isnan(self._origin):
-            raise SampleError(
-                "the time is a date, and those of the samples before are numbers: give numbers."
-            )
-        return (stamp - self._origin) * second, self._origin
-
-    def _time_of_next(self, t: float) -> float:
-        """Return the time of the next sample, checked; only the first may be at the start."""
-        if type(t) is not float or not math.isfinite(t):
-            t = number(t, "time t")
-            if math.isnan(t):
-                raise SampleError("time t is NaN; give the time of the sample.")
-        if t < self._t and not self._samples:
-            raise TimeOrderError(
-                f"the sample at t = {t!r} is before the initial time t0 = {self._t!r}: set `t0`."
-            )
-        if t < self._t or (t == self._t and self._samples):
-            raise TimeOrderError(
-                f"the sample at t = {t!r} is not later than the last one at t = {self._t!r}: "
-                "sort the stream, and drop repeated samples."
-            )
-        return t
-
     def _opening(self, inputs: Inputs, t: float) -> Inputs:
         """Return the inputs at the initial time, from those at t of the first sample."""
-        if t == self._t or not self._stated:
+        if t == self.t or not self._stated:
             return inputs
         return Inputs({**inputs, **self._stated})
 
@@ -515,27 +358,22 @@ class Identifier(Shown):
                 f"the sample at t = {t:g} gives no finite initial state: check the values of its "
                 f"inputs {list(self.inputs)}; the run begins with the next one."
             )
-        self._state, self._inputs, self._known = state, inputs, inputs
+        self._state = state
         # The mean over the first interval comes with its end.
         known = {*self._stated, *self.problem.control.held.next}
         missing = [name for name in self.model.channels if name not in known]
-        unstated = tuple(missing) if t > self._t else ()
-        mask = np.array([name in unstated for name in self.inputs], dtype=float)
-        self._gaps = replace(self._gaps, unstated=mask)
+        unstated = tuple(missing) if t > self.t else ()
+        self._so_far = self._so_far.begun(inputs, unstated, self.inputs)
         return unstated
 
     @property
-    def _place(self) -> tuple[Any, ...]:
+    def _place(self) -> tuple[Any, TakenSamples]:
         """Snapshot for `return_to`, of values that a step replaces but never changes in place."""
-        ledgers = self._validation, self._gaps, self._steps, self._origin
-        inputs = self._inputs, self._known
-        return self._state, self._t, self._z, inputs, self._samples, ledgers
+        return self._state, self._so_far
 
-    def _return_to(self, place: tuple[Any, ...]) -> None:
+    def _return_to(self, place: tuple[Any, TakenSamples]) -> None:
         """Go back to a snapshot by `place`, as if no sample had been taken since then."""
-        self._state, self._t, self._z, inputs, self._samples, ledgers = place
-        self._inputs, self._known = inputs
-        self._validation, self._gaps, self._steps, self._origin = ledgers
+        self._state, self._so_far = place
 
     def _check_weighs(self, noise: Array | None) -> None:
         """Refuse the noise of readings where the law does not weigh them; None: there is none."""
@@ -581,7 +419,8 @@ class Identifier(Shown):
                 # Of the predicted values, without the noise of the sensors.
                 rows = seen_rows(self.validation, belief, Moment(t, inputs))
                 variance = np.zeros(len(error)) if rows is None else (rows * rows).sum(axis=1)
-                self._validation = self._validation.add(validation, predicted, variance)
+                scores = self._so_far.validation.add(validation, predicted, variance)
+                self._so_far = replace(self._so_far, validation=scores)
         return Estimate.deferred(
             read,
             t=t,
@@ -601,7 +440,8 @@ class Identifier(Shown):
         self, judge: Callable[[], Verdict], diagnose: Callable[[], Diagnostics[float]]
     ) -> Callable[[], Verdict]:
         """Return the verdict of the law with the findings on steps, validation sensors and gaps."""
-        validation, gaps, steps = self._validation, self._gaps, self._steps
+        taken = self._so_far
+        validation, gaps, steps = taken.validation, taken.gaps, taken.steps
         known, ignored = self.validation, self.ignored
         names, units = ((), ()) if known is None else (known.names, known.units)
         inputs = self._channels.inputs
@@ -631,11 +471,11 @@ class Identifier(Shown):
         nothing = np.full(self.observed.size, np.nan)
         hidden = np.full(self.validation.size if self.validation else 0, np.nan)
         belief = self._belief()
-        moment = Moment(self._t, self._inputs)
-        predicted = self.observed.predict(belief.u, belief.q, moment)
+        taken = self._so_far
+        predicted = self.observed.predict(belief.u, belief.q, Moment(taken.t, taken.inputs))
         known = partial(self.law.diagnosed, self._work, self._state)
         report = Report(Status(), predicted, diagnose=known)
-        return self._estimate(self._t, nothing, hidden, self._inputs, report, ())
+        return self._estimate(taken.t, nothing, hidden, taken.inputs, report, ())
 
     def _settled(self, estimate: Estimate, *, columns: bool = True) -> Estimate:
         """Return the last estimate after a fit of all stored samples, for the end of a run.
@@ -719,250 +559,22 @@ class Identifier(Shown):
         >>> rod.forecast([1.0, 2.0])["middle"].round(6)
         array([20., 20.])
         """
+        taken, unit = self._so_far, self.model.time_unit
+        given: Any = times
         if np.iterable(times) and stamp_of(next(iter(times), None)) is not None:
-            times = [self._counted(time)[0] for time in times]
-        t = np.atleast_1d(numbers(self._counted(times)[0], "forecast: times"))
-        if t.ndim != 1 or not np.isfinite(t).all():
-            raise SampleError(f"forecast: times must be finite numbers; got {times!r}.")
-        if not len(t) or t[0] < self._t or np.any(np.diff(t) <= 0.0):
-            raise TimeOrderError(
-                f"forecast: times must increase from the last sample at t = {self._t!r} on; got "
-                f"{t.tolist()}."
-            )
-        far = np.diff(t, prepend=self._t)
-        if any(map(self.problem.control.stretches, far.tolist())):
-            raise SampleError(
-                f"forecast: two times are more than {MOST_SUBSTEPS} substeps of dt_max = "
-                f"{self.problem.control.dt_max:g} apart; give times in between, or a longer dt_max."
-            )
-        planned = self._channels.planned(inputs, t.tolist(), self._t, self._known)
-        state, last = self._state, self._last
+            given = [taken.counted(time, unit)[0] for time in times]
+        found = np.atleast_1d(numbers(taken.counted(given, unit)[0], "forecast: times"))
+        t = future_times(found, given, taken.t, self.problem.control)
+        planned = self._channels.planned(inputs, t, taken.t, taken.known)
+        state, last = self._state, taken.last
         if state is None:
-            opening = self._opening(planned[0], float(t[0]))
+            opening = self._opening(planned[0], t[0])
             state, last = self._start(opening), replace(last, inputs=opening)
         blank = np.full(self.observed.size, np.nan)
-        ends = [
-            End(t=when, inputs=then, z=blank)
-            for when, then in zip(t.tolist(), planned, strict=True)
-        ]
+        ends = [End(t=when, inputs=then, z=blank) for when, then in zip(t, planned, strict=True)]
         intervals = [Interval.between(start, stop) for start, stop in pairwise([last, *ends])]
         sensors = self._channels.sensors
         return ahead(self.law, self._work, self.problem, sensors, state, intervals)
-
-    def run(
-        self,
-        stream: Any,
-        *,
-        on_estimate: Callable[[Estimate], object] | None = None,
-        progress: bool = False,
-        total: int | None = None,
-        fields_every: int = 1,
-        time: str | None = None,
-        time_unit: str | None = None,
-        columns: Mapping[str, str] | None = None,
-        units: Mapping[str, str] | None = None,
-        strict: bool | None = None,
-    ) -> Result:
-        """Take every sample of a table, a file or a stream, and collect the estimates.
-
-        Parameters
-        ----------
-        stream
-            A pandas table or an xarray dataset with a column for each channel; the name of a file
-            (`.csv`, `.jsonl`, `.parquet`); or an iterable of (t, z), (t, z, inputs) or `Sample`.
-            Times are numbers or dates; the first date is at t0. Dates without a zone are in UTC.
-        on_estimate
-            Called with each estimate before the next sample is asked for: a controller, say. Its
-            return value is ignored; an exception ends the run.
-        progress
-            Show a bar with rate and time left.
-        total
-            Number of samples, for the time left; default len(stream) if it has one.
-        fields_every
-            Keep the fields of every so many samples (scalars and innovations of all).
-        time
-            Column of the times; this and the options below are of tables and files. Default: the
-            index of a table, the coordinate of a dataset, or the one column that is called time,
-            date or the like.
-        time_unit
-            Unit of times that are numbers; default that of the model. Required if the name of
-            their column has another one, such as time_min.
-        columns
-            Channel -> name of its column, where they differ: {"T_10": "TS_3_2_1"}.
-        units
-            Sensor -> unit of its column, where that is not the unit of the sensor.
-        strict
-            Refuse columns that are no channel; by default they are ignored.
-
-        Raises
-        ------
-        DataError
-            A channel without a column; text or infinity in one; times that do not increase.
-        ConfigurationError
-            Options that do not fit; dates for a model without `time_unit`.
-
-        Examples
-        --------
-        >>> import pandas as pd
-        >>> import livepde as lp
-        >>> from livepde.models import heat
-        >>> model = heat(lp.interval(0.0, 1.0, 20), lp.Normal(0.1, std=0.05))
-        >>> rod = lp.Identifier(model, lp.Points({"middle": 0.5}, noise=0.1), u0=20.0)
-        >>> table = pd.DataFrame({"middle": [20.0, 20.1]}, index=[1.0, 2.0])
-        >>> len(rod.run(table))
-        2
-        """
-        options: dict[str, Any] = {"time": time, "time_unit": time_unit, "columns": columns}
-        options |= {"units": units, "strict": strict}
-        given = {name: value for name, value in options.items() if value is not None}
-        stream = self._samples_of(stream, given)
-        result = Result(
-            self.model, self.observed, self.validation, fields_every, ignored=self.ignored
-        )
-        begun, taken = copy.copy(self), list[Sample]()  # states of laws are values
-        result.smoother = partial(begun.smoothed, taken, fields_every=fields_every)
-        result.readings = partial(self._channels.readings, taken)
-        if progress:
-            from livepde.progress import watched
-
-            size = total if total is not None else getattr(stream, "__len__", lambda: None)()
-            stream = watched(stream, size)
-        for item in stream:
-            sample = sample_of(item)
-            estimate = self.step(sample.t, sample.z, sample.inputs)
-            if not len(result):
-                result.layout = self._dated(result.layout)
-            result.add(estimate)
-            taken.append(Sample(t=sample.t, z=copy.copy(sample.z), inputs=copy.copy(sample.inputs)))
-            if on_estimate is not None:
-                on_estimate(estimate)
-        if result.last is not None:
-            result._settle(self._settled(result.last))
-            noise = self.law.reading_noise(self._work, self._state)
-            if noise is not None and not begun._samples and not self.model.latent.moves:
-                result.expected = partial(begun._expected, taken, noise)
-        return result
-
-    def _samples_of(self, data: Any, reading: Mapping[str, Any]) -> Iterable[Any]:
-        """Return a stream as it is, and the samples of a table with times of the model."""
-        if not is_tabular(data):
-            if reading:
-                raise ConfigurationError(
-                    f"run: {next(iter(reading))} describes a table or a file; got "
-                    f"{type(data).__name__}."
-                )
-            return cast("Iterable[Any]", data)
-        from livepde.streams.given import Reading
-
-        optional = [name for name in self.inputs if name in self._optional_inputs]
-        needed = [name for name in self.channels if name not in optional]
-        units = {
-            name: unit
-            for sensors in self._channels.sensors
-            for name, unit in zip(sensors.names, sensors.units, strict=True)
-        }
-        how = Reading(
-            channels=needed,
-            optional=[*optional, *self._channels.noise],
-            unit=self.model.time_unit,
-            sensor_units=units,
-            **reading,
-        )
-        table = how.table(data)
-        if table.origin is None:
-            return table
-        t0, self._origin = self._since(since_1970(table.origin))
-        return replace(table, t=table.t + t0)
-
-    def _dated(self, layout: Layout) -> Layout:
-        """Return the layout of a run with the date of t = 0, if times are dates."""
-        if self.origin is None:
-            return layout
-        return replace(layout, attrs={**layout.attrs, "origin": self.origin.isoformat(sep=" ")})
-
-    @property
-    def _unsmoothed(self) -> str:
-        """Why the law smooths nothing; empty if it does."""
-        return self.law.unsmoothed(self._work)
-
-    def smoothed(self, stream: Any, *, fields_every: int = 1) -> xr.Dataset:
-        """Return the smoothed unknowns and state at each sample of a run, given all of them.
-
-        A fixed-interval smoother: see `livepde.laws.smoother`. All samples are taken by a copy of
-        this identifier, as in a run, and then at least once more; this one stays as it is.
-
-        Parameters
-        ----------
-        stream, fields_every
-            As for `run`.
-
-        Returns
-        -------
-        smoothed
-            As `Result.to_xarray` of the run, without innovations. A constant unknown
-            has one value at all times: the last one.
-
-        Raises
-        ------
-        ConfigurationError
-            An identifier that has taken a sample.
-        LawError
-            A law without a covariance that a smoother could follow.
-        """
-        if self._samples:
-            raise ConfigurationError(
-                "smoothed takes a run from its first sample on: call it of an identifier that has "
-                "taken none."
-            )
-        if why := self._unsmoothed:
-            raise LawError(f"smoothed: {why}; use SensitivityLaw.")
-        stream = self._samples_of(stream, {})
-        who, run, before = copy.copy(self), Hindsight(self._q0), self._state
-        for item in stream:
-            sample = sample_of(item)
-            estimate, interval = who._taken(sample.t, sample.z, sample.inputs)
-            if before is None:  # the law begins with the first sample
-                before = self._start(Inputs(interval.inputs0))
-            run.add(estimate, interval, who._latent_belief().q)
-        result = Result(
-            self.model, self.observed, self.validation, fields_every, ignored=self.ignored
-        )
-        result.layout = who._dated(result.layout)
-        data = run.fixed_interval(fields_every)
-        beliefs = data and self.law.smoothed(self._work, before, who._state, data)
-        return run.dataset(result, self.problem, beliefs or ())
-
-    def _expected(
-        self, samples: Iterable[Sample], noise: Array, q: Array, draws: Array
-    ) -> tuple[Array, Array]:
-        """Return readings that draws of the unknowns lead to, and their standard deviation.
-
-        Linear about q, shape (m,), for draws of shape (n, m): the samples are taken again from
-        there, without their readings. Shapes (n, samples, sensors) and (samples, sensors); NaN
-        where a step fails.
-        """
-        latent = self.model.latent
-        centre = latent.inverse(q)
-        found = LinearReadings(np.array([latent.inverse(draw) for draw in draws]) - centre)
-        who = self._started(centre, self._u0, self.problem.initial_errors)
-        who._state = None
-        if not who.inputs:
-            who._begin(who._inputs)
-        nothing = np.full(self.observed.size, np.nan)
-        for sample in samples:
-            _, own, _, named = self._channels.parse(sample.z, sample.inputs)
-            inputs = {name: named[name] for name in self.inputs if name in named}
-            estimate, interval = who._taken(sample.t, nothing, inputs)
-            std = noise if own is None else np.where(np.isnan(own), noise, own)
-            used = estimate.status.ok and estimate.t >= self.assimilate_from
-            latent_factor = who._latent_belief().q_factor
-            belief = who._belief()
-            predicted = self.observed.predict(belief.u, belief.q, interval.end)
-            rows = seen_rows(self.observed, belief, interval.end)
-            if latent_factor is None or rows is None:
-                raise LawError(f"{type(self.law).__name__} has no covariance: use SensitivityLaw.")
-            found.add(predicted, rows, latent_factor, std if used else nothing)
-        return found.readings, found.std
 
     @property
     def fingerprint(self) -> Fingerprint:
@@ -986,22 +598,7 @@ class Identifier(Shown):
     def dump(self) -> bytes:
         """Return the state as `save` writes it."""
         header = {**self._header(), "begun": self._state is not None}
-        leaves = {
-            "t": self._t,
-            "z": self._z,
-            "samples": self._samples,
-            "inputs": np.array([self._inputs[c] for c in self._inputs]),
-            "known": np.array([self._known[c] for c in self._known]),
-            "validation": self._validation.sums,
-            "validation_last": self._validation.last,
-            "held_counts": self._gaps.counts,
-            "held": self._gaps.held,
-            "steps": self._steps.counts,
-            "lengths": self._steps.lengths,
-            "origin": self._origin,
-            "unstated": self._gaps.unstated,
-            **self.fingerprint.leaves,
-        }
+        leaves = self._so_far.leaves | self.fingerprint.leaves
         if self._state is not None:
             leaves |= checkpoint.flatten(self._state)
         return checkpoint.packed(header, leaves)
@@ -1040,20 +637,7 @@ class Identifier(Shown):
             )
         state = None
         try:
-            t, samples = float(leaves["t"]), int(leaves["samples"])
-            origin = float(leaves["origin"])
-            z = checkpoint.rebuild(self._z, leaves, "z")
-            validation = ValidationLedger(leaves["validation"], leaves["validation_last"])
-            gaps = InputLedger(
-                counts=leaves["held_counts"].astype(np.int64),
-                held=leaves["held"],
-                unstated=leaves["unstated"],
-            )
-            steps = StepLedger(leaves["steps"].astype(np.int64), leaves["lengths"])
-            names = self.inputs if len(leaves["inputs"]) else ()
-            inputs, known = (
-                Inputs(dict(zip(names, leaves[part].tolist(), strict=True))) for part in INPUTS
-            )
+            taken = self._so_far.restored(leaves, self.inputs)
             if header["begun"]:
                 template = self.law.init(self._work, self._q0, self._u0)
                 state = checkpoint.rebuild(template, leaves)
@@ -1062,39 +646,6 @@ class Identifier(Shown):
                 f"{where} does not fit this identifier ({error}): build it with the law's options "
                 "as they were when it was saved."
             ) from error
-        self._t, self._samples, self._z, self._origin = t, samples, z, origin
-        self._inputs, self._known = inputs, known
-        self._state, self._validation, self._gaps, self._steps = state, validation, gaps, steps
+        self._state, self._so_far = state, taken
         if state is None and not self.inputs:
-            self._begin(inputs)
-
-
-def _check_parts(*parts: object) -> None:
-    """Refuse what is not a model, an observation and a law, in this order."""
-    for part, kind in zip(parts, (Model, Observation, Law), strict=True):
-        if not isinstance(part, kind):
-            remedy = ": call it" if isinstance(part, type) and issubclass(part, kind) else ""
-            raise ConfigurationError(
-                "Identifier(model, observation, law): as "
-                f"{kind.__name__.lower()}, got {part!r:.80}{remedy}."
-            )
-
-
-def _time(name: str, value: Any) -> float:
-    """Return a time or duration of the options."""
-    if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf" or math.isnan(value):
-        raise ConfigurationError(
-            f"{name} must be a number, in the unit of time of the model; got {value!r}."
-        )
-    return float(value)
-
-
-def _check_start(model: Model, t0: float, u0: Any, uncertain: Mapping[str, Any]) -> None:
-    """Refuse an initial time that is not finite, and an initial state given twice or not at all."""
-    if not np.isfinite(t0):
-        raise ConfigurationError(f"t0 must be a finite number; got {t0}.")
-    for name, given in uncertain.items():
-        if given and u0 is None:
-            raise ConfigurationError(f"{name} describes u0: give u0, too.")
-    if u0 is not None and model.form_initial is not None:
-        raise ConfigurationError("the model has its own initial state (initial=): leave out u0.")
+            self._begin(taken.inputs)

@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 import scipy.sparse as sp
 
+from livepde.diffusion import negative_diffusion
 from livepde.errors import ConfigurationError, ModelError, NameClashError
 from livepde.fem import (
     START,
@@ -175,31 +176,19 @@ class Model(Shown):
         self._check_parameter()
         _ = self.state_space.fixed  # refuses boundary values that do not fit their field
         x, q = self.state_space, self.parameter_space
-        pair, triple = {"u": x, "v": x}, {"q": q, "u": x, "v": x}
+        pair = {"u": x, "v": x}
         self.form_M = self._form("M", x.product if M is None else M, pair)
         self.form_B = self._form("B", B, pair, "u", dB)
         self.latent = Latent(q)
-        # A in the parameter as forms see it; `form_A` is the same in latent coefficients.
-        computed = self._coefficients(coefficients, dA)
-        terms = A if computed is None else computed.expanded(A)
-        self.physical_A = self.linear_A = self._form("A", terms, triple, "u", dA, "q")
-        # Numbers computed from the unknowns, and A in both; None if there are none.
-        self.coefficients = computed if computed is not None and computed.numeric else None
-        self.computed = () if computed is None else tuple(computed.names)  # what A reads besides q
-        if self.coefficients is not None:
-            more = triple | {"q": self.coefficients.space}
-            self.linear_A = self._form("A", A, more, "u", None, "q")
-        self.form_A = compose(self.physical_A, self.latent)
+        self._set_A(A, dA, coefficients)
         sources = f if isinstance(f, Sequence) else [f]
         integrands = [source_density(item, x) for item in sources]
         self.form_F = self._form("f", integrands, {"v": x})
         self._source: tuple[Mapping[str, float] | None, Array] | None = None
         self.form_initial: Form | Composed | None = None
         if initial is not None:
-            pair = {"q": q, "v": x}
-            self.form_initial = compose(
-                self._form("initial", initial, pair, parameter="q"), self.latent
-            )
+            form = self._form("initial", initial, {"q": q, "v": x}, parameter="q")
+            self.form_initial = compose(form, self.latent)
         self._check_diffusion()
         if not self.form_M.constant:
             raise ModelError("M may not depend on time or inputs: move the change into B or f.")
@@ -213,22 +202,29 @@ class Model(Shown):
                 rows[f"state {name}"] += f", Dirichlet values {block.field.boundary_text}"
         formula = self._about["formula"]
         rows["equation"] = formula or _equation(self._parts)
-        for name, what in {"M": "mass M(u, v)", "initial": "initial state"}.items():
-            if self._parts[name] is not None and not (formula and name == "M"):
+        shown = {} if formula else {"M": "mass M(u, v)"}
+        for name, what in {**shown, "initial": "initial state"}.items():
+            if self._parts[name] is not None:
                 rows[what] = " + ".join(_terms(self._parts[name]))
-        for name, unknown in self.parameter_space.unknowns.items():
-            of = f"field, {type(unknown.element).__name__}, " if isinstance(unknown, Field) else ""
-            many = [label for label in self.parameter_space.labels if label.startswith(f"{name}[")]
-            named = f" for each of {listed(many)}" if many else ""
-            prior = f"{of}{unknown.prior.text} {unknown.unit}".rstrip()
-            rows[f"unknown {name}"] = prior + named
+        for name in self.parameter_space.unknowns:
+            rows[f"unknown {name}"] = self._prior_text(name)
         if self.inputs:
             rows["inputs"] = listed(self.inputs)
-        ends = zip("xyz", self.mesh.p.min(axis=1), self.mesh.p.max(axis=1), strict=False)
-        extent = ", ".join(f"{axis} from {low:g} to {high:g}" for axis, low, high in ends)
-        rows["mesh"] = f"{self.mesh.nelements} cells, {extent} {self.length_unit}".rstrip()
+        rows["mesh"] = f"{self.mesh.nelements} cells, {self._extent} {self.length_unit}".rstrip()
         rows["unit of time"] = self.time_unit or "not stated"
         return f"Model with {self.X.dim} state coefficients, {self.Q.dim} of unknowns", rows
+
+    @property
+    def _extent(self) -> str:
+        ends = zip("xyz", self.mesh.p.min(axis=1), self.mesh.p.max(axis=1), strict=False)
+        return ", ".join(f"{axis} from {low:g} to {high:g}" for axis, low, high in ends)
+
+    def _prior_text(self, name: str) -> str:
+        unknown = self.parameter_space.unknowns[name]
+        of = f"field, {type(unknown.element).__name__}, " if isinstance(unknown, Field) else ""
+        many = [label for label in self.parameter_space.labels if label.startswith(f"{name}[")]
+        named = f" for each of {listed(many)}" if many else ""
+        return f"{of}{unknown.prior.text} {unknown.unit}".rstrip() + named
 
     def __copy__(self) -> Model:
         return self  # it never changes
@@ -237,13 +233,7 @@ class Model(Shown):
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return how pickle builds it again: from what it was made of.
-
-        Raises
-        ------
-        ConfigurationError
-            A function that pickle cannot find by its name.
-        """
+        """Return how pickle builds it again: from what it was made of."""
         parts = self.state, self.parameter, self._parts
         try:
             pickle.dumps(parts)
@@ -268,6 +258,26 @@ class Model(Shown):
         mesh, order, inputs = self.mesh, self.order, self.inputs
         return Form(name, integrands, spaces, mesh, order, nonlinear, derivative, inputs, parameter)
 
+    def _set_A(
+        self,
+        A: Integrand | On | Sequence[Integrand | On],
+        dA: Integrand | Sequence[Integrand] | None,
+        coefficients: Callable[[Any], Mapping[str, Any]] | None,
+    ) -> None:
+        """Set A in the parameter as forms see it; `form_A` is the same in latent coefficients."""
+        x = self.state_space
+        spaces = {"q": self.parameter_space, "u": x, "v": x}
+        computed = self._coefficients(coefficients, dA)
+        terms = computed.expanded(A) if computed else A
+        self.physical_A = self.linear_A = self._form("A", terms, spaces, "u", dA, "q")
+        # Numbers computed from the unknowns, and A in both; None if there are none.
+        self.coefficients = computed if computed and computed.numeric else None
+        self.computed = tuple(computed.names) if computed else ()  # what A reads besides q
+        if self.coefficients is not None:
+            more = spaces | {"q": self.coefficients.space}
+            self.linear_A = self._form("A", A, more, "u", None, "q")
+        self.form_A = compose(self.physical_A, self.latent)
+
     def _coefficients(
         self, function: Callable[[Any], Mapping[str, Any]] | None, dA: Any
     ) -> Coefficients | None:
@@ -285,10 +295,7 @@ class Model(Shown):
     def with_unknowns(self, more: Mapping[str, Unknown]) -> Model:
         """Return the same process with more unknowns, such as those of sensors, not in its forms.
 
-        Raises
-        ------
-        ModelError
-            This model has one unknown without a name, or a name is taken.
+        Raises `ModelError`: this model has one unknown without a name, or a name is taken.
         """
         space = self.parameter_space
         taken = sorted(set(space.names) & set(more))
@@ -308,10 +315,7 @@ class Model(Shown):
 
         `inputs` are the names of the channels that these read.
 
-        Raises
-        ------
-        ModelError
-            The derivative of A or B was given and would lack that of the terms.
+        Raises `ModelError`: the derivative of A or B was given and would lack that of the terms.
         """
         parts = dict(self._parts)
         for name, more in (("A", A), ("B", B)):
@@ -326,13 +330,7 @@ class Model(Shown):
         return Model(self.state, self.parameter, **parts, **about)
 
     def with_constant_inputs(self, values: Mapping[str, float]) -> Model:
-        """Return the same process with constants instead of some of its inputs.
-
-        Raises
-        ------
-        ModelError
-            The process has no such input.
-        """
+        """Return the same process with constants instead of some of its inputs."""
         if other := sorted(set(values) - set(self.inputs)):
             raise ModelError(
                 f"with_constant_inputs: the model has no input '{other[0]}'; it has "
@@ -356,10 +354,7 @@ class Model(Shown):
     def refined(self) -> Model:
         """Return the same process on a mesh whose elements are halved in every direction.
 
-        Raises
-        ------
-        ModelError, SpaceError
-            Something that was given belongs to this mesh alone.
+        Raises `ModelError` or `SpaceError`: something that was given belongs to this mesh alone.
         """
         mesh = halved(self.mesh)
 
@@ -384,8 +379,10 @@ class Model(Shown):
 
     def _check_diffusion(self) -> None:
         """Warn of a diffusion that is negative everywhere at the prior mean: u_t = -k u_xx."""
+        components, A, B = list(self.state_space.blocks), self.physical_A, self.form_B
         for name in self.state_space.fields:
-            if self._grows(name):
+            number = components.index(name)
+            if negative_diffusion(self.form_M, A, B, self.parameter_space.prior, number):
                 what = "the model" if self.state_space.single else f"'{name}'"
                 warnings.warn(
                     f"the diffusion of {what} is negative at the prior mean, which is ill-posed: "
@@ -393,42 +390,6 @@ class Model(Shown):
                     "term is + k * dot(grad(u), grad(v)): change its sign in A or B.",
                     stacklevel=4,
                 )
-
-    def _grows(self, name: str) -> bool:
-        """Return whether a component has negative diffusion in a direction, on all of the mesh.
-
-        Not where other components or higher derivatives may make up for it, nor for a component
-        without a change in time, whose sign is free.
-        """
-        mine = list(self.state_space.blocks).index(name)
-        owners = self.form_M.owners("u")
-        values = [k for k, owner in enumerate(owners) if owner == (mine, "value")]
-        masses = [self.form_M.factor(k, k, 0.0) for k in values]
-        if all((mass >= 0.0).all() and (mass > 0.0).any() for mass in masses):
-            sign = 1.0
-        elif all((mass <= 0.0).all() and (mass < 0.0).any() for mass in masses):
-            sign = -1.0
-        else:
-            return False
-        slopes = [k for k, (_, part) in enumerate(owners) if part == "grad"]
-        own = [k for k in slopes if owners[k][0] == mine]
-        levels = (0.1, 1.0, 10.0)  # of a diffusivity that depends on u
-        growing = [k for k in own if all(self._negative(sign, k, u) for u in levels)]
-        if not growing:
-            return False
-        others = [k for k in slopes if owners[k][0] != mine]
-        coupled = [(k, k) for k, (_, part) in enumerate(owners) if part not in ("value", "grad")]
-        coupled += [pair for k in growing for j in others for pair in ((k, j), (j, k))]
-        return not any(self._pairing(*pair, 1.0).any() for pair in coupled)
-
-    def _pairing(self, of: int, tested: int, u: float) -> Array:
-        """Return the factor of two components in A and B, at the prior mean of the unknowns."""
-        A = self.physical_A.factor(of, tested, u, q=self.parameter_space.prior)
-        return A + self.form_B.factor(of, tested, u)
-
-    def _negative(self, sign: float, k: int, u: float) -> bool:
-        factors = sign * self._pairing(k, k, u)
-        return bool((factors < 0.0).any() and (factors <= 0.0).all())
 
     def _check_names(self) -> None:
         """Refuse names that a run's dataset could not distinguish."""
@@ -690,7 +651,6 @@ class Model(Shown):
 
 
 def _terms(given: Any) -> list[str]:
-    """Return the terms of a form as text."""
     terms = given if isinstance(given, Sequence) else [given]
     return [
         f"{_terms(one.form)[0]} on {one.name!r}" if isinstance(one, On) else expression(one)

@@ -8,8 +8,12 @@ from typing import Any
 from rich.console import Console
 
 
-def watched(stream: Iterable[Any], total: int | None, what: str = "samples") -> Iterator[Any]:
-    """Yield the items of a stream behind a bar on standard error."""
+def watched(
+    stream: Iterable[Any], total: int | None = None, what: str = "samples"
+) -> Iterator[Any]:
+    """Yield the items of a stream behind a bar on standard error; `total`: default its length."""
+    if total is None:
+        total = getattr(stream, "__len__", lambda: None)()
     console = Console(stderr=True)
     if not console.is_terminal:
         yield from stream

@@ -172,6 +172,31 @@ def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
             yield flat(label, left)
 
 
+def marginals_at(
+    name: str,
+    points: ArrayLike,
+    space: FunctionSpace,
+    coefficients: Array,
+    deviation: Callable[[Any, slice], Array | None],
+) -> Marginal:
+    """Return the marginals of the values of a field of a space at points.
+
+    `deviation` returns the standard deviation of rows @ coefficients[part], None if unknown.
+    """
+    block, part, unknown = space.fields[name], space.part(name), space.unknown_of(name)
+    at, one = coordinates_of(points, len(block.box[0]), name)
+    rows = block.probe(at, f"estimate['{name}'].at: point")
+    values, std = rows @ coefficients[part], deviation(rows, part)
+    std = np.full_like(values, np.nan) if std is None else std
+    shape = () if one else (at.shape[1],)
+    if block.vector:
+        values, std = (x.reshape(-1, at.shape[1]).T for x in (values, std))
+        shape = (*shape, values.shape[1])
+    if not shape:
+        return Marginal(float(values[0]), float(std[0]), unknown)
+    return Marginal(values.reshape(shape), std.reshape(shape), unknown)
+
+
 def coordinates_of(points: ArrayLike, axes: int, name: str) -> tuple[Array, bool]:
     """Return coordinates of points, shape (axes, points), and whether one point is meant."""
     try:

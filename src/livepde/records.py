@@ -153,7 +153,6 @@ class RecordArrays:
         return len(self._t)
 
     def append(self, record: Record, /) -> None:
-        """Keep one more."""
         count = len(self._t)
         # All is converted before anything is kept: a value that is no number changes nothing.
         notes = {name: float(value) for name, value in record.notes.items()}
@@ -204,7 +203,6 @@ class RecordArrays:
 
     @property
     def t(self) -> Array:
-        """Times, shape (samples,)."""
         return _array(self._t)
 
     @property
@@ -214,12 +212,10 @@ class RecordArrays:
 
     @property
     def innovation(self) -> Array:
-        """Innovations, shape (samples, sensors)."""
         return self._table(self._innovation)
 
     @property
     def validation_error(self) -> Array:
-        """Errors of the validation sensors, shape (samples, validation)."""
         return self._table(self._error)
 
     @property
@@ -229,7 +225,6 @@ class RecordArrays:
 
     @property
     def steps(self) -> Array:
-        """Substeps, shape (samples,)."""
         return np.array(self._steps, dtype=np.int32)
 
     @property
@@ -243,7 +238,6 @@ class RecordArrays:
 
     @property
     def last_snapshot(self) -> int:
-        """Number of the last record with a snapshot, -1 if there is none."""
         return self._with_fields[-1] if self._with_fields else -1
 
     def snapshots(self) -> Iterator[tuple[int, Snapshot]]:
@@ -285,7 +279,6 @@ class Layout:
     sensor_units: Mapping[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the layout as a JSON object."""
         return asdict(self)
 
     @classmethod
@@ -315,12 +308,7 @@ class Layout:
         data |= self._snapshots([snapshot for _, snapshot in kept])
         if "correlation" in data:
             coords["unknown"] = ("unknown", list(self.scalars))
-        unit = {"units": self.sensor_unit}
-        innovations = np.reshape(rows.innovation, (len(rows), len(self.sensors)))
-        data["innovation"] = (("time", "sensor"), innovations, unit)
-        if self.validation:
-            errors = np.reshape(rows.validation_error, (len(rows), len(self.validation)))
-            data["validation_error"] = (("time", "validation"), errors, unit)
+        data |= self._of_sensors(rows)
         data["status"] = ("time", rows.status, dict(STATUS_FLAGS))
         data["steps"] = ("time", rows.steps, {"long_name": "substeps taken"})
         for name, values in rows.notes.items():
@@ -333,6 +321,16 @@ class Layout:
             "state": " ".join(self.state),
         }
         return xr.Dataset(data, coords, about)
+
+    def _of_sensors(self, rows: RecordArrays) -> dict[str, Any]:
+        """Return the variables of sensors, and of those that are not used."""
+        unit = {"units": self.sensor_unit}
+        innovations = np.reshape(rows.innovation, (len(rows), len(self.sensors)))
+        data = {"innovation": (("time", "sensor"), innovations, unit)}
+        if self.validation:
+            errors = np.reshape(rows.validation_error, (len(rows), len(self.validation)))
+            data["validation_error"] = (("time", "validation"), errors, unit)
+        return data
 
     def _coordinates(self, times: Array, snapshots: Array) -> dict[str, Any]:
         """Return the coordinates of the dataset: times of samples and of fields, and places."""

@@ -18,6 +18,7 @@ from livepde.fem import FunctionSpace
 from livepde.frames import (
     covariance_of,
     draws,
+    draws_dataset,
     estimates,
     frame,
     layout_of,
@@ -27,7 +28,6 @@ from livepde.frames import (
     snapshot_of,
     summary,
     times,
-    vertex_order,
     with_estimates,
 )
 from livepde.laws import Belief, Fit, Status
@@ -36,15 +36,8 @@ from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
-from livepde.readout import Marginal, ScalarReadout, coordinates_of, known_badly
-from livepde.records import (
-    STATUS_CODES,
-    Layout,
-    Record,
-    RecordArrays,
-    Records,
-    Snapshot,
-)
+from livepde.readout import Marginal, ScalarReadout, known_badly, marginals_at
+from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Records, Snapshot
 from livepde.showing import Shown, listed
 from livepde.verdict import Verdict, at_limit, discretised, held_inputs
 
@@ -55,6 +48,7 @@ if TYPE_CHECKING:
     from livepde.plots import RunPlots
 
 Kept = TypeVar("Kept")
+OF_MODEL = ("model", "observed", "validation", "_readout", "_settled")  # lost by pickling
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -116,11 +110,7 @@ class Estimate(Shown):
     state_space: FunctionSpace | None = None
 
     @classmethod
-    def deferred(
-        cls,
-        read: Callable[[], Belief],
-        **attributes: Any,
-    ) -> Estimate:
+    def deferred(cls, read: Callable[[], Belief], **attributes: Any) -> Estimate:
         """Return an estimate whose belief is computed by `read` when it is first read, and kept.
 
         All other attributes are given; `read` must give the same numbers at any time.
@@ -258,24 +248,22 @@ class Estimate(Shown):
         if name in space.labels:
             k = space.labels[name]
             return Marginal(float(self.q[k]), float(std[k]), space.unknown_of(name))
+        values, at = self.q, partial(self._at, name)
+        if name not in space.fields and self.state_space is not None:
+            space, values = self.state_space, self.u
+            std = self.u_std if self.u_std is not None else np.full_like(self.u, np.nan)
         if name in space.fields:
             part = space.part(name)
-            known = space.unknown_of(name)
-            return Marginal(self.q[part], std[part], known, partial(self._at, name))
-        if self.state_space is not None and name in self.state_space.fields:
-            part = self.state_space.part(name)
-            u_std = self.u_std if self.u_std is not None else np.full_like(self.u, np.nan)
-            known = self.state_space.unknown_of(name)
-            return Marginal(self.u[part], u_std[part], known, partial(self._at, name))
+            return Marginal(values[part], std[part], space.unknown_of(name), at)
         if self.state_space is None:
             raise ConfigurationError(
                 f"estimate['{name}']: this estimate was pickled, without its state; its unknowns "
-                f"are {[*space.labels, *space.fields]}."
+                f"are {[*self.space.labels, *self.space.fields]}."
             )
         components = self.state_space.fields
         raise ConfigurationError(
             f"estimate['{name}']: there is no unknown '{name}'; there are "
-            f"{[*space.labels, *space.fields, *components]}."
+            f"{[*self.space.labels, *self.space.fields, *components]}."
         )
 
     def _at(self, name: str, points: ArrayLike) -> Marginal:
@@ -285,25 +273,14 @@ class Estimate(Shown):
                 f"estimate['{name}'].at: this estimate was pickled, without its mesh: call `at` "
                 "of the estimate of an identifier."
             )
-        unknown = name in self.space.fields
-        space = self.space if unknown else self.state_space
-        block, part = space.fields[name], space.part(name)
-        at, one = coordinates_of(points, len(block.box[0]), name)
-        rows = block.probe(at, f"estimate['{name}'].at: point")
-        if unknown:
-            values, std = rows @ self.q[part], self.belief.deviation(rows, part)
-        else:
-            factor = self.belief.u_factor
-            values = rows @ self.u[part]
-            std = None if factor is None else np.linalg.norm(rows @ factor[part], axis=1)
-        std = np.full_like(values, np.nan) if std is None else std
-        shape = () if one else (at.shape[1],)
-        if block.vector:
-            values, std = (x.reshape(-1, at.shape[1]).T for x in (values, std))
-            shape = (*shape, values.shape[1])
-        if not shape:
-            return Marginal(float(values[0]), float(std[0]), space.unknown_of(name))
-        return Marginal(values.reshape(shape), std.reshape(shape), space.unknown_of(name))
+        if name in self.space.fields:
+            return marginals_at(name, points, self.space, self.q, self.belief.deviation)
+        factor = self.belief.u_factor
+
+        def deviation(rows: Any, part: slice) -> Array | None:
+            return None if factor is None else np.linalg.norm(rows @ factor[part], axis=1)
+
+        return marginals_at(name, points, self.state_space, self.u, deviation)
 
 
 def read_together(estimates: Sequence[Estimate]) -> None:
@@ -448,7 +425,6 @@ class Result(Shown):
             )
 
     def _snapshot(self, estimate: Estimate) -> Snapshot:
-        """Return the fields at the vertices."""
         return snapshot_of(self.model, estimate.belief)
 
     def to_xarray(self) -> xr.Dataset:
@@ -524,28 +500,10 @@ class Result(Shown):
         ConfigurationError
             There is no estimate yet; the result was pickled.
         """
-        import xarray as xr
-
-        last, model = self._last("sample"), self.model
+        last = self._last("sample")
         _check_count("sample: n", n)
-        q, u = draws(last.belief, last.space, n, seed)
-        numbers = {
-            label: ("draw", q[:, k], {"units": last.space.unknown_of(label).unit})
-            for label, k in last.space.labels.items()
-        }
-        fields: dict[str, Any] = {}
-        order = vertex_order(model)
-        for space, values in ((model.parameter_space, q), (model.state_space, u)):
-            for name, block in space.fields.items():
-                at_vertices = block.at_vertices @ values[:, space.part(name)].T
-                names = block.variables(name)
-                parts = at_vertices.reshape(len(names), -1, n)
-                fields |= {
-                    key: (("draw", "vertex"), part[order].T)
-                    for key, part in zip(names, parts, strict=True)
-                }
-        axes = {axis: ("vertex", np.array(x)) for axis, x in self.layout.coordinates.items()}
-        return xr.Dataset({**numbers, **fields}, axes)
+        drawn = draws(last.belief, last.space, n, seed)
+        return draws_dataset(self.model, *drawn, self.layout.coordinates)
 
     def to_inference_data(self, n: int = 1000, seed: int | None = 0) -> xr.DataTree:
         """Return what ArviZ (from 1.0 on) plots and compares: an xarray DataTree.
@@ -575,18 +533,17 @@ class Result(Shown):
         """
         import xarray as xr
 
-        drawn = self.sample(n, seed).assign_coords(draw=np.arange(n))
-        before = {
-            label: ("draw", values)
-            for label, values in prior_draws(self._last("prior").space, n, seed).items()
+        last = self._last("prior")
+        groups = {"posterior": self.sample(n, seed), "prior": prior_draws(last.space, n, seed)}
+        number = np.arange(n)
+        chains = {
+            name: group.assign_coords(draw=number).expand_dims(chain=[0])
+            for name, group in groups.items()
         }
-        groups = {"posterior": drawn, "prior": xr.Dataset(before, {"draw": np.arange(n)})}
-        chains = {name: group.expand_dims(chain=[0]) for name, group in groups.items()}
         if self.readings is not None:
             frame = self.measured
             chains["observed_data"] = xr.Dataset({name: frame[name] for name in frame})
         if self.expected is not None:
-            last = self._last("to_inference_data")
             # The same draws as in `sample`, without what the law takes no account of.
             q, _ = draws(replace(last.belief, rest=None), last.space, n, seed)
             measured = self.measured[list(self.layout.sensors)]
@@ -665,18 +622,16 @@ class Result(Shown):
 
     def _finished(self) -> tuple[RecordArrays, Snapshot | None]:
         """Return all records, and the last fields if `fields_every` has left them out."""
-        records, last = RecordArrays.of(self.records), self._last_fields
-        if self._complete:
-            return records, last
-        if self.last is not None and self._settled is not None:
-            snapshot = (
-                None if records.last_snapshot < len(records) - 1 else self._snapshot(self.last)
-            )
-            records = records.with_last(self._readout([self._settled])[0], snapshot)
-        if self.last is not None and records.last_snapshot < len(records) - 1:
-            # The last fields are part of the dataset, also where `fields_every` has left them out.
-            last = self._snapshot(self.last)
-        return records, last
+        records, fields = RecordArrays.of(self.records), self._last_fields
+        if self._complete or self.last is None:
+            return records, fields
+        # The last fields are part of the dataset, also where `fields_every` has left them out.
+        missing = records.last_snapshot < len(records) - 1
+        last = self._snapshot(self.last) if missing or self._settled is not None else None
+        if self._settled is not None:
+            numbers = self._readout([self._settled])[0]
+            records = records.with_last(numbers, None if missing else last)
+        return records, last if missing else fields
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what was found, without the model, whose functions may not be pickled."""
@@ -690,12 +645,11 @@ class Result(Shown):
         }
         if self.readings is not None:
             own["readings"] = partial(kept, self.readings())
-        left = ("model", "observed", "validation", "_readout", "_settled")
-        return {k: v for k, v in vars(self).items() if k not in left} | own
+        return {k: v for k, v in vars(self).items() if k not in OF_MODEL} | own
 
     def __getattr__(self, name: str) -> Any:
         # Python calls this only for names that are not there: those that `__getstate__` leaves out.
-        if name in ("model", "observed", "validation", "_readout", "_settled"):
+        if name in OF_MODEL:
             raise ConfigurationError(
                 "this result was pickled, without its model: it has its estimates, datasets and "
                 "tables. To add samples or to smooth, run an identifier again."

@@ -56,12 +56,10 @@ class Check:
 
     @classmethod
     def at_most(cls, name: str, value: float, bound: float, remedy: str) -> Check:
-        """Return a check of value <= bound."""
         return cls(name, float(value), bound, "<=", remedy)
 
     @classmethod
     def at_least(cls, name: str, value: float, bound: float, remedy: str) -> Check:
-        """Return a check of value >= bound."""
         return cls(name, float(value), bound, ">=", remedy)
 
     @property
@@ -73,7 +71,6 @@ class Check:
 
     @property
     def bound_text(self) -> str:
-        """The bound as text."""
         if isinstance(self.bound, tuple):
             return f"[{self.bound[0]:g}, {self.bound[1]:g}]"
         return f"{self.bound:g}"
@@ -99,7 +96,6 @@ class Table:
     rows: Sequence[Sequence[Any]]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object."""
         return {
             "title": self.title,
             "columns": list(self.columns),
@@ -148,10 +144,7 @@ class CheckReport:
     def raise_if_failed(self) -> CheckReport:
         """Return the report if every property holds.
 
-        Raises
-        ------
-        ConfigurationError
-            A property does not hold; the message names it, and the remedy.
+        Raises `ConfigurationError`: a property does not hold; the message names it, and the remedy.
         """
         if not self.ok:
             raise self.error(

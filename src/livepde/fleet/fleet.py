@@ -26,6 +26,7 @@ from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.records import STATUS_CODES
 from livepde.samples import check_noise, noise_channel
+from livepde.start import initial_errors, initial_readings
 from livepde.stepping import Advance, Between, Scheme, Span, own_noise
 
 FORMAT = 12  # of the checkpoint
@@ -128,7 +129,7 @@ class Fleet:
                 stated = model.boundary_readings(u)
             self._stated[k] = [stated.get(name, np.nan) for name in self.inputs]
         self.note = law.stepped_alone(self._work)
-        self._errors = [self._one._initial_errors(one) for one in off]
+        self._errors = [initial_errors(model, one) for one in off]
         self._engine = self._stepper(made_of, u0s)
         count = len(self)
         self._state: Any = None
@@ -148,7 +149,7 @@ class Fleet:
 
     def _stepper(self, made_of: list[Mapping[str, Any]], u0s: list[Any]) -> FleetEngine:
         """Return the engine that steps members as blocks if the law can, else one by one."""
-        readings = [self._one._initial_readings(one) for one in made_of]
+        readings = [initial_readings(self.model, self.observed, one) for one in made_of]
         begins = beginnings(self._work, readings, self._errors, u0s)
         if not self.note:
             return BlockEngine(self.law, self._work, begins)
@@ -521,7 +522,7 @@ class Fleet:
         for k, name in enumerate(self.inputs):
             column = named.get(name, values[:, k])
             missing = np.isnan(column)
-            if name not in self._one._optional_inputs and missing.any():
+            if name not in self._one._channels.optional and missing.any():
                 column = np.where(missing, self._known[:, k], column)
                 if np.isnan(column).any():
                     member = self.members[int(np.argmax(np.isnan(column)))]

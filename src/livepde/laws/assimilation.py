@@ -29,26 +29,14 @@ LEARN = 0.3  # of a sample each adds to the count: errors of the first guess fad
 
 @dataclass(frozen=True, eq=False)
 class MemberReports:
-    """Report of a step of all members, in addition to the new state.
+    """Report of a step of all members, in addition to the new state."""
 
-    Attributes
-    ----------
-    statuses
-        Status of the step of each member.
-    predicted
-        Predicted value of each sensor, shape (members, sensors).
-    steps
-        Substeps taken, shape (members,).
-    diagnose
-        Function that returns the diagnostics, numbers of shape (members,); called when read.
-    parts
-        In how many parts the substeps were divided, shape (members,); None: not at all.
-    """
-
-    statuses: tuple[Status, ...]
-    predicted: Array
-    steps: Array
+    statuses: tuple[Status, ...]  # status of the step of each member
+    predicted: Array  # predicted value of each sensor, shape (members, sensors)
+    steps: Array  # substeps taken, shape (members,)
+    # Function that returns the diagnostics, numbers of shape (members,); called when read.
     diagnose: Callable[[], Diagnostics[Array]] = Diagnostics
+    # In how many parts the substeps were divided, shape (members,); None: not at all.
     parts: IntArray | None = None
 
     @cached_property
@@ -57,7 +45,6 @@ class MemberReports:
         return self.diagnose()
 
     def member(self, k: int) -> Report:
-        """Return the report of one member."""
         steps = int(self.steps[k])
         parts = 1 if self.parts is None else int(self.parts[k])
         diagnose = then(self.diagnose, lambda found: found.member(k))
@@ -68,7 +55,6 @@ class MemberReports:
         return replace(self, diagnose=lambda: self.diagnostics.updated(more))
 
     def with_members(self, reports: Mapping[int, Report]) -> MemberReports:
-        """Return the reports with those of some members exchanged."""
         if not reports:
             return self
         statuses, predicted, steps = list(self.statuses), self.predicted.copy(), self.steps.copy()
@@ -103,10 +89,14 @@ class Assimilation(NamedTuple):
     anchored: Mask | None = None  # those that correct the state alone; None: none does
 
     @property
-    def decision(self) -> GateDecision:
-        """What the gate has decided."""
-        none = np.zeros_like(self.refused)
-        return GateDecision(self.refused, none if self.anchored is None else self.anchored)
+    def disturbed(self) -> Mask | None:
+        """Members of which a reading has corrected the state alone, (members,); None: none."""
+        return None if self.anchored is None else np.asarray(self.anchored.any(axis=1))
+
+    @property
+    def good(self) -> bool:
+        """True if the step of the one member was taken and its numbers are finite."""
+        return self.status.ok and bool(self.finite[0])
 
 
 def no_readings(x: FilterState, sensors: int) -> Assimilation:
@@ -146,86 +136,128 @@ def absorb(
 
     Gate, verdict, update, statistics; `steps` are the substeps that have led to the state.
     """
-    at = span.end
-    predicted, Y = filter_.sensors.observe(x, at)
+    predicted, Y = filter_.sensors.observe(x, span.end)
     d = span.z1 - predicted
-    used: Mask = np.isfinite(d)
-    whole, measured, present = np.count_nonzero(used) == used.size, None, used
-    refused = np.zeros(used.shape, dtype=bool)
-    if not whole:
-        measured = np.asarray(used.any(axis=1))
-        if not measured.any():
-            sums = (x.u + x.du).sum(axis=1) + x.da.sum(axis=1)
-            finite: Mask = np.isfinite(sums + x.U.sum(axis=(1, 2)) + x.C.sum(axis=(1, 2)))
-            return x, Assimilation(predicted, steps, OK, finite, refused, 0.0)
-    noise, innovations = filter_.noise_of(x, span), d
+    if not d.size or np.count_nonzero(np.isfinite(d)):
+        return _updated(filter_, x, span, options, predicted, Y, d, steps)
+    sums = (x.u + x.du).sum(axis=1) + x.da.sum(axis=1)
+    finite: Mask = np.isfinite(sums + x.U.sum(axis=(1, 2)) + x.C.sum(axis=(1, 2)))
+    return x, Assimilation(predicted, steps, OK, finite, np.zeros(d.shape, dtype=bool), 0.0)
+
+
+def _updated(
+    filter_: Filter,
+    x: FilterState,
+    span: Span,
+    options: UpdateOptions,
+    predicted: Array,
+    Y: Array,
+    innovations: Array,
+    steps: int | IntArray,
+) -> tuple[FilterState, Assimilation]:
+    """Return the same after a sample with a reading, from [U C] H^T and the innovations."""
+    at, judge, shadows = span.end, filter_.judge, filter_.shadows
+    present: Mask = np.isfinite(innovations)
+    whole = np.count_nonzero(present) == present.size
+    measured = None if whole else np.asarray(present.any(axis=1))
+    noise = filter_.noise_of(x, span)
     # From here on in units of the noise: variance of an innovation 1 + |Y|^2.
-    Y, d = Y / noise[:, None], d / noise
+    Y, d = Y / noise[:, None], innovations / noise
     sizes = np.abs(d)
     worst = float(np.fmax.reduce(sizes, axis=None))
     variance = 1.0 + np.add.reduce(Y * Y, axis=1)
-    e = d / np.sqrt(variance)
-    shadows, off, shift = filter_.shadows, None, None
-    told = d
+    e, told = d / np.sqrt(variance), d
+    off, shift = np.zeros(0), None
     if shadows is not None:
         x, off = shadows.in_readings(x, at)
         # Shifts of the innovations by the known discretisation error have a finding of their own:
         # neither the gate nor the verdict may count them again.
         shift = np.add.reduce(off[:, shadows.counted], axis=1) / noise
         told = d + shift
-    newest = anchored = None
-    parts: dict[str, Any] = {}
-    if options.decision is not None:
-        refused, anchored = options.decision
-        used = present & ~refused
-        whole = bool(used.all())
-        e = np.where(used, e, np.nan)
-    elif options.gate.beyond < math.inf:
-        screened, pause = x.screened, x.driven.pause
-        far = _far(x, e, d, variance, shift, pause, used, options.gate.beyond)
-        z = span.z1
-        if z.shape != used.shape:  # members may share one sample
-            z = np.broadcast_to(z, used.shape)
-        if far is None:
-            parts["screened"] = screened.fitted(z, used)
-        else:
-            gated = options.gate(screened, z, innovations, noise, far, used, span.t1, pause)
-            parts["screened"], used, whole = gated.state, gated.kept, bool(gated.kept.all())
-            refused, anchored = present & ~used, gated.anchored
-            newest = np.where(gated.counted, e, np.nan)
-            e = np.where(used, e, np.nan)
+    kept = _admitted(options, x, span, present, innovations, noise, (e, d, variance, shift))
+    used, parts = kept.used, dict[str, Any](kept.parts)
+    if used is not present:
+        whole, e = bool(used.all()), np.where(used, e, np.nan)
     if not whole:  # missing values take part as zeros, which carry no information
         d, told = np.where(used, d, 0.0), np.where(used, told, 0.0)
         Y = np.where(used[:, None], Y, 0.0)
-        off = None if off is None else np.where(used[:, None], off, 0.0)
-    causes, judge = x.causes, filter_.judge
+    causes = x.causes
     if judge is not None:
         causes, parts["ledger"] = _judged(judge, filter_, x, Y, told, used, noise, predicted, span)
-    parts["innovations"] = x.innovations.add(e, measured, newest)
+    parts["innovations"] = x.innovations.add(e, measured, kept.newest)
     changes, made = filter_.update(x, Y, d, causes)
     parts |= changes
+    parts["evidence"] = x.evidence + _density(options, x, made, noise, present, kept.refused)
+    if options.adaptive:
+        parts |= _learned(x, used, d, made)
+    if shadows is not None:
+        weights = used / noise  # missing values have none
+        U, C, off = parts["U"], parts["C"], np.where(used[:, None], off, 0.0)
+        parts["shadows"] = shadows.update(x, U, C, made.left, weights, off, span.t1)
+    new = changed(x, **parts)
+    if kept.anchored is not None and kept.anchored.any():
+        new = filter_.anchor.corrected(new, innovations, kept.anchored, at)
+    good = _finite(new, sizes, worst)
+    return new, Assimilation(predicted, steps, OK, good, kept.refused, worst, kept.anchored)
+
+
+def _density(
+    options: UpdateOptions,
+    x: FilterState,
+    made: Update,
+    noise: Array,
+    present: Mask,
+    refused: Mask,
+) -> Array:
+    """Return the logarithm of the density of the readings, (members,)."""
     logs = ((np.log(noise) + HALF_LOG) * present).sum(axis=1)
     density = -0.5 * made.misfit - made.spread - logs
     if np.count_nonzero(refused) and options.gate.beyond < math.inf:
         # The same readings count whatever is refused: one that is counts as one at the limit.
         limit = options.gate.beyond**2 * np.maximum(x.innovations.ratio, 1.0)
         density = density - 0.5 * limit * refused.sum(axis=1)
-    parts["evidence"] = x.evidence + density
-    if options.adaptive:
-        parts |= _learned(x, used, d, made)
-    if shadows is not None and off is not None:
-        weights = (1.0 if whole else used) / noise
-        U, C = parts["U"], parts["C"]
-        parts["shadows"] = shadows.update(x, U, C, made.left, weights, off, span.t1)
-    new = changed(x, **parts)
-    if anchored is not None and anchored.any():
-        new = filter_.anchor.corrected(new, innovations, anchored, at)
-    # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
-    # square overflows would leave statistics that are not finite. The squares of all members tell
-    # at once that nothing of this has happened.
-    squares = np.vdot(new.u, new.u) + np.vdot(new.du, new.du) + np.vdot(new.da, new.da)
-    good = x.member >= 0 if squares + worst * worst < math.inf else _finite(new, sizes)
-    return new, Assimilation(predicted, steps, OK, good, refused, worst, anchored)
+    return np.asarray(density)
+
+
+class _Admitted(NamedTuple):
+    """Which readings are used, which are refused, and what the gate remembers."""
+
+    used: Mask
+    refused: Mask
+    anchored: Mask | None = None  # those of the refused that correct the state alone
+    newest: Array | None = None  # normalised innovations that count in the test for jumps
+    parts: Mapping[str, Any] = {}  # fields of the filter state to exchange
+
+
+def _admitted(
+    options: UpdateOptions,
+    x: FilterState,
+    span: Span,
+    present: Mask,
+    innovations: Array,
+    noise: Array,
+    scaled: tuple[Array, Array, Array, Array | None],
+) -> _Admitted:
+    """Return the readings that are used, by an earlier decision or by the gate.
+
+    `scaled`: normalised innovations, and what `_far` takes besides.
+    """
+    refused = np.zeros(present.shape, dtype=bool)
+    if options.decision is not None:
+        refused, anchored = options.decision
+        return _Admitted(present & ~refused, refused, anchored)
+    if not options.gate.beyond < math.inf:
+        return _Admitted(present, refused)
+    z, pause = span.z1, x.driven.pause
+    if z.shape != present.shape:  # members may share one sample
+        z = np.broadcast_to(z, present.shape)
+    far = _far(x, *scaled, pause, present, options.gate.beyond)
+    if far is None:
+        return _Admitted(present, refused, parts={"screened": x.screened.fitted(z, present)})
+    found = options.gate(x.screened, z, innovations, noise, far, present, span.t1, pause)
+    newest = np.where(found.counted, scaled[0], np.nan)
+    parts = {"screened": found.state}
+    return _Admitted(found.kept, present & ~found.kept, found.anchored, newest, parts)
 
 
 def _far(
@@ -259,8 +291,14 @@ def _far(
     return None if quiet and not far.any() else far
 
 
-def _finite(x: FilterState, sizes: Array) -> Mask:
+def _finite(x: FilterState, sizes: Array, worst: float) -> Mask:
     """Return which members are finite, with the squares of their innovations, (members,)."""
+    # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
+    # square overflows would leave statistics that are not finite. The squares of all members tell
+    # at once that nothing of this has happened.
+    squares = np.vdot(x.u, x.u) + np.vdot(x.du, x.du) + np.vdot(x.da, x.da)
+    if squares + worst * worst < math.inf:
+        return np.asarray(x.member >= 0)
     sums = (x.u + x.du).sum(axis=1) + x.da.sum(axis=1)
     return np.asarray(np.isfinite(sums + np.fmax.reduce(sizes, axis=1, initial=0.0) ** 2))
 

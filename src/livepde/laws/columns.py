@@ -22,19 +22,18 @@ import numpy as np
 
 from livepde.fem import Channel
 from livepde.laws.filter_state import FilterState, unaccompanied
-from livepde.laws.gate import Gate
+from livepde.laws.gate import Gate, near_most, near_neighbours
 from livepde.laws.history import intervals_since
 from livepde.laws.one_member import filtered
 from livepde.laws.policies import Refit
-from livepde.laws.refit import WILD, Found, near_most, near_neighbours, refitted
+from livepde.laws.refit import WILD, Found, refitted
 from livepde.laws.sensitivity_state import MOST_TRIED, SensitivityState, SensitivityWork
 from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.linalg.member_arrays import changed
-from livepde.showing import in_percent
 from livepde.verdict import Cause, channel_setting
 from livepde.verdict.directions import boundary_lifts
-from livepde.verdict.sentences import LIKELY, amount_of, estimating, table_of
+from livepde.verdict.sentences import clause, estimating, table_of, width
 
 FEWEST_ROWS, FEWEST_READINGS = 20, 40
 MOST_WORK = 4e8  # coefficients of states that all passes may compute
@@ -137,22 +136,10 @@ class Columns:
         places |= {name: first + channels.index(name) for name in inputs}
         log = state.log[:, int(state.window[0]) :]
         log = log[:, np.isfinite(log[0, :, 0])]
-        # At two places: three errors of each input, and all exchanges with an input.
-        passes, most = 2 * len(inputs) * (3 + len(names) + len(inputs)), MOST_TRIED
-        passes += PASSES * ROUNDS * sum(TRIED.values())
-        if work.filter.moves:  # units, exchanges, and lags of one sample and of more
-            passes = len(places) * (5 + len(places) // 2) + LAGS * TRIED["lag"]
-            most = min(MOST_FOLLOWED, MOST_STEPS // passes)
-        each = problem.model.X.dim * (1 + work.filter.reduction.size)
-        most = min(most, int(MOST_WORK / (passes * each)))
-        if most < FEWEST_ROWS:
-            return "the mesh is too large, or the columns are too many, to try each"
-        rows = min(log.shape[1], most)
-        log = log[:, :rows].copy()
-        if np.isfinite(log[0, :, 1 : 1 + len(names)]).sum() < FEWEST_READINGS:
-            return f"fewer than {FEWEST_READINGS} readings are stored"
-        if rows < FEWEST_ROWS:
-            return f"fewer than {FEWEST_ROWS} samples are stored"
+        most = _most_rows(work, len(places), len(inputs))
+        log = log[:, :most].copy()
+        if lacking := _lacking(log, len(names), most):
+            return lacking
         own = log[0][:, 1 + len(names) : first]
         own[:] = np.where(np.isnan(own), work.filter.noise, own)
         open_gate = replace(work.options, gate=Gate())
@@ -179,7 +166,6 @@ class Columns:
         return StoredSamples.of(self.work, begun)
 
     def corrected(self, error: Error) -> SensitivityState:
-        """Return the member with the columns of an error corrected."""
         log, names = self.state.log.copy(), error.names
         at = [self.places[name] for name in names]
         values = log[0][:, at]
@@ -284,6 +270,27 @@ class Columns:
         return float(np.median(np.diff(self.state.log[0, :, 0])))
 
 
+def _lacking(log: Array, sensors: int, most: int) -> str:
+    """Return why so few rows of samples tell nothing of a column; empty if they are enough."""
+    if most < FEWEST_ROWS:
+        return "the mesh is too large, or the columns are too many, to try each"
+    if np.isfinite(log[0, :, 1 : 1 + sensors]).sum() < FEWEST_READINGS:
+        return f"fewer than {FEWEST_READINGS} readings are stored"
+    return f"fewer than {FEWEST_ROWS} samples are stored" if log.shape[1] < FEWEST_ROWS else ""
+
+
+def _most_rows(work: SensitivityWork, columns: int, inputs: int) -> int:
+    """Return how many samples all passes can afford, with so many columns and inputs of them."""
+    # At two places: three errors of each input, and all exchanges with an input.
+    passes = 2 * inputs * (3 + columns) + PASSES * ROUNDS * sum(TRIED.values())
+    most = MOST_TRIED
+    if work.filter.moves:  # units, exchanges, and lags of one sample and of more
+        passes = columns * (5 + columns // 2) + LAGS * TRIED["lag"]
+        most = min(MOST_FOLLOWED, MOST_STEPS // passes)
+    each = work.filter.problem.model.X.dim * (1 + work.filter.reduction.size)
+    return min(most, int(MOST_WORK / (passes * each)))
+
+
 @dataclass(frozen=True, eq=False)
 class _Fit:
     """The quadratic model of the cost about a trajectory, and its minimum."""
@@ -338,16 +345,9 @@ def likely_columns(columns: Columns, least: float) -> list[Cause]:
     prior = samples.about(0.0 * found.best.xi)
     places = [base] if prior is None else [base, _Fit.about(prior)]
     promising = [item for at in places for item in search.promising(at, base.cost)]
-    tried = sorted(promising, key=lambda item: -item[0])
-    kept: list[tuple[float, Error]] = []
+    tried = _varied(sorted(promising, key=lambda item: -item[0]))
     close = min(CLOSE, SLIGHT * noise / misfit)
-    for error in _varied(tried):
-        if any(share >= 1.0 - close and one.numbers <= error.numbers for share, one in kept):
-            continue  # nothing is left to explain
-        end = search.fitted(error)
-        if end is not None:
-            share = 1.0 - (2.0 * end[0] - noise) / misfit
-            kept.append((share, end[1]))
+    kept = search.explaining(tried, close, lambda cost: 1.0 - (2.0 * cost - noise) / misfit)
     kept.sort(key=lambda item: close * item[1].numbers - item[0])
     return [_cause(columns, error, share) for share, error in kept if share > 0.0]
 
@@ -367,6 +367,22 @@ class _Trials:
         if found is not None and found.screened:
             self.vain = len(samples)
         return found
+
+    def explaining(
+        self, tried: Sequence[Error], close: float, share_of: Callable[[float], float]
+    ) -> list[tuple[float, Error]]:
+        """Return errors as they were fitted, and the share of the misfit that each explains.
+
+        `close`: a share that is nothing. `share_of`: the share, from the cost of a fit.
+        """
+        kept: list[tuple[float, Error]] = []
+        for error in tried:
+            if any(share >= 1.0 - close and one.numbers <= error.numbers for share, one in kept):
+                continue  # nothing is left to explain
+            end = self.fitted(error)
+            if end is not None:
+                kept.append((share_of(end[0]), end[1]))
+        return kept
 
     def promising(self, at: _Fit, cost: float) -> Iterator[tuple[float, Error]]:
         """Iterate over errors, and by how much they lower a cost by the model about a fit."""
@@ -393,8 +409,10 @@ class _Trials:
             # Correcting by theta changes the residuals by theta g: so the column is off by theta.
             yield gained, Error(kind, (name,), self._bounded(kind, name, theta))
         if "offset" in slopes and ("gain" in slopes or constant):
-            units = self._units if name in columns.inputs else self._sensor_units
-            yield from units(base, name, slopes)
+            if name in columns.inputs:
+                yield from self._units(base, name, slopes)
+            else:
+                yield from self._sensor_units(base, name)
 
     def _bounded(self, kind: str, name: str, theta: float) -> float:
         columns = self.columns
@@ -428,7 +446,7 @@ class _Trials:
             cost = 0.5 * float(r @ r + xi @ xi - slope @ base.inverse @ slope)
             yield base.cost - cost, Error("unit", (name,), unit=number)
 
-    def _sensor_units(self, base: _Fit, name: str, _: object) -> Iterator[tuple[float, Error]]:
+    def _sensor_units(self, base: _Fit, name: str) -> Iterator[tuple[float, Error]]:
         """Iterate over the same of a sensor: the trajectory is the same."""
         expected = self.columns.unit(name)
         for number, unit in enumerate(UNITS):
@@ -627,47 +645,46 @@ def _noise(residuals: Array) -> float:
 
 
 def _cause(columns: Columns, error: Error, share: float) -> Cause:
-    first, size = error.names[0], error.size
-    problem = columns.work.filter.problem
-    values: dict[str, object] = {"name": first, "other": error.names[-1]}
-    kind, unit_of, side = error.kind, UNITS[error.unit], size > 0
-    factor, _ = error.correction
-    match kind:
-        case "offset":
-            amount = amount_of(abs(size), columns.unit(first))
-            values |= {"amount": amount, "side": "high" if side else "low"}
-        case "gain":
-            values |= {"share": in_percent(abs(size)), "side": "large" if side else "small"}
-        case "lag":
-            lag = amount_of(abs(size), problem.model.time_unit)
-            values |= {"amount": lag, "side": "late" if side else "early"}
-        case "unit" if unit_of.name:
-            values |= {"unit": unit_of.name, "expected": unit_of.expected}
-            values["table"] = table_of(first)
-        case "unit" if factor < 0.0:
-            kind, values["table"] = "sign", table_of(first)
-        case "unit":
-            kind, large = "factor", factor < 1.0
-            values |= {"factor": unit_of.times, "side": "large" if large else "small"}
-            values |= {"correction": f"{factor:.6g}", "table": table_of(first)}
-    text, remedy = LIKELY[kind].filled(**values)
-    wide = f"{2.0 * abs(size):.2g}"
-    if kind == "offset" and first in problem.observed.names:
-        unit = columns.unit(first).replace("degC", "K")
-        remedy = estimating(kind, first, f'"{wide} {unit}"' if unit else wide)
-    late = f'"{size:.4g} {problem.model.time_unit}"' if problem.model.time_unit else f"{size:.4g}"
-    keys = {
-        "gain": ("factor", f"{factor:.6g}"),
-        "lag": ("late", late),
-        "unit": ("unit", f'"{unit_of.name}"') if unit_of.name else ("factor", f"{factor:.6g}"),
-    }
-    if first in problem.observed.names:
-        keys["offset"] = ("offset", wide)
-    setting = channel_setting(first, *keys[error.kind]) if error.kind in keys else ""
-    if error.kind == "exchange":
-        pairs = (error.names, error.names[::-1])
-        setting = "; ".join(
-            channel_setting(one, "column", json.dumps(other)) for one, other in pairs
-        )
+    kind, first, size, unit = error.kind, error.names[0], error.size, columns.unit(error.names[0])
+    problem, (factor, _) = columns.work.filter.problem, error.correction
+    time_unit, of_sensor = problem.model.time_unit, first in problem.observed.names
+    variant, positive = kind, size > 0
+    more: dict[str, object] = {"other": error.names[-1], "table": table_of(first)}
+    if kind == "unit":
+        variant, positive = _unit_variant(error), factor < 1.0
+        other = UNITS[error.unit]
+        more |= {"unit": other.name, "expected": other.expected, "factor": other.times}
+        more |= {"correction": f"{factor:.6g}"}
+    text, remedy = clause(
+        variant, first, size, time_unit if kind == "lag" else unit, positive=positive, **more
+    )
+    if kind == "offset" and of_sensor:
+        remedy = estimating(kind, first, width(size, unit))
+    setting = _setting(error, variant, time_unit, of_sensor=of_sensor)
     known = float("nan") if error.kind in ("unit", "exchange") else size
     return Cause(error.kind, first, text, float(min(share, 1.0)), remedy, setting, known)
+
+
+def _setting(error: Error, variant: str, time_unit: str, *, of_sensor: bool) -> str:
+    """Return the settings of a case that correct a column; empty if there are none."""
+    first, size, factor = error.names[0], error.size, f"{error.correction[0]:.6g}"
+    if error.kind == "exchange":
+        pairs = (error.names, error.names[::-1])
+        return "; ".join(channel_setting(one, "column", json.dumps(other)) for one, other in pairs)
+    keys = {
+        "gain": ("factor", factor),
+        "lag": ("late", f'"{size:.4g} {time_unit}"' if time_unit else f"{size:.4g}"),
+        "unit": ("unit", f'"{UNITS[error.unit].name}"'),
+        "factor": ("factor", factor),
+        "sign": ("factor", factor),
+    }
+    if of_sensor:
+        keys["offset"] = ("offset", f"{2.0 * abs(size):.2g}")
+    return channel_setting(first, *keys[variant]) if variant in keys else ""
+
+
+def _unit_variant(error: Error) -> str:
+    """Return whether a column is in a unit that is known, has another sign, or another factor."""
+    if UNITS[error.unit].name:
+        return "unit"
+    return "sign" if error.correction[0] < 0.0 else "factor"

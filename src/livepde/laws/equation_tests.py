@@ -3,22 +3,20 @@
 *Excitation.* The law holds q while nothing but noise excites it.
 
 The law multiplies r by A(w), w = u_alpha + P u. At rest A(w) is noise, the same as in r, so that
-their product has a mean, and q drifts with it, the faster the larger the gain. Noise is independent
-from sample to sample, and an excitation that is resolved in time is not: with the vector a_k of
-(A(w_k) e, p) for a few fixed e and p, the mean of
+their product has a mean, and q drifts with it. Noise is independent from sample to sample, and an
+excitation that is resolved in time is not: with the vector a_k of (A(w_k) e, p) for a few fixed e
+and p, the mean of
 
     (a_k, a_{k-1}) / (|a_k| |a_{k-1}|)
 
-is about 1 for an excitation, and 0 for noise. For a process faster than the samples it may be 0,
-too. So |a|^2 must have fallen, and the rest of it must be noise. Noise is the change from one
-sample to the next that the estimate u^ does not follow: with b_k of (A(w_k) e, p) - (A(u^_k) e, p)
-the mean of
+is about 1 for an excitation, and 0 for noise. It may be 0 for a process faster than the samples,
+too. So |a|^2 must have fallen, and the rest of it must be change that the estimate u^ does not
+follow: with b_k of (A(w_k) e, p) - (A(u^_k) e, p) the mean of
 
     |b_k - b_{k-1}|^2 / (|a_k|^2 + |a_{k-1}|^2)
 
-is about 1 for noise. It is far smaller where the estimate follows exact data, however small these
-have become, and where it is still off after a transient: that error is smooth in time. Only all
-three together close the gate.
+is about 1 for noise, and far smaller where the estimate follows exact data, or is still off after a
+transient. Only all three together close the gate.
 
 *Equation.* The tests are of the equation on the observed part.
 With test functions p_j that vanish outside of omega the equation error of the data,
@@ -125,13 +123,7 @@ class ExcitationGate:
         )
 
     def add(self, excitation: ExcitationLevel, a: Array, followed: Array) -> ExcitationLevel:
-        """Return the excitation after a sample.
-
-        Parameters
-        ----------
-        a, followed
-            Values of the probes at w and at the estimate, shape (PROBES,).
-        """
+        """Return the excitation after a sample, from probes at w and at the estimate, (PROBES,)."""
         # Fading means: each moves by the share 1/window towards its new value.
         size = float(a @ a)
         scale = math.sqrt(size * excitation.size)
@@ -170,7 +162,6 @@ class ExcitationLevel:
 
     @classmethod
     def none(cls) -> ExcitationLevel:
-        """Return the value before any sample."""
         return cls(np.zeros(PROBES), np.zeros(PROBES), 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -244,11 +235,9 @@ class EquationLedger:
 
     @classmethod
     def none(cls) -> EquationLedger:
-        """Return the value before any sample."""
         return cls(samples=0, rests=0, last=np.full((2, TESTS), np.nan), sums=np.zeros(3))
 
     def add(self, error: Array, square: float) -> EquationLedger:
-        """Return the value after a sample."""
         samples, sums = self.samples + 1, self.sums
         product = float(error @ self.last[0])
         if math.isfinite(product + square):  # the third sample in a row, or a later one
@@ -306,8 +295,7 @@ class EquationTests:
         space = HilbertSpace(sp.csr_array(smooth), "tests", np.flatnonzero(free == 0.0))
         load = np.random.default_rng(0).standard_normal((model.X.dim, TESTS))
         p: Array = np.asarray(space.riesz(np.sqrt(mass.diagonal())[:, None] * load))
-        found: Array = p / np.sqrt((p * (mass @ p)).sum(axis=0))
-        return found
+        return np.asarray(p / np.sqrt((p * (mass @ p)).sum(axis=0)))
 
     @property
     def possible(self) -> bool:
@@ -315,14 +303,12 @@ class EquationTests:
         return bool(self.functions.shape[1])
 
     def add(self, ledger: EquationLedger, at: ObservedEquation) -> EquationLedger:
-        """Return the ledger after a sample."""
         p = self.functions
         seen = self.forms.A_in.matrix("v", "q", at.moment, u=at.w, q=at.q).T @ p  # (m, TESTS)
         terms = np.concatenate([[at.q @ seen, at.rate @ p], self.prior.T @ seen])
         return ledger.add(at.error @ p, float((terms**2).sum()))
 
     def verdict(self, ledger: EquationLedger) -> Verdict:
-        """Return the verdict on a run with this ledger."""
         rests = [rested(ledger.rests)] if ledger.rests else []
         if not self.possible:
             why = "the sensors do not determine the state on any part of the domain"

@@ -262,10 +262,7 @@ class ErrorColumns:
         begin, first, end = (float(t) for t in (spans[0].start, spans[0].t1, spans[-1].t1))
         # Courses in time are those of the samples: the first may come long after t0.
         late = max(begin, first - PAUSE * (end - first) / steps)
-        p = np.zeros((self.count, model.X.dim))
-        for column, (answer, _) in zip(self.first, self.answers, strict=True):
-            if answer.start is not None:
-                p[column] = answer.start
+        p = self._begun()
         found = np.full((len(spans), self.observed.size, self.count), np.nan)
         largest = np.abs(p).max(axis=1)
         states: list[Array] = []
@@ -292,13 +289,24 @@ class ErrorColumns:
         found = _filled(found, times)
         for column, most in enumerate(largest):
             found[:, :, column] = beyond_rounding(found[:, :, column], most)
-        # What an unknown does is no error of the model.
-        some = np.linspace(0, len(seen) - 1, min(COMPARED, len(seen))).astype(int)
-        for number in self._of_unknowns([seen[k] for k in some]):
+        return self._without_unknowns(found, seen), states, predicted
+
+    def _begun(self) -> Array:
+        """Return the answers at the start, (columns, n)."""
+        p = np.zeros((self.count, self.model.X.dim))
+        for column, (answer, _) in zip(self.first, self.answers, strict=True):
+            if answer.start is not None:
+                p[column] = answer.start
+        return p
+
+    def _without_unknowns(self, found: Array, nows: Sequence[Now]) -> Array:
+        """Return answers without what an unknown does, which is no error of the model."""
+        some = np.linspace(0, len(nows) - 1, min(COMPARED, len(nows))).astype(int)
+        for number in self._of_unknowns([nows[k] for k in some]):
             first, (_, course) = self.first[number], self.answers[number]
             own = slice(first, first + course.size)
             found[:, :, own] = course.varying(found[:, :, own])
-        return found, states, predicted
+        return found
 
     def _of_unknowns(self, nows: Sequence[Now]) -> list[int]:
         """Return the answers whose loads are those of changed constant unknowns, at some moments.

@@ -67,8 +67,7 @@ class Update(NamedTuple):
     @property
     def spread(self) -> Array:
         """Return log det (I + Y^T Y)/2, shape (members,)."""
-        spread: Array = -np.log(np.abs(np.diagonal(self.W, axis1=1, axis2=2))).sum(axis=1)
-        return spread
+        return np.asarray(-np.log(np.abs(np.diagonal(self.W, axis1=1, axis2=2))).sum(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +98,6 @@ class Filter:
     shadows: ShadowSet | None = None
 
     def drifts(self, member: IntArray) -> Array:
-        """Return the drift of some members."""
         return self.drift[member] if len(self.drift) > 1 else np.repeat(self.drift, len(member))
 
     @cached_property
@@ -109,7 +107,6 @@ class Filter:
 
     @cached_property
     def moves(self) -> bool:
-        """True if an unknown moves."""
         return self.reduction.moves or bool(self.drift.any())
 
     def span(self, interval: Interval) -> Span:
@@ -144,8 +141,7 @@ class Filter:
 
     def estimate(self, x: FilterState) -> Array:
         """Return the estimated latent parameters, not yet bounded, shape (members, m)."""
-        q: Array = x.q + x.da @ self.reduction.Phi.T
-        return q
+        return x.q + x.da @ self.reduction.Phi.T
 
     def _with_noise(self, x: FilterState, h: float, noise: NoiseRows | None) -> FilterState:
         """Return the state with the unknowns predicted over a time h, their noise in new rows."""
@@ -244,28 +240,34 @@ class Filter:
     ) -> tuple[FilterState, Steps, StepFailed | None]:
         """Return the same of members that divide their substeps alike."""
         x, end, taken, failure = self._divided(x, span)
-        noise = self.problem.input_noise
-        if failure is None and noise:
-            end, failure = with_input_errors(self.carried, x, end, span, noise)
-        # A refit of constant unknowns takes held values as exact, and so does their filter.
-        if failure is None and (self.moves or noise) and self.input_gaps(span) is not None:
-            off = unread_inputs(self.problem, x, span)
-            end, failure = with_input_errors(self.carried, x, end, span, off)
-            end = self.compressed(end) if end.U.shape[1] > self.rank else end
+        if failure is None:
+            end, failure = self._with_inputs(x, end, span)
         if failure is not None:
             return x, taken, failure
-        end = changed(end, driven=x.driven.after(span))
-        if np.count_nonzero(end.driven.pause):
-            coarse = self._coarse(span.t1 - span.start)
-            end, failure = after_pause(coarse.carried, self.problem, x, end, span)
-            if failure is not None:
-                return x, taken, failure
-            end = self.compressed(end) if end.U.shape[1] > self.rank else end
         if self.shadows is not None:
             end = self.shadows.predict(x, end, span)
         if self.fading < math.inf:  # exponential decay of the cross-covariance
             end = changed(end, U=np.exp(-(span.t1 - span.start) / self.fading) * end.U)
         return end, taken, None
+
+    def _with_inputs(
+        self, x: FilterState, end: FilterState, span: Span
+    ) -> tuple[FilterState, StepFailed | None]:
+        """Return the state with the errors of inputs, and of what they have done in a pause."""
+        noise, failure = self.problem.input_noise, None
+        if noise:
+            end, failure = with_input_errors(self.carried, x, end, span, noise)
+        # A refit of constant unknowns takes held values as exact, and so does their filter.
+        if failure is None and (self.moves or noise) and self.input_gaps(span) is not None:
+            off = unread_inputs(self.problem, x, span)
+            end, failure = with_input_errors(self.carried, x, end, span, off)
+            end = self._limited(end)
+        end = changed(end, driven=x.driven.after(span))
+        if failure is None and np.count_nonzero(end.driven.pause):
+            coarse = self._coarse(span.t1 - span.start)
+            end, failure = after_pause(coarse.carried, self.problem, x, end, span)
+            end = self._limited(end)
+        return end, failure
 
     def _coarse(self, length: float) -> Filter:
         """Return the filter with so long substeps that an interval has at most `FEW_SUBSTEPS`."""
@@ -328,23 +330,11 @@ class Filter:
         """Return the state at the end of a part of a span."""
         noise, rows = self._noise(x, start, stop - start), x.U.shape[1]
         end, kept = self._with_noise(x, stop - start, noise) if self.moves else x, x.kept
-        deviates = bool(np.count_nonzero(x.da) or np.count_nonzero(x.du))
-        off: Mask = np.zeros(len(x.member), dtype=bool)
-        if deviates:
-            off = np.asarray(x.da.any(axis=1) | x.du.any(axis=1))
+        off: Mask = np.asarray(x.da.any(axis=1) | x.du.any(axis=1))
+        deviates = bool(off.any())
         shadows = x.shadows.u.shape[1]
 
-        def directions(at: FilterState, C: Array) -> Array:
-            # The estimate relative to the linearisation point, [du; da], is propagated as one more
-            # tangent: so it follows the same linear model as the rows of [U C].
-            C = np.concatenate([C, at.da[:, None]], axis=1) if deviates else C
-            found = self.reduction.directions(at.q, C)
-            if not shadows:  # which change no number of the others
-                return found
-            apart = self.reduction.directions(at.q, at.shadows.a)
-            return np.concatenate([found, apart], axis=1)
-
-        at_end = directions(end, end.C)
+        at_end = self._directions(end, end.C, deviates)
         factors: dict[float, Any] = {}  # of all stages of a step that have the same q
         begun, length = start, stop - start
 
@@ -362,7 +352,7 @@ class Filter:
                 C = now.C[:, :rows]
                 if noise:
                     C = np.concatenate([C, noise.at_stage(t, begun, length)], axis=1)
-                q, along = now.q, directions(now, C)
+                q, along = now.q, self._directions(now, C, deviates)
             same = factors if q is end.q else {}
             work = StageOfMembers(x.member, q, along, h, span.at(t), kept, off, same, shadows)
             y, kept = self.stage.advance(columns, work)
@@ -384,7 +374,18 @@ class Filter:
         new = changed(end, **parts)
         if noise and stop == span.t1:
             new = changed(new, rate=self._rate(new, noise, span))
-        return self.compressed(new) if count > self.rank else new, steps, None
+        return self._limited(new), steps, None
+
+    def _directions(self, at: FilterState, C: Array, deviates: bool) -> Array:
+        """Return the derivatives of q along all tangents, (members, tangents, m)."""
+        # The estimate relative to the linearisation point, [du; da], is propagated as one more
+        # tangent: so it follows the same linear model as the rows of [U C].
+        C = np.concatenate([C, at.da[:, None]], axis=1) if deviates else C
+        found = self.reduction.directions(at.q, C)
+        if not at.shadows.u.shape[1]:  # which change no number of the others
+            return found
+        apart = self.reduction.directions(at.q, at.shadows.a)
+        return np.concatenate([found, apart], axis=1)
 
     def _rate(self, x: FilterState, noise: NoiseRows, span: Span) -> Array:
         """Return how fast the readings at the end forget the process noise, shape (members,)."""
@@ -459,8 +460,7 @@ class Filter:
         # The added rows are zero in U, which makes the added error independent of the state.
         rows = size * (np.eye(k) if chosen is None else np.eye(k)[chosen])
         U = np.zeros((members, len(rows), x.u.shape[1]))
-        new = with_rows(x, U, np.broadcast_to(rows, (members, *rows.shape)))
-        return self.compressed(new) if new.C.shape[1] > self.rank else new
+        return self._limited(with_rows(x, U, np.broadcast_to(rows, (members, *rows.shape))))
 
     def with_prior(self, x: FilterState) -> FilterState:
         """Return the state with the prior of the unknowns, and u as it is estimated."""
@@ -475,6 +475,9 @@ class Filter:
         shadows = changed(x.shadows, a=np.zeros_like(x.shadows.a))
         new = changed(x, u=x.u + x.du, q=prior, du=du, da=da, U=U, C=C, past=past, causes=causes)
         return changed(new, shadows=shadows)
+
+    def _limited(self, x: FilterState) -> FilterState:
+        return self.compressed(x) if x.C.shape[1] > self.rank else x
 
     def compressed(self, x: FilterState) -> FilterState:
         """Return the state with a square root of `rank` rows.

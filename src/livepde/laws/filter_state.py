@@ -43,7 +43,6 @@ class InputHistory:
 
     @classmethod
     def start(cls, channels: int, members: int = 1) -> InputHistory:
-        """Return the value before any interval."""
         far = np.full((members, channels), np.inf)
         none = np.zeros(members)
         return cls(
@@ -153,7 +152,6 @@ class ShadowState:
 
     @classmethod
     def none(cls, members: int, n: int, k: int) -> ShadowState:
-        """Return the value without any shadow."""
         # No step writes into the arrays of a state, so that several fields may share one.
         zero, time = np.zeros(members, dtype=np.int64), np.zeros(members)
         counts = ("count", "last", "due", "jumped", "failed", "coarse")
@@ -243,8 +241,7 @@ def along(x: FilterState, k: int, shift: Array) -> Array:
     """Return by how much the state of a member is expected to move with a shift of a, (n,)."""
     if not shift.any():
         return np.zeros(x.u.shape[1])
-    moved: Array = coordinates(x.C[k], shift) @ x.U[k]
-    return moved
+    return np.asarray(coordinates(x.C[k], shift) @ x.U[k])
 
 
 def extended(rows: Array, count: int) -> Array:

@@ -2,12 +2,14 @@
 
 Laws without a covariance cannot weigh an innovation: `ReadingRange` leaves out wild values, such as
 9999, far outside all that has been measured. If the readings of the sensor stay there, the process
-has moved.
+has moved. A fit of stored samples, which knows the readings before and after each, leaves out those
+that are far from their neighbours.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -23,6 +25,9 @@ CALM = 50  # samples without a correction of the state, after which a disturbanc
 SETTLED = 20  # readings used, before which a lasting misfit may come from a poor start
 ABSURD = 10.0  # ranges outside of the past, as the runaway of `Guards`
 PATIENCE = 3  # wild readings in a row, after which the process has moved
+NEIGHBOURS = 3  # in time, to each side of a value
+FEW = 2 * NEIGHBOURS  # values of a sensor up to which all count as near
+NORMAL = 1.4826  # standard deviation of normal values over the median of their sizes
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +59,6 @@ class Screened:
 
     @classmethod
     def start(cls, sensors: int, members: int = 1) -> Screened:
-        """Return the value before any sample."""
         none = np.zeros((members, sensors), np.int64)
         counts = ("refused", "changes", "fits", "taken", "run", "longest", "strain")
         same: dict[str, Any] = dict.fromkeys(counts, none)
@@ -215,7 +219,6 @@ class ReadingRange:
 
     @classmethod
     def start(cls, sensors: int) -> ReadingRange:
-        """Return the value before any reading."""
         never, none = np.full(sensors, np.nan), np.zeros(sensors, dtype=np.int64)
         return cls(low=never, high=never, count=none, wild=none)
 
@@ -250,3 +253,61 @@ class ReadingRange:
         with np.errstate(invalid="ignore"):
             far: Mask = (z > self.high + ABSURD * scale) | (z < self.low - ABSURD * scale)
         return known & far & (scale > 0.0)
+
+
+def usual_size(values: Array) -> float:
+    """Return the standard deviation by the median of the sizes of values, at least 1."""
+    return max(1.0, NORMAL * float(np.median(np.abs(values)))) if len(values) else 1.0
+
+
+def near_neighbours(values: Array, limit: float) -> Mask:
+    """Return which values lie within `limit` usual distances from the median of their neighbours.
+
+    A model error, which changes slowly, stays. Values that are near tell about the others: among
+    several wild ones in a row the neighbours of one are no measure.
+    """
+    first = _near(values, limit, _of_neighbours)
+    near = first.copy()
+    for k, column in enumerate(values.T):
+        (kept,) = first[:, k].nonzero()
+        if len(kept) <= FEW:
+            continue
+        (others,) = (np.isfinite(column) & ~first[:, k]).nonzero()
+        away = np.full(len(column), np.nan)
+        away[kept] = column[kept] - _of_neighbours(column[kept])
+        begin = np.searchsorted(kept, others) - NEIGHBOURS
+        begin = np.clip(begin, 0, len(kept) - 2 * NEIGHBOURS)
+        around = kept[begin[:, None] + np.arange(2 * NEIGHBOURS)]
+        away[others] = column[others] - np.median(column[around], axis=1)
+        near[:, k] = np.abs(away) <= limit * usual_size(away[kept])
+    return near
+
+
+def near_most(values: Array, limit: float) -> Mask:
+    """Return which values lie within `limit` usual distances from the median of all of a sensor.
+
+    A sensor that shows a wrong constant for some time has neighbours that agree with it.
+    """
+    return _near(values, limit, np.median)
+
+
+def _near(values: Array, limit: float, centre: Callable[[Array], Array]) -> Mask:
+    """Return which values lie within `limit` usual distances from the centre of their sensor."""
+    near = np.isfinite(values)
+    for k, column in enumerate(values.T):
+        (places,) = near[:, k].nonzero()
+        if len(places) > FEW:
+            away = column[places] - centre(column[places])
+            near[places, k] = np.abs(away) <= limit * usual_size(away)
+    return near
+
+
+def _of_neighbours(values: Array) -> Array:
+    """Return the median of the neighbours of each value, itself left out, shape (count,)."""
+    count, reach = len(values), NEIGHBOURS
+    windows = np.lib.stride_tricks.sliding_window_view(values, 2 * reach + 1)
+    inner = np.median(np.delete(windows, reach, axis=1), axis=1)
+    edges = {k: np.r_[0:k, k + 1 : 2 * reach + 1] for k in range(reach)}
+    first = [np.median(values[which]) for which in edges.values()]
+    last = [np.median(values[count - 1 - which]) for which in edges.values()]
+    return np.concatenate([first, inner, last[::-1]])

@@ -73,8 +73,6 @@ class GradientParts:
     _stages: Memo[bytes, CoupledStage] = field(default_factory=lambda: Memo(MOST_STAGES))
 
     def stage(self, present: Array) -> CoupledStage:
-        """Return the coupled stage for the sensors present."""
-
         def made() -> CoupledStage:
             terms = StageTerms(self.forms(present), self.damping, self.memory)
             return CoupledStage(terms, self.newton)
@@ -82,7 +80,6 @@ class GradientParts:
         return self._stages.get(present.tobytes(), made)
 
     def forms(self, present: Array) -> StageForms:
-        """Return the forms of the stage for the sensors present."""
         split = self.problem.observed.split(present)
         return StageForms(self.problem.model, split, self.M_op, self.N_op, self.nu)
 
@@ -95,7 +92,6 @@ class GradientParts:
     def excited(
         self, excitation: ExcitationLevel, w: Array, u: Array, q: Array, moment: Moment
     ) -> ExcitationLevel:
-        """Return the excitation after a sample, from w and the estimate u."""
         if self.gate is None or self.probes is None:
             return excitation
         seen = self.probes(np.array([w, u]).T, q, moment)
@@ -165,8 +161,7 @@ class StageSequence:
         # r at the beginning of the stage: M r' is the change of M r over its length.
         before = forms.split.project(problem.c[:n]) - self.path.at(begin).u
         change = at.mass_r - forms.mass @ before
-        error: Array = at.residual[:n] - at.theta * at.Mr - change / problem.h
-        return error
+        return np.asarray(at.residual[:n] - at.theta * at.Mr - change / problem.h)
 
     def rate(self, begin: Array, end: Array) -> Array:
         """Return the change of (u - u_alpha, q) over the interval, per unit of time."""

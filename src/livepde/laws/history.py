@@ -16,15 +16,15 @@ import numpy as np
 
 from livepde.fem import Inputs
 from livepde.linalg import Array, IntArray, Mask
-from livepde.stepping import End, Interval, Span, own_noise
+from livepde.stepping import End, Interval, Span, gaps_of, own_noise
 
 SPARE = np.inf  # time of rows that are not in use
 ROWS = 64  # least room of a log
 
 
-def empty_log(members: int, sensors: int, channels: int) -> Array:
-    """Return a log without rows."""
-    return np.zeros((members, 0, 2 + 2 * sensors + 2 * channels))
+def empty_log(sensors: int, channels: int) -> Array:
+    """Return a log of one member without rows."""
+    return np.zeros((1, 0, 2 + 2 * sensors + 2 * channels))
 
 
 def _inputs(log: Array, sensors: int) -> tuple[slice, slice]:
@@ -114,44 +114,35 @@ class LogRows(NamedTuple):
     readings: Array
     noise: Array  # NaN: that of the sensor
     inputs: Array
+    held: Array  # for how long each input has been held without a reading
     parts: IntArray
 
     @classmethod
     def of(cls, log: Array, sensors: int) -> LogRows:
         """Return the rows of a log of one member."""
-        rows, (inputs, _) = log[0][np.isfinite(log[0, :, 0])], _inputs(log, sensors)
+        rows, (inputs, held) = log[0][np.isfinite(log[0, :, 0])], _inputs(log, sensors)
         return cls(
             times=rows[:, 0],
             readings=rows[:, 1 : 1 + sensors],
             noise=rows[:, 1 + sensors : inputs.start],
             inputs=rows[:, inputs],
+            held=rows[:, held],
             parts=rows[:, -1].astype(int),
         )
 
 
 def _rows(log: Array, channels: tuple[str, ...]) -> list[End]:
-    sensors = (log.shape[2] - 2 - 2 * len(channels)) // 2
-    values, held = _inputs(log, sensors)
-    found = list[End]()
-    before = [0.0] * len(channels)
-    for row in log[0][np.isfinite(log[0, :, 0])]:
-        t, z, noise = np.split(row[: values.start], [1, 1 + sensors])
-        named = Inputs(dict(zip(channels, row[values].tolist(), strict=True)))
-        gaps, now = {}, row[held].tolist()
+    rows = LogRows.of(log, (log.shape[2] - 2 - 2 * len(channels)) // 2)
+    found, before = list[End](), [0.0] * len(channels)
+    for t, z, noise, inputs, held, parts in zip(*rows, strict=True):
+        named = Inputs(dict(zip(channels, inputs.tolist(), strict=True)))
+        gaps, now = {}, held.tolist()
         if any(before) or (any(now) and found):
-            each = zip(channels, before, now, strict=True)
-            gaps = {name: (past, again > 0.0) for name, past, again in each if past or again}
+            gaps = gaps_of(channels, before, now)
         before = now
-        found.append(
-            End(
-                t=float(t[0]),
-                inputs=named,
-                z=z,
-                noise=own_noise(noise),
-                gaps=gaps,
-                parts=int(row[-1]),
-            )
-        )
+        own = own_noise(noise)
+        end = End(t=float(t), inputs=named, z=z, noise=own, gaps=gaps, parts=int(parts))
+        found.append(end)
     return found
 
 

@@ -3,7 +3,7 @@
 A rule returns the `Metric` of the second line for each stage, and carries its statistics from
 sample to sample. With the metric of the information `GradientLaw(gain="auto")` tunes itself.
 
-The first line of the method says, on the observed part, that q leaves the equation error
+On the observed part q leaves the equation error
 
     eps(q) = M u_alpha' + B(w) + A(w) q - F,        eps(q) - eps(q*) = A(w) (q - q*).
 
@@ -13,70 +13,54 @@ the prior (G_Q is divided by the square of `std`). Then the best q given all dat
     S ||q - q0||_Q^2 + int ||R^T eps(q)||^2_{D^{-1}} dt.
 
 Its recursion, recursive least squares for a field, is the second line of the method in the metric
-of the information, H = S G_Q + J in the place of G_Q/gain, J = int A^T R D^{-1} R^T A dt: the gain
-H^{-1} falls like 1/t where the data excite q, stays that of the prior where they do not, and what
-early data taught stays when the excitation dies out. With M_op = M and theta = PULL/h all of r
-comes from the step itself, about -h M^{-1} eps/PULL, and the stage solves
+of the information, H = S G_Q + J in the place of G_Q/gain, J = int A^T R D^{-1} R^T A dt. With
+M_op = M and theta = PULL/h all of r, about -h M^{-1} eps/PULL, comes from the step itself, and the
+stage solves
 
     H (q - c)/PULL = A(w)^T r + (b - J c - S G_Q (c - q0))/PULL
 
-from c, q before the step, with the normal equations J q = b of the data so far. These are kept
-exactly: the remaining equation error eps of a step follows from its r, and y = A q - eps is the
-value of A q according to the data,
+from c, q before the step. The normal equations J q = b of the data so far are kept exactly: the
+equation error eps of a step follows from its r, y = A q - eps is the value of A q according to the
+data, and
 
     J <- J + h A^T R D^{-1} R^T A,        b <- b + h A^T R D^{-1} R^T y.
 
-So a step need not be exact: the remaining errors of filter, pull and iteration, and the correction
-for a change of S, are in b - J c - S G_Q (c - q0), and the next step makes them good. Without b, by
-the drive A^T r alone, q and J disagree on rough functions by the ratio of D to M, and when S falls
-q jumps by that.
+So a step need not be exact: what it leaves is in b - J c - S G_Q (c - q0), and the next one makes
+it good. The drive A^T r alone would not: q and J disagree on rough functions by the ratio of D to
+M, and q would jump when S falls.
 
 S is the power of the remaining equation error, as far as q sees it,
 
     power(eps) = mean of h ||A^T D^{-1} eps||_{Q*}^2 / mean of trace(G_Q^{-1} A^T R D^{-1} R^T A),
     S          = (power(eps_k) power(eps_k - eps_{k-1})/2)^{1/2}.
 
-Of white noise both powers are S. An error that goes on counts, too, the less the slower it changes:
-so the equation errors of mesh, time step, smoothing and a wrong P u hold q back as noise does, and
-a wrong q hardly. (By the first alone, a q far from its prior was never learned: its own error is
-all noise. By the second alone, q left its prior for some samples at first. By the reversals,
--(eps_k - eps_{k-1}, eps_{k-1} - eps_{k-2}), which are noise alone but of either sign, S was zero as
-soon as errors went on.) The same is done with the diagonal of G_Q in the place of G_Q, and the
-larger S is taken: the first measures the error against smooth functions, the second against rough
-ones, where derivatives of noisy data are far larger. (With the first alone 1 % of noise moved q to
-1.3 times the bound of the prior.) Means weigh a sample at time t by t^FORGETS: they forget the
-start, and of exact data S vanishes. The first sample moves nothing: it tells S.
+Of white noise both powers are S. An error that goes on counts less, the slower it changes: errors
+of mesh, time step, smoothing and a wrong P u hold q back as noise does, and a wrong q hardly. The
+same is done with the diagonal of G_Q in the place of G_Q, and the larger S is taken: the first
+measures the error against smooth functions, the second against rough ones, where derivatives of
+noisy data are far larger. Means weigh a sample at time t by t^FORGETS. The first sample moves
+nothing: it tells S.
 
-J and b fade in two kinds of rows. Those that see nothing but the data, with tests within omega, are
-weighed by the information that had been given up to a sample: the first ones, least smoothed, count
-less and less, and where nothing is excited nothing fades. The others hold fluxes of P u, which was
-wrong at first, and are weighed by t^4; since P u keeps an error that the data do not determine, S
-is not taken below a small share of their J.
+J and b fade in two kinds of rows. Those of tests within omega, which see nothing but the data, are
+weighed by the information that had been given up to a sample. The others hold fluxes of P u, which
+was wrong at first, and are weighed by t^4; since P u keeps an error that the data do not determine,
+S is not taken below a small share of their J.
 
 H is renewed when S or the trace of J have changed by more than `AGED`, or J along the last step has
 grown by more than `STEEPER`. In between a step is one of quasi-Newton's, and factors serve on.
 
-Every number above is a ratio of quantities with the same units: scaling u, q (with `std`), x or t
-scales the estimate with them. Nothing refers to the mesh or to the sampling interval but the noise
-itself.
+Every number above is a ratio of quantities with the same units, and refers neither to the mesh nor
+to the sampling interval.
 
-The prior says whether q is plausible. If all of this holds, q - q0 is Gaussian, and its covariance
-is that of the prior less the remaining one after the data, so that ||q - q0||_Q^2 is a sum of
-chi-squares with weights of at most 1, whose sum k is at most m and at most trace(G_Q^{-1} J)/S,
-with a J that has not faded. It is more than k + 2 sqrt(k s) + 2 s with a probability below exp(-s)
-only (Laurent and Massart 2000). A q beyond that is not believed: the step holds q, which is a
-failed status, and the data go on to tell J, b and S.
+If all of this holds, ||q - q0||_Q^2 is a sum of chi-squares with weights of at most 1, whose sum k
+is at most m and at most trace(G_Q^{-1} J)/S, with a J that has not faded. It is more than
+k + 2 sqrt(k s) + 2 s with a probability below exp(-s) (Laurent and Massart 2000). Beyond that the
+step holds q, which is a failed status, and the data go on to tell J, b and S. A bias that q
+absorbs, as of a smoothing that takes too much, is not in S (`livepde.laws.observed_part`).
 
-S does not contain a bias that q absorbs without a trace: smoothing that takes too much or too
-little leaves an equation error that moves with w, as a wrong q does. The remedy is smoothing
-without this bias (`livepde.laws.observed_part`).
-
-*Rows.* A diagonal D >= M (Gershgorin; the lumped mass for P1) makes A^T R D^{-1} R^T A as sparse as
-A^T A where sensors select coefficients. Else the rows are those of a basis of N(G)^perp, D is M,
-and the matrix is dense.
-
-Rows are of two kinds, which are kept apart: those of tests within omega, which see nothing but the
-data, and the others, which hold fluxes of the unobserved part.
+A diagonal D >= M (Gershgorin; the lumped mass for P1) makes A^T R D^{-1} R^T A as sparse as A^T A
+where sensors select coefficients. Else the rows are those of a basis of N(G)^perp, D is M, and the
+matrix is dense.
 """
 
 from __future__ import annotations
@@ -228,8 +212,7 @@ class Information:
 def _diagonal(space: HilbertSpace) -> Array:
     """Return the diagonal of G, or a bound of it where G is a Schur complement; positive."""
     diagonal = space.augmented.diagonal()[: space.dim]
-    found: Array = np.where(diagonal > 0.0, diagonal, 1.0)
-    return found
+    return np.where(diagonal > 0.0, diagonal, 1.0)
 
 
 def trace_probes(space: HilbertSpace) -> Array:
@@ -283,8 +266,7 @@ def _root(inverse: Callable[[Array], Array], x: Array, modes: Array) -> Array:
     # The root times x is about ||x|| V T^(1/2) e_1, with the Lanczos basis V and its matrix T.
     values, vectors = np.linalg.eigh(T[:k, :k], UPLO="U")
     powers = vectors @ (np.sqrt(np.maximum(values, 0.0)) * vectors[0])
-    root: Array = size * (powers @ np.array(basis))
-    return root
+    return np.asarray(size * (powers @ np.array(basis)))
 
 
 def _pattern(model: Model, selects: bool) -> Pattern:
@@ -321,7 +303,6 @@ class InformationMetric(MetricRule[Information]):
         self._normal: Memo[bytes, SelectedRows | ProjectedRows] = Memo(MOST_NORMAL)
 
     def init(self, q0: Array) -> Information:
-        """Return the information before the first sample: none."""
         J = np.zeros((2, self.pattern.nnz))
         return Information(
             origin=q0,
@@ -516,7 +497,6 @@ class SelectedRows:
         return data
 
     def gain(self, A: Array, q: Array, error: Array, probes: Array) -> Gain:
-        """Return the contribution of a sample."""
         matrix = self.pattern.compact(A)
         images = matrix @ np.column_stack([self.free * q, probes])
         y = images[:, 0] - error
@@ -526,10 +506,8 @@ class SelectedRows:
         return Gain(self._matrix(A), products[:2], products[2], trace)
 
     def trace(self, A: Array, probes: Array) -> Array:
-        """Return `Gain.trace` alone."""
         images = self.pattern.compact(A) @ probes
-        trace: Array = self.inverse @ np.square(images).sum(axis=1)
-        return trace
+        return np.asarray(self.inverse @ np.square(images).sum(axis=1))
 
 
 class ProjectedRows:
@@ -573,5 +551,4 @@ def diagonal_bound(mass: sp.csr_array) -> Array:
     scale = sp.diags_array(1.0 / root)
     rows = abs(scale @ mass @ scale).sum(axis=1)
     # diag(row sums) less the scaled M is diagonally dominant, and so has no negative eigenvalue.
-    bound: Array = np.where(diagonal > 0.0, root**2 * np.maximum(rows, 1.0), 0.0)
-    return bound
+    return np.where(diagonal > 0.0, root**2 * np.maximum(rows, 1.0), 0.0)

@@ -78,8 +78,7 @@ class Innovations:
     def ratio(self) -> Array:
         """Mean of e^2 of each member, shape (members,); 1 if the noise level is right."""
         # `TINY` on both sides makes the ratio 1, that of a right model, before any innovation.
-        ratio: Array = (self.sums[:, 2] + TINY) / (self.sums[:, 0] + TINY)
-        return ratio
+        return (self.sums[:, 2] + TINY) / (self.sums[:, 0] + TINY)
 
     @property
     def correlation(self) -> Array:
@@ -101,8 +100,7 @@ class Innovations:
         Model errors smaller than the noise hardly correlate one innovation with the next, and yet
         do not average out. Shape (members,).
         """
-        persistence: Array = (self.sums[:, 6] + TINY) / (self.sums[:, 5] + TINY)
-        return persistence
+        return (self.sums[:, 6] + TINY) / (self.sums[:, 5] + TINY)
 
     @property
     def inflation(self) -> Array:
@@ -141,8 +139,7 @@ class Innovations:
         chance = SIGNIFICANT * np.sqrt(weight + TINY) / (count + TINY)
         beyond = rho * (1.0 - np.minimum(chance / np.maximum(rho, TINY), 1.0) ** 2)
         most = np.maximum((N - 1.0) / (N + 1.0), rho)
-        unbiased: Array = np.minimum(rho + 4.0 / N * beyond, most)
-        return unbiased
+        return np.asarray(np.minimum(rho + 4.0 / N * beyond, most))
 
     @property
     def scatter(self) -> Array:

@@ -70,8 +70,7 @@ def next_reference(filter_: Filter, window: Window) -> Array:
     """Return the reference at the window's start that is next: towards the estimate, (m,)."""
     step = _missed(filter_, window)
     step = step * min(1.0, TRUSTED / max(float(np.abs(step).max()), 1e-300))
-    q: Array = window.reference + filter_.reduction.Phi @ step
-    return q
+    return window.reference + filter_.reduction.Phi @ step
 
 
 def missed_most(filter_: Filter, window: Window) -> float:
@@ -142,24 +141,7 @@ def _iterated(work: SensitivityWork, state: SensitivityState) -> tuple[Sensitivi
     # While all directions keep most of their variance, no estimate has moved far enough for its
     # linearisation to matter.
     if shares[0] < HALF:
-        samples = _Samples.of(work, state)
-        # A search needs neither the ledger nor the errors of the discretisation, which cost twice
-        # as much again.
-        searched = samples.unaccompanied
-        best = iterated_smoother(searched)
-        if best is not None and not searched.believable(best):
-            best = None  # such a trajectory has not found the samples but lost them
-        moved = math.inf if best is None else apart(work.filter, best.x, state.now)
-        found = None if best is None else best.x
-        if best is not None and searched is not samples:
-            now = state.now
-            if moved <= holds and usual(now) and now.C.shape[1] == now.C.shape[2]:
-                # Ledger and errors of the discretisation are linear about the trajectory, on the
-                # rows of the square root, which are those of the prior: updates move them alike.
-                found = changed(best.x, ledger=now.ledger, causes=now.causes, shadows=now.shadows)
-            else:
-                whole = samples.about(best.trajectory)
-                found = None if whole is None else whole.x
+        found, moved = _searched(work, state, holds)
         if found is not None:
             # Earlier values would cost columns in each later update.
             found = changed(found, past=found.past[:, :, :0], dpast=found.dpast[:, :0])
@@ -170,6 +152,32 @@ def _iterated(work: SensitivityWork, state: SensitivityState) -> tuple[Sensitivi
     if count >= work.window:
         return new_window(work, state.now, state), moved
     return changed(state, due=2 * state.assimilated), moved
+
+
+def _searched(
+    work: SensitivityWork, state: SensitivityState, holds: float
+) -> tuple[FilterState | None, float]:
+    """Return the filter about the most probable trajectory, and how far that has moved it.
+
+    None and infinity if no trajectory is possible. `holds`: a move that changes no linearisation.
+    """
+    samples, now = _Samples.of(work, state), state.now
+    # A search needs neither the ledger nor the errors of the discretisation, which cost twice as
+    # much again.
+    searched = samples.unaccompanied
+    best = iterated_smoother(searched)
+    if best is None or not searched.believable(best):  # it has not found the samples but lost them
+        return None, math.inf
+    moved = apart(work.filter, best.x, now)
+    if searched is samples:
+        return best.x, moved
+    if moved <= holds and usual(now) and now.C.shape[1] == now.C.shape[2]:
+        # Ledger and errors of the discretisation are linear about the trajectory, on the rows of
+        # the square root, which are those of the prior: updates move them alike.
+        parts = {"ledger": now.ledger, "causes": now.causes, "shadows": now.shadows}
+        return changed(best.x, **parts), moved
+    whole = samples.about(best.trajectory)
+    return None if whole is None else whole.x, moved
 
 
 def iterated_smoother(samples: _Samples) -> _Pass | None:
@@ -228,8 +236,7 @@ def _shares(before: FilterState, now: FilterState) -> Array:
     # Eigenvalues of the covariance now relative to that at the start: they have no units.
     earlier, later = before.C[0].T @ before.C[0], now.C[0].T @ now.C[0]
     # The eigenproblem needs a definite matrix, also where a coordinate began without variance.
-    found: Array = eigh(later, earlier + 1e-12 * np.trace(earlier) * np.eye(len(later)))[0]
-    return found
+    return np.asarray(eigh(later, earlier + 1e-12 * np.trace(earlier) * np.eye(len(later)))[0])
 
 
 def apart(filter_: Filter, x: FilterState, other: FilterState) -> float:
@@ -293,8 +300,7 @@ class _Samples:
         """Reduced unknowns as the filter estimates them now, shape (k,)."""
         filter_ = self.work.filter
         estimate = filter_.estimate(self.state.now) - filter_.problem.model.latent.prior
-        reached: Array = filter_.reduction.reduced(estimate)[0]
-        return reached
+        return np.asarray(filter_.reduction.reduced(estimate)[0])
 
     def about(self, trajectory: Array | None) -> _Pass | None:
         """Assimilate the samples, linear about a trajectory or each estimate; None if it fails."""
@@ -324,7 +330,6 @@ class _Samples:
         x = self._remembered(x)
         # The prior of the start is a ~ N(0, I): minus twice its logarithm is |a|^2.
         followed = [reduction.reduced(x.q[0] - prior)]
-        nothing = np.zeros((1, reduction.size))
         misfit += float(followed[0] @ followed[0])
         for number, interval in enumerate(self.intervals, start=1):
             h = interval.t1 - interval.t0
@@ -333,19 +338,24 @@ class _Samples:
             elif filter_.moves:
                 x = expecting(filter_, x, trajectory[number], h)
             x, told = assimilate(filter_, x, filter_.span(interval), self.work.options)
-            if self._unlike(x) or not (told.status.ok and told.finite[0]):
+            if self._unlike(x) or not told.good:
                 return None
             x = self._remembered(x)
             followed.append(reduction.reduced(x.q[0] - prior))
             misfit += missed(filter_, x, interval)
-            if filter_.moves:
-                # The density of an increment is that given the value before: its variance is that
-                # of the process noise alone.
-                gained = reduction.gained(h, nothing, filter_.drifts(x.member))[0]
-                misfit += moved(filter_, followed[-2], followed[-1], h, gained)
+            misfit += self._moved(followed, x, h)
         x = x if filter_.moves else filter_.remembered(x)  # what stays is now as it always was
         smoothed = np.broadcast_to(x.dpast[0].reshape(-1, x.C.shape[2]), np.shape(followed))
         return _Pass(np.array(followed), smoothed, x, misfit)
+
+    def _moved(self, followed: Sequence[Array], x: FilterState, h: float) -> float:
+        """Return what the last increment of the unknowns adds to the misfit."""
+        filter_, reduction = self.work.filter, self.work.filter.reduction
+        if not filter_.moves:
+            return 0.0
+        # Its density is that given the value before: its variance is that of the process noise.
+        gained = reduction.gained(h, np.zeros((1, reduction.size)), filter_.drifts(x.member))[0]
+        return moved(filter_, followed[-2], followed[-1], h, gained)
 
     def _remembered(self, x: FilterState) -> FilterState:
         return self.work.filter.remembered(x) if self.work.filter.moves else x

@@ -62,7 +62,6 @@ class Status:
 
     @classmethod
     def of(cls, failure: StepFailed) -> Status:
-        """Return the status of a failed step."""
         return cls(failure.code, failure.detail)
 
     def __str__(self) -> str:
@@ -258,8 +257,7 @@ class Belief:
             return np.full(len(self.q[rows]), np.nan)
         before = np.linalg.norm(self.prior_factor[rows], axis=1)
         after = np.linalg.norm(self.q_factor[rows], axis=1)
-        left: Array = after / np.where(before > 0.0, before, np.nan)
-        return left
+        return np.asarray(after / np.where(before > 0.0, before, np.nan))
 
     def modes_left(self, part: Any) -> Array:
         """Return the remaining share of the prior standard deviation of modes of a part of q.
@@ -278,8 +276,7 @@ class Belief:
 
 
 def _deviation(factor: Array) -> Array:
-    std: Array = np.sqrt((factor**2).sum(axis=1))
-    return std
+    return np.asarray(np.sqrt((factor**2).sum(axis=1)))
 
 
 @dataclass(frozen=True, eq=False)

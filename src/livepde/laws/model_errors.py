@@ -21,6 +21,7 @@ from livepde.fem import Inputs, Moment, Scalar
 from livepde.laws.error_columns import FULL, MOST_WORK, SMALL, ErrorColumns, beyond_rounding, hats
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
+from livepde.laws.law import Problem
 from livepde.laws.policies import Refit
 from livepde.laws.refit import plausible
 from livepde.laws.stored_samples import Passed, StoredSamples, principal
@@ -88,19 +89,9 @@ def _sensor_columns(
         (-rate, math.inf),
     ]
     common = [(change, MOST_GAIN), (-rate, math.inf)]
-    positions = stated_positions(problem.observed)
-    shifts, step = sensor_shifts(problem.model, problem.observed)
-    for axis, matrix in enumerate(shifts):
-        size = abs(matrix)
-        slope = np.array([matrix @ u for u in states]) / step
-        terms = np.array([size @ np.abs(u) for u in states]) / step
-        for k in range(sensors):
-            slope[:, k] = beyond_rounding(slope[:, k], terms[:, k])
-        vertices = np.asarray(problem.model.mesh.p)[axis]
-        low, high = float(vertices.min()), float(vertices.max())
+    for slope, step, depths in _misplaced(problem, states):
         each.append((slope, FARTHEST / SHIFT * step))
-        at = np.zeros(sensors) if positions is None else np.nan_to_num(positions[:, axis])
-        common += [(slope * (at - end), FARTHEST) for end in (low, high)]  # depths from either
+        common += [(slope * depth, FARTHEST) for depth in depths]
     for effect, most in each:
         for k in range(sensors):
             own = np.zeros_like(predicted)
@@ -108,6 +99,27 @@ def _sensor_columns(
             yield own, float(np.broadcast_to(most, sensors)[k])
     for effect, most in common:
         yield effect, most
+
+
+def _misplaced(
+    problem: Problem, states: Sequence[Array]
+) -> Iterator[tuple[Array, Array, tuple[Array, Array]]]:
+    """Iterate over the axes along which sensors may be off.
+
+    Slopes of the readings there, (samples, sensors), usual shifts, and depths from either end of
+    the domain, (sensors,).
+    """
+    positions = stated_positions(problem.observed)
+    shifts, step = sensor_shifts(problem.model, problem.observed)
+    for axis, matrix in enumerate(shifts):
+        size = abs(matrix)
+        slope = np.array([matrix @ u for u in states]) / step
+        terms = np.array([size @ np.abs(u) for u in states]) / step
+        for k in range(len(step)):
+            slope[:, k] = beyond_rounding(slope[:, k], terms[:, k])
+        vertices = np.asarray(problem.model.mesh.p)[axis]
+        at = np.zeros(len(step)) if positions is None else np.nan_to_num(positions[:, axis])
+        yield slope, step, (at - float(vertices.min()), at - float(vertices.max()))
 
 
 def _slow_noise(times: Array, sensors: int, count: int) -> tuple[Array, Array]:
@@ -131,8 +143,7 @@ def _root(modes: Array, count: int, time: float) -> Array:
         each = np.exp(-np.abs(nodes[:, None] - nodes) / time)
     sizes, axes = np.linalg.eigh(each)
     one = axes * np.sqrt(np.maximum(sizes, 0.0))
-    found: Array = np.kron(np.diag(1.0 / (1.0 + modes)), one)
-    return found
+    return np.kron(np.diag(1.0 / (1.0 + modes)), one)
 
 
 Roots: TypeAlias = Callable[[float], Array]
@@ -343,7 +354,7 @@ def linear_model(
     numbers = FULL if fine else SMALL
     errors = ErrorColumns(samples, numbers)
     answers, states, predicted = errors.followed(one)
-    noise = samples.noise
+    noise, times, sensors = samples.noise, samples.times, predicted.shape[1]
     level = _level(one.residuals, used)
     parts: list[Array] = []
     causes: list[tuple[int, float]] = []
@@ -358,27 +369,24 @@ def linear_model(
         return np.arange(place - flat.shape[1], place)
 
     own = add(answers)
+    columns_of = zip(errors.first, errors.answers, strict=True)
     family: dict[str, list[tuple[float, IntArray, int]]] = {}
-    for first, (answer, course) in zip(errors.first, errors.answers, strict=True):
+    for first, (answer, course) in columns_of:
         columns = own[first : first + course.size]
         if answer.kind in ("source", "conductivity", "flow"):
             family.setdefault(answer.kind, []).append((answer.mode, columns, course.size))
-            continue
-        causes += [(column, math.inf) for column in columns.tolist()]
+        else:
+            causes += [(column, math.inf) for column in columns.tolist()]
     for kind, members in family.items():
-        modes = np.array([mode for mode, _, _ in members])
-        modes -= modes.min()
-        count = members[0][2]
-        columns = np.concatenate([one for _, one, _ in members])
-        families[kind] = (columns, partial(_root, modes, count))
+        modes, each, sizes = zip(*members, strict=True)
+        number = np.array(modes) - min(modes)
+        families[kind] = (np.concatenate(each), partial(_root, number, sizes[0]))
     J = one.slopes / level
     stated = _basis_of_sensors(samples, J[used])
     for effect, largest in _sensor_columns(samples, predicted, states):
         column = int(add(effect[:, :, None])[0])
         parts[-1] = _beyond(parts[-1], stated)
         causes.append((column, largest))
-    times = samples.times
-    sensors = predicted.shape[1]
     together, apart = _slow_noise(times, sensors, numbers.noise)
     families["common"] = (add(together), partial(_root, np.zeros(1), numbers.noise))
     if 1 < sensors <= MOST_SENSORS:
@@ -389,8 +397,7 @@ def linear_model(
     # Beside a missing position of a sensor that moves, rates are not known.
     known = np.isfinite(Z).all(axis=1)
     J, z, Z = J[known], z[known], Z[known]
-    columns = np.array([column for column, _ in causes])
-    most = np.array([largest for _, largest in causes])
+    columns, most = map(np.array, zip(*causes, strict=True))
     single = Causes(columns, most, CAUSE_SIZES)
     return LinearModel(J=J, Z=Z, z=z, T=T), single, list(_families(families))
 

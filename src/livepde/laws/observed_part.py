@@ -167,8 +167,7 @@ class SmoothingOperator:
 
     def _removed(self, alpha: Array | float) -> Array:
         s, k = self.spectral.s, self.spectral.k
-        out: Array = (alpha * k / (s + alpha * k)) ** ORDER
-        return out
+        return np.asarray((alpha * k / (s + alpha * k)) ** ORDER)
 
     def _rough(self, z: Array, boundary: Array) -> tuple[Array, Array]:
         """Return the modes of the data, and those less the smooth continuation of the boundary.
@@ -231,8 +230,7 @@ class SmoothingOperator:
         if self.size == 0:
             return np.zeros(len(boundary))
         modes, rough = (part[:, 0] for part in self._rough(z[None], boundary[None]))
-        u: Array = self.spectral.phi @ (modes - self._removed(alpha) * rough)
-        return u
+        return np.asarray(self.spectral.phi @ (modes - self._removed(alpha) * rough))
 
 
 Find: TypeAlias = Callable[[Array, Array | None], Reconstructed]

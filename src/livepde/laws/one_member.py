@@ -23,7 +23,7 @@ from livepde.laws.iterated_smoother import (
     placed,
 )
 from livepde.laws.law import Report, Status
-from livepde.laws.policies import Guards, Jumps
+from livepde.laws.policies import Guards, Jumps, Watch
 from livepde.laws.sensitivity_state import (
     SensitivityState,
     SensitivityWork,
@@ -34,8 +34,9 @@ from livepde.laws.sensitivity_state import (
     without_past,
 )
 from livepde.laws.step_diagnostics import Diagnostics
-from livepde.linalg.member_arrays import changed
-from livepde.stepping import Interval
+from livepde.linalg import Mask
+from livepde.linalg.member_arrays import changed, where
+from livepde.stepping import Interval, Span
 
 NEAR_ONSETS = (-8, -6, -4, -3, -2, -1, 0, 1, 2, 3)  # of a first guess of when a jump was
 TEMPER = 10.0  # factor on the noise of a sample whose Gauss-Newton steps do not converge
@@ -49,7 +50,7 @@ def step_alone(
     if (guards := work.guards) is not None:
         new, report = _rescued(work, guards, state, interval, new, report)
     if report.status.ok and (jumps := work.jumps) is not None:
-        new, report = _watched(work, jumps, state, interval, new, report)
+        new, report = _jumped(work, jumps, state, interval, new, report)
     return new, report
 
 
@@ -235,16 +236,35 @@ def _likelihood(
     work: SensitivityWork, jumps: Jumps, x: FilterState, intervals: Sequence[Interval]
 ) -> float:
     """Return the logarithm of the likelihood of all samples if the unknowns jump now."""
-    x = work.filter.inflated(x, jumps.size, work.jumping)
+    x, status = _after(work, work.filter.inflated(x, jumps.size, work.jumping), intervals)
+    return float(x.evidence[0]) if status.ok else -np.inf
+
+
+def _after(
+    work: SensitivityWork, x: FilterState, intervals: Sequence[Interval]
+) -> tuple[FilterState, Status]:
+    """Return the filter after samples, up to the first that fails, and whether one does."""
+    status = Status()
     for interval in intervals:
         x, report = filtered(work, x, interval)
-        x = work.filter.relinearised(x)
-        if not report.status.ok:
-            return -np.inf
-    return float(x.evidence[0])
+        x, status = work.filter.relinearised(x), report.status
+        if not status.ok:
+            break
+    return x, status
 
 
-def _watched(
+def watched(
+    work: SensitivityWork, jumps: Jumps, state: SensitivityState, x: FilterState, span: Span
+) -> tuple[Watch, Mask]:
+    """Return the innovations watched for jumps after a sample, and members with an alarm."""
+    screened, present = x.screened, span.present
+    gaps, newest = work.filter.input_gaps(span), x.innovations.newest
+    seen, alarm = jumps.add(state.watch, newest, screened.refused, screened.run, gaps)
+    # Without a reading `newest` is that of an earlier sample, which has been counted.
+    return where(np.broadcast_to(present, alarm.shape), seen, state.watch), alarm & present
+
+
+def _jumped(
     work: SensitivityWork,
     jumps: Jumps,
     state: SensitivityState,
@@ -259,35 +279,29 @@ def _watched(
     """
     if not interval.present.any():  # there is no innovation, and `newest` is that of before
         return new, report
+    watch, alarm = watched(work, jumps, state, new.now, work.filter.span(interval))
+    new = changed(new, watch=watch)
+    if not alarm[0]:
+        return new, report
     screened, e = new.now.screened, new.now.innovations.newest
-    gaps = work.filter.input_gaps(work.filter.span(interval))
-    watch, alarms = jumps.add(state.watch, e, screened.refused, screened.run, gaps)
-    alarm, new = bool(alarms[0]), changed(new, watch=watch)
-    if alarm:
-        row = int(state.since_older[0])
-        known = [*_since(work, state, row), interval]
-        # Values that the gate has refused in a row do not count in the onset, and belong to it.
-        doubted = int(np.where(screened.aside, 0, screened.refused).max())
-        moving = np.where(state.watch.repeating(screened.run), np.nan, e)
-        onset = max(jumps.onset(state.watch, moving), doubted)
-        guess = len(known) - reaching([bool(item.present.any()) for item in known], onset)
-        before = _most_likely(work, jumps, state.older, known, guess)
-        x, status = changed(work.filter.relinearised(state.older), kept=new.now.kept), Status()
-        for earlier in known[:before]:
-            x, found = filtered(work, x, earlier)
-            x, status = work.filter.relinearised(x), found.status
-            if not status.ok:
-                break
-        start = work.filter.inflated(x, jumps.size, work.jumping)
-        # Rows of samples that this member did not take have no time: they are not counted.
-        taken = np.flatnonzero(np.isfinite(state.log[0, row:, 0]))
-        at = row + int(taken[before])
-        again, found = _retaken(work, new, start, at, known[before:])
-        if status.ok and found.status.ok:
-            new = again
-        else:
-            now = work.filter.relinearised(new.now)
-            new = new_window(work, work.filter.inflated(now, jumps.size, work.jumping), new)
-        since = float(len(known) - before)
-        report = report.updated(Diagnostics(jump=1.0, jump_samples=since))
-    return new, report
+    row = int(state.since_older[0])
+    known = [*_since(work, state, row), interval]
+    # Values that the gate has refused in a row do not count in the onset, and belong to it.
+    doubted = int(np.where(screened.aside, 0, screened.refused).max())
+    moving = np.where(state.watch.repeating(screened.run), np.nan, e)
+    onset = max(jumps.onset(state.watch, moving), doubted)
+    guess = len(known) - reaching([bool(item.present.any()) for item in known], onset)
+    before = _most_likely(work, jumps, state.older, known, guess)
+    x = changed(work.filter.relinearised(state.older), kept=new.now.kept)
+    x, status = _after(work, x, known[:before])
+    start = work.filter.inflated(x, jumps.size, work.jumping)
+    # Rows of samples that this member did not take have no time: they are not counted.
+    taken = np.flatnonzero(np.isfinite(state.log[0, row:, 0]))
+    again, found = _retaken(work, new, start, row + int(taken[before]), known[before:])
+    if status.ok and found.status.ok:
+        new = again
+    else:
+        now = work.filter.relinearised(new.now)
+        new = new_window(work, work.filter.inflated(now, jumps.size, work.jumping), new)
+    since = float(len(known) - before)
+    return new, report.updated(Diagnostics(jump=1.0, jump_samples=since))

@@ -124,8 +124,7 @@ class Guards:
 
         `change` is that of the reduced unknowns, in prior standard deviations, (members, k).
         """
-        near: Mask = np.abs(change).max(axis=1, initial=0.0) <= self.reach
-        return near
+        return np.asarray(np.abs(change).max(axis=1, initial=0.0) <= self.reach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +263,6 @@ class Jumps:
         return 2 ** np.arange(int(np.log2(self.window)) + 1) - 1
 
     def start(self, sensors: int, members: int = 1) -> Watch:
-        """Return the value before any innovation."""
         zero, none = np.zeros((members, self.window)), np.zeros(members, dtype=np.int64)
         usual = Innovations.start(sensors, members)
         repeats = np.zeros((members, sensors), dtype=np.int64)
@@ -280,15 +278,9 @@ class Jumps:
     ) -> tuple[Watch, Mask]:
         """Return the value after a sample, and for which members there is an alarm.
 
-        Parameters
-        ----------
-        e
-            Normalised innovations, shape (members, sensors), NaN where missing.
-        refused, run
-            As for `Watch.add` and `Watch.repeating`; None: no reading repeats one.
-        unread
-            Members with an input that was not read, (members,): what it did is no jump of an
-            unknown, and moves the state for some time; None: there are none.
+        `e`: normalised innovations, shape (members, sensors), NaN where missing. `refused`, `run`:
+        as for `Watch.add` and `Watch.repeating`. `unread`: members with an input that was not read,
+        (members,): what it did is no jump of an unknown, and moves the state for some time.
         """
         if unread is not None:
             watch, e = watch.interrupted(unread, self.settle), np.where(unread[:, None], np.nan, e)

@@ -28,7 +28,6 @@ class ReducedEvolution:
     std: float
 
     def transition(self, h: float) -> Array:
-        """Return the transition of its coordinates in a time h."""
         # Copies, as the harmonics of a periodic unknown, move by F; every mode of a copy moves
         # alike.
         F = self.model.transition(h)
@@ -205,8 +204,7 @@ class Reduction:
 
     def reduced(self, dq: Array) -> Array:
         """Return a with Phi a = dq, (..., k) for (..., m): columns of Phi are orthonormal in Q."""
-        a: Array = dq @ self._dual
-        return a
+        return dq @ self._dual
 
     @cached_property
     def ends(self) -> tuple[Array, Array]:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
@@ -24,6 +23,7 @@ import scipy
 
 from livepde.laws.assimilation import assimilate
 from livepde.laws.filter_state import FilterState
+from livepde.laws.gate import FEW, near_most, near_neighbours, usual_size
 from livepde.laws.history import intervals_since
 from livepde.laws.iterated_smoother import HOLDS, apart, iterate_starts, usual
 from livepde.laws.law import numerical
@@ -40,9 +40,6 @@ from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.linalg.member_arrays import changed, put_each, take
 
-NEIGHBOURS = 3  # in time, to each side of a value
-FEW = 2 * NEIGHBOURS  # values of a sensor up to which all count as near
-NORMAL = 1.4826  # standard deviation of normal values over the median of their sizes
 DELTA = 1.5  # prior standard deviations of the first step at most: 0.5 to 3 do much the same
 ENDS = 0.03  # posterior standard deviations of a last step
 ENDS_EARLY = 1.0  # the same where the samples will be fitted again when there are twice as many
@@ -79,64 +76,6 @@ UNDER_WAY: WeakKeyDictionary[FilterState, Future[SensitivityState]] = WeakKeyDic
 LOCK = threading.Lock()
 
 
-def usual_size(values: Array) -> float:
-    """Return the standard deviation by the median of the sizes of values, at least 1."""
-    return max(1.0, NORMAL * float(np.median(np.abs(values)))) if len(values) else 1.0
-
-
-def near_neighbours(values: Array, limit: float) -> Mask:
-    """Return which values lie within `limit` usual distances from the median of their neighbours.
-
-    A model error, which changes slowly, stays. Values that are near tell about the others: among
-    several wild ones in a row the neighbours of one are no measure.
-    """
-    first = _near(values, limit, _of_neighbours)
-    near = first.copy()
-    for k, column in enumerate(values.T):
-        (kept,) = first[:, k].nonzero()
-        if len(kept) <= FEW:
-            continue
-        (others,) = (np.isfinite(column) & ~first[:, k]).nonzero()
-        away = np.full(len(column), np.nan)
-        away[kept] = column[kept] - _of_neighbours(column[kept])
-        begin = np.searchsorted(kept, others) - NEIGHBOURS
-        begin = np.clip(begin, 0, len(kept) - 2 * NEIGHBOURS)
-        around = kept[begin[:, None] + np.arange(2 * NEIGHBOURS)]
-        away[others] = column[others] - np.median(column[around], axis=1)
-        near[:, k] = np.abs(away) <= limit * usual_size(away[kept])
-    return near
-
-
-def near_most(values: Array, limit: float) -> Mask:
-    """Return which values lie within `limit` usual distances from the median of all of a sensor.
-
-    A sensor that shows a wrong constant for some time has neighbours that agree with it.
-    """
-    return _near(values, limit, np.median)
-
-
-def _near(values: Array, limit: float, centre: Callable[[Array], Array]) -> Mask:
-    """Return which values lie within `limit` usual distances from the centre of their sensor."""
-    near = np.isfinite(values)
-    for k, column in enumerate(values.T):
-        (places,) = near[:, k].nonzero()
-        if len(places) > FEW:
-            away = column[places] - centre(column[places])
-            near[places, k] = np.abs(away) <= limit * usual_size(away)
-    return near
-
-
-def _of_neighbours(values: Array) -> Array:
-    """Return the median of the neighbours of each value, itself left out, shape (count,)."""
-    count, reach = len(values), NEIGHBOURS
-    windows = np.lib.stride_tricks.sliding_window_view(values, 2 * reach + 1)
-    inner = np.median(np.delete(windows, reach, axis=1), axis=1)
-    edges = {k: np.r_[0:k, k + 1 : 2 * reach + 1] for k in range(reach)}
-    first = [np.median(values[which]) for which in edges.values()]
-    last = [np.median(values[count - 1 - which]) for which in edges.values()]
-    return np.concatenate([first, inner, last[::-1]])
-
-
 @dataclass(frozen=True, eq=False)
 class Found:
     """End of a search."""
@@ -160,15 +99,7 @@ def refitted(
     search had that began again at screened points in vain.
     """
     search = _Search(samples, options, last, lacking=1 if screened else AGREED)
-    start = samples.reached
-    search.descend(start)
-    screens = search.suspicious and len(samples) >= (ANEW_LAST if last else ANEW) * screened
-    if screens:
-        search.screen()
-    elif screened and search.best and np.linalg.norm(search.best.xi - start) < STAYS:
-        search.lacking = 0  # fewer samples have shown that there is no other end
-    if last and search.lost:
-        search.draw()
+    screens = search.search(screened)
     if search.best is None:
         return None
     for _ in range(GATE_ROUNDS if samples.gated else 0):
@@ -235,6 +166,24 @@ class _Search:
                 near[:, k] &= np.abs(column) <= limit * usual
         return near
 
+    def search(self, screened: int) -> bool:
+        """Search from the present estimate, and from elsewhere if the end needs it.
+
+        `screened` as in `refitted`. Returns whether it began again at screened points.
+        """
+        start = self.samples.reached
+        self.descend(start)
+        screens = self.suspicious and (
+            len(self.samples) >= (ANEW_LAST if self.last else ANEW) * screened
+        )
+        if screens:
+            self.screen()
+        elif screened and self.best and np.linalg.norm(self.best.xi - start) < STAYS:
+            self.lacking = 0  # fewer samples have shown that there is no other end
+        if self.last and self.lost:
+            self.draw()
+        return screens
+
     def begin(self, used: Mask) -> None:
         """Search again from the best trajectory, with other readings in use."""
         before, self.used, self.best = self.best, used, None
@@ -270,24 +219,18 @@ class _Search:
         end, settled, ends = start, False, ENDS if self.last else ENDS_EARLY
         budget, delta = self.passes + self.options.passes, DELTA
         while self.passes < budget:
-            if math.sqrt(2.0 * self._decrease(end)) < ends:
+            H, g = end.model(self.used)
+            model = _Quadratic.of(H, g, self._free(end, g))
+            if math.sqrt(2.0 * model.decrease) < ends:
                 settled = True
                 break
-            better, delta = self._stepped(end, delta, budget)
+            better, delta = self._stepped(end, model, delta, budget)
             if better is None:
                 break
             end = better
         if self.best is None or end.cost(self.used) < self.best.cost(self.used):
             self.best, self.settled = end, settled
         return end
-
-    def _decrease(self, one: Passed) -> float:
-        """Return by how much the quadratic model of the cost falls to its minimum."""
-        H, g = one.model(self.used)
-        free = self._free(one, g)
-        sizes, axes = principal(free.T @ H @ free)
-        along = axes.T @ (free.T @ g)
-        return 0.5 * float((along**2 / sizes).sum())
 
     def _free(self, one: Passed, g: Array) -> Array:
         """Return a basis of the directions in which no bound is in the way, (r, free)."""
@@ -302,53 +245,60 @@ class _Search:
         if not held.any():
             return np.eye(len(g))
         rows = (reduction.Phi @ start.C[0].T)[held]
-        basis: Array = scipy.linalg.null_space(rows)
-        return basis
+        return np.asarray(scipy.linalg.null_space(rows))
 
-    def _stepped(self, one: Passed, delta: float, budget: float) -> tuple[Passed | None, float]:
+    def _stepped(
+        self, one: Passed, model: _Quadratic, delta: float, budget: float
+    ) -> tuple[Passed | None, float]:
         """Return the pass after an accepted step, None if there is none, and the trust region."""
-        H, g = one.model(self.used)
-        free, cost = self._free(one, g), one.cost(self.used)
-        sizes, axes = principal(free.T @ H @ free)
-        axes = free @ axes
-        along, bend = axes.T @ g, None
+        cost, bend = one.cost(self.used), None
         several = 1  # one trial, and where it fails shorter ones at once
         while self.passes < budget:
-            steps, predicted = [], []
-            for radius in delta * SHORTER ** np.arange(several):
-                shift = _shift(sizes, along, radius)
-                step = axes @ (along / (sizes + shift))
-                gain = float(g @ step - 0.5 * step @ H @ step)
-                if np.linalg.norm(step) < SHORTEST or gain < LEAST * cost:
-                    break
-                if several == 1 and np.linalg.norm(step) < SHORT:
-                    better = self._about(self.samples.within_bounds(one.xi + step))
-                    if better is not None and cost - better.cost(self.used) > ACCEPTED * gain:
-                        return better, delta
-                if bend is None:
-                    bend = self._bend(one, step)
-                curved = axes @ ((axes.T @ (bend * (step @ step))) / (sizes + shift))
-                if np.linalg.norm(curved) < CURVED * np.linalg.norm(step):
-                    step = step + 0.5 * curved
-                steps.append(self.samples.within_bounds(one.xi + step) - one.xi)
-                predicted.append(gain)
+            if several == 1 and (better := self._short_step(one, model, delta)):
+                return better, delta
+            steps, predicted, bend = self._trials(one, model, delta, several, bend)
             if not steps:
                 return None, delta
             tried, taken = self.samples.costs(one.xi + np.array(steps), self.used, cost)
             self.passes += taken
             best = int(np.argmin(tried))
-            length = float(np.linalg.norm(steps[best]))
             ratio = (cost - float(tried[best])) / predicted[best]
-            if ratio < POOR:
-                delta = length * (SHORTER if ratio > 0.0 else SHORTER**2)
-            elif ratio > GOOD:
-                delta = max(delta, 2.0 * length)
+            delta = _trusted(delta, float(np.linalg.norm(steps[best])), ratio)
             several = self.samples.together
-            if ratio > ACCEPTED:
-                better = self._about(one.xi + steps[best])
-                if better is not None:
-                    return better, delta
+            if ratio > ACCEPTED and (better := self._about(one.xi + steps[best])):
+                return better, delta
         return None, delta
+
+    def _trials(
+        self, one: Passed, model: _Quadratic, delta: float, several: int, bend: Array | None
+    ) -> tuple[list[Array], list[float], Array | None]:
+        """Return steps of shrinking length, the decrease that each predicts, and the bend.
+
+        `bend`: that of `_bend`, None before it is known.
+        """
+        steps, predicted, cost = list[Array](), list[float](), one.cost(self.used)
+        for radius in delta * SHORTER ** np.arange(several):
+            step, shift = model.step(radius)
+            gain = model.gain(step)
+            if np.linalg.norm(step) < SHORTEST or gain < LEAST * cost:
+                break
+            bend = self._bend(one, step) if bend is None else bend
+            curved = model.shifted(model.axes.T @ (bend * (step @ step)), shift)
+            if np.linalg.norm(curved) < CURVED * np.linalg.norm(step):
+                step = step + 0.5 * curved
+            steps.append(self.samples.within_bounds(one.xi + step) - one.xi)
+            predicted.append(gain)
+        return steps, predicted, bend
+
+    def _short_step(self, one: Passed, model: _Quadratic, delta: float) -> Passed | None:
+        """Return the pass after a step so short that it needs no second-order part, or None."""
+        step, _ = model.step(delta)
+        gain, cost = model.gain(step), one.cost(self.used)
+        if not SHORTEST <= np.linalg.norm(step) < SHORT or gain < LEAST * cost:
+            return None
+        better = self._about(self.samples.within_bounds(one.xi + step))
+        accepted = better is not None and cost - better.cost(self.used) > ACCEPTED * gain
+        return better if accepted else None
 
     def _bend(self, one: Passed, step: Array) -> Array:
         """Return J' d2r/ds2 of the residuals r along a step, by a difference; zero if it fails."""
@@ -437,6 +387,47 @@ class _Search:
                 return
 
 
+@dataclass(frozen=True, eq=False)
+class _Quadratic:
+    """The quadratic model of the cost about a trajectory, in its free principal directions."""
+
+    # Hessian and direction of descent, principal values and axes, and g along these.
+    H: Array
+    g: Array
+    sizes: Array
+    axes: Array
+    along: Array
+    decrease: float  # by which the model falls to its minimum
+
+    @classmethod
+    def of(cls, H: Array, g: Array, free: Array) -> _Quadratic:
+        """Return the model in directions with the basis `free`, (r, free)."""
+        sizes, axes = principal(free.T @ H @ free)
+        decrease = 0.5 * float(((axes.T @ (free.T @ g)) ** 2 / sizes).sum())
+        axes = free @ axes
+        return cls(H, g, sizes, axes, axes.T @ g, decrease)
+
+    def step(self, radius: float) -> tuple[Array, float]:
+        """Return the step to the minimum within a ball, and the shift of the Hessian for it."""
+        shift = _shift(self.sizes, self.along, radius)
+        return self.shifted(self.along, shift), shift
+
+    def shifted(self, along: Array, shift: float) -> Array:
+        """Return the solution with a shifted Hessian, for a right side along the axes."""
+        return np.asarray(self.axes @ (along / (self.sizes + shift)))
+
+    def gain(self, step: Array) -> float:
+        """Return by how much the model falls with a step."""
+        return float(self.g @ step - 0.5 * step @ self.H @ step)
+
+
+def _trusted(delta: float, length: float, ratio: float) -> float:
+    """Return the trust region after a step, from the ratio of actual and predicted decrease."""
+    if ratio < POOR:
+        return length * (SHORTER if ratio > 0.0 else SHORTER**2)
+    return max(delta, 2.0 * length) if ratio > GOOD else delta
+
+
 def _shift(sizes: Array, g: Array, delta: float) -> float:
     """Return the shift of the Hessian with which the minimum of the model is within a ball."""
     if np.linalg.norm(g / sizes) <= delta:
@@ -474,29 +465,38 @@ def _misfit(residuals: Array, readings: Array, used: Mask) -> float:
 
 
 def refit_due(
-    work: SensitivityWork, state: SensitivityState, due: Mask
+    work: SensitivityWork, state: SensitivityState
 ) -> tuple[SensitivityState, Diagnostics[Array] | None]:
     """Return all members after the refits that are due, and diagnostics if there was one."""
+    due, rows = state.assimilated >= state.due, state.log.shape[1]
+    if work.fits and 0 < work.window < rows:  # samples without a reading need room
+        due = due | (rows - state.window > work.window)
+    if not np.count_nonzero(due):
+        return state, None
     if not work.fits:
         return iterate_starts(work, state, due)
     if (options := work.refit) is None:
         return state, None
-    each: dict[int, SensitivityState] = {}
-    for k in np.flatnonzero(due).tolist():
-        one = take(state, k)
-        count = int(one.assimilated[0])
-        if max(count, one.log.shape[1] - 1 - int(one.window[0])) >= options.window:
-            one = new_window(work, one.now, one)
-        else:
-            # A window but the first begins with what is known: it has nothing to search for.
-            if count <= options.start and options.apart and len(state) == 1 and count > AT_ONCE:
-                one = changed(one, fork=Fork.of(one))
-            elif count <= options.start:
-                one = refitted_now(work, options, one)
-            later = 2 * count if 2 * count <= options.start else options.window
-            one = changed(one, due=np.array([later]))
-        each[k] = one
+    alone = len(state) == 1
+    which = np.flatnonzero(due).tolist()
+    each = {k: _after_due(work, options, take(state, k), alone=alone) for k in which}
     return put_each(state, each), None
+
+
+def _after_due(
+    work: SensitivityWork, options: Refit, state: SensitivityState, *, alone: bool
+) -> SensitivityState:
+    """Return one member after a refit that is due; `alone`: not of a fleet."""
+    count = int(state.assimilated[0])
+    if max(count, state.log.shape[1] - 1 - int(state.window[0])) >= options.window:
+        return new_window(work, state.now, state)
+    # A window but the first begins with what is known: it has nothing to search for.
+    if count <= options.start and options.apart and alone and count > AT_ONCE:
+        state = changed(state, fork=Fork.of(state))
+    elif count <= options.start:
+        state = refitted_now(work, options, state)
+    later = 2 * count if 2 * count <= options.start else options.window
+    return changed(state, due=np.array([later]))
 
 
 @nonfinite_allowed()  # such a trajectory is refused
@@ -512,18 +512,24 @@ def settle(
     for k in range(len(state)):
         one = take(state, k)
         if one.log.shape[1] and (one.assimilated[0] or one.opening[0]):
-            samples = StoredSamples.of(work, one)
-            one = changed(one, fork=Fork.none(one.now))  # this is a refit of more samples
-            try:
-                found = refitted(samples, options, last=True, screened=int(one.fit.screened[0]))
-                each[k] = _after(work, one, samples, found, last=True)
-            except Exception as error:
-                if numerical(error) is None:
-                    raise
-                each[k] = _after(work, one, samples, None, last=True)
-            else:
-                used[k] = None if found is None else found.used
+            each[k], used[k] = _settled(work, options, one)
     return put_each(state, each), used
+
+
+def _settled(
+    work: SensitivityWork, options: Refit, state: SensitivityState
+) -> tuple[SensitivityState, Mask | None]:
+    """Return one member after a last refit, and the readings it has used or None."""
+    samples = StoredSamples.of(work, state)
+    state = changed(state, fork=Fork.none(state.now))  # this is a refit of more samples
+    try:
+        found = refitted(samples, options, last=True, screened=int(state.fit.screened[0]))
+        after = _after(work, state, samples, found, last=True)
+    except Exception as error:
+        if numerical(error) is None:
+            raise
+        return _after(work, state, samples, None, last=True), None
+    return after, None if found is None else found.used
 
 
 def refitted_now(
@@ -636,7 +642,7 @@ def _caught_up(work: SensitivityWork, state: SensitivityState, fork: Fork) -> Se
     rows = state.log[:, row : row + 1 + AT_A_TIME]
     for interval in intervals_since(rows, work.filter.problem.channels):
         x, told = assimilate(work.filter, x, work.filter.span(interval), work.options)
-        if not (told.status.ok and told.finite[0]):
+        if not told.good:
             return _without(state, x)
         x, row = work.filter.relinearised(x), row + 1
     if row < last:

@@ -28,7 +28,7 @@ from livepde.laws.iterated_smoother import AGREED, Window, distance, next_refere
 from livepde.laws.law import Belief, Deferred, Fit, FixedInterval, Law, Problem, Report, finite
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.noise_rows import PAUSE_ROWS, input_rank, with_initial_rows
-from livepde.laws.one_member import step_alone
+from livepde.laws.one_member import step_alone, watched
 from livepde.laws.policies import Guards, Jumps, Refit
 from livepde.laws.reduction import Reduction
 from livepde.laws.refit import go_on, refit_due, settle
@@ -173,7 +173,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             (self.memory > 0, "memory", "positive"),
             (self.noise in (None, "auto") or stated, "noise", "a positive number or 'auto'"),
             *(
-                (part is None or isinstance(part, kind), name, f"a {kind.__name__}, or None")
+                (isinstance(part, kind | None), name, f"a {kind.__name__}, or None")
                 for part, name, kind in parts
             ),
             (isinstance(gate, int | float) and gate > 0, "gate", "positive"),
@@ -194,8 +194,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return True
 
     def reading_noise(self, work: SensitivityWork, state: SensitivityState) -> Array | None:
-        noise: Array = np.sqrt(state.now.level[0]) * work.filter.noise
-        return noise
+        return np.asarray(np.sqrt(state.now.level[0]) * work.filter.noise)
 
     def prepare(self, problem: Problem) -> SensitivityWork:
         observed, model = problem.observed, problem.model
@@ -310,8 +309,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             newer=x,
             since_older=zero,
             since_newer=zero,
-            log=empty_log(1, sensors, len(problem.channels)),
-            trial=empty_log(1, sensors, len(problem.channels)),
+            log=empty_log(sensors, len(problem.channels)),
+            trial=empty_log(sensors, len(problem.channels)),
             trial_start=zeros(x) if work.fits else x,
             watch=(self.jumps or Jumps()).start(sensors),
             scale=Scale.start(sensors),
@@ -409,16 +408,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             usual = np.array([status.ok for status in reports.statuses])
             if not usual.any():
                 return (new if len(state) > 1 else state), reports
-        due = new.assimilated >= new.due
-        if work.fits and 0 < work.window < new.log.shape[1]:  # samples without a reading need room
-            due = due | (new.log.shape[1] - new.window > work.window)
-        if np.count_nonzero(due):
-            new, moved = refit_due(work, new, due)
-            if moved is not None:
-                taken = usual
-                reports = reports.updated(
-                    moved.each(lambda number: np.where(taken, number, np.nan))
-                )
+        new, moved = refit_due(work, new)
+        if moved is not None:
+            taken = usual
+            reports = reports.updated(moved.each(lambda number: np.where(taken, number, np.nan)))
         if len(new.fork):
             new = go_on(work, new)
         return shortened(work, new), reports
@@ -436,23 +429,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             usual = usual & span.together
         scale = state.scale.add(span.z1, span.z1 - told.predicted)
         parts: dict[str, Any] = {"scale": scale.without_refused(state.scale, x.screened.refused)}
-        if (guards := self.guards) is not None:
-            far = np.abs(x.da - before.da) > guards.reach
-            if np.count_nonzero(far):
-                usual = usual & ~far.any(axis=1)
-            # Ranges are at least as large as the noise, so that smaller innovations cannot run
-            # away: most samples are spared the exact test.
-            if told.worst > guards.runaway:
-                noise = filter_.noise_of(before, span)
-                beyond = scale.beyond(span.z1 - told.predicted, noise)
-                usual = usual & ~(beyond > guards.runaway)
-        if (jumps := self.jumps) is not None and (present := span.present).any():
-            screened, newest = x.screened, x.innovations.newest
-            gaps = filter_.input_gaps(span)
-            seen, alarm = jumps.add(state.watch, newest, screened.refused, screened.run, gaps)
-            # Without a reading `newest` is that of an earlier sample, which has been counted.
-            parts["watch"] = where(np.broadcast_to(present, alarm.shape), seen, state.watch)
-            usual = usual & ~(alarm & present)
+        if self.guards is not None:
+            usual = usual & _within(self.guards, filter_, before, x, told, scale, span)
+        if self.jumps is not None and span.present.any():
+            parts["watch"], alarm = watched(work, self.jumps, state, x, span)
+            usual = usual & ~alarm
         if self.relinearises:
             x = filter_.relinearised(x)
         if np.count_nonzero(usual) < usual.size:
@@ -460,8 +441,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 return state, told, usual
             x = where(usual, x, before)
             parts = {name: where(usual, part, getattr(state, name)) for name, part in parts.items()}
-        anchored = None if told.anchored is None else np.asarray(told.anchored.any(axis=1))
-        return stored(work, state, x, span, usual, anchored, **parts), told, usual
+        return stored(work, state, x, span, usual, told.disturbed, **parts), told, usual
 
     def _apart(
         self,
@@ -560,7 +540,6 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return self._beliefs([(work, take(now, k))])[0]
 
     def _beliefs(self, samples: Sequence[tuple[SensitivityWork, FilterState]]) -> list[Belief]:
-        """Return the beliefs of one member after some samples."""
         (work, _), now = samples[0], joined([x for _, x in samples])
         reduction, drifts = work.filter.reduction, work.filter.drifts(now.member).tolist()
         Phi, ages, (U, C) = reduction.Phi, now.age.tolist(), self.factors(work, now)
@@ -575,6 +554,25 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             )
             for k in range(len(now))
         ]
+
+
+def _within(
+    guards: Guards,
+    filter_: Filter,
+    before: FilterState,
+    x: FilterState,
+    told: Assimilation,
+    scale: Scale,
+    span: Span,
+) -> Mask:
+    """Return which members a sample neither moves too far, nor finds far off, (members,)."""
+    near = guards.within_reach(x.da - before.da)
+    # Ranges are at least as large as the noise, so that smaller innovations cannot run away: most
+    # samples are spared the exact test.
+    if told.worst > guards.runaway:
+        beyond = scale.beyond(span.z1 - told.predicted, filter_.noise_of(before, span))
+        near = near & ~(beyond > guards.runaway)
+    return near
 
 
 def _started(work: SensitivityWork, state: SensitivityState, x: FilterState) -> SensitivityState:

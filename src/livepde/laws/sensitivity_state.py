@@ -57,7 +57,6 @@ class SensitivityWork:
 
     @cached_property
     def unjudged(self) -> SensitivityWork:
-        """The same without a ledger."""
         return replace(self, filter=replace(self.filter, judge=None))
 
     @cached_property
@@ -276,7 +275,6 @@ class Scale:
 
     @classmethod
     def start(cls, sensors: int, members: int = 1) -> Scale:
-        """Return the value before any sample."""
         never = np.full((members, sensors), np.nan)
         return cls(never, never, never)
 
@@ -332,14 +330,9 @@ def stored(
     if not work.keeps_log:
         return changed(state, now=now, **parts)
     log = added(state.log, span, taken, now.parts)
-    # A sensor that is set aside brings no measurements, from the first one that misfitted on.
-    if np.count_nonzero(now.screened.aside):
-        aside = now.screened.aside & taken[:, None]
-        kept = withdrawn(log, aside, now.screened.since)
-        if len(state.fork) and _differ(kept, log, int(state.fork.row[0])):
-            parts |= {"fork": Fork.none(now), "due": state.assimilated}
-        log = kept
     parts["log"] = log
+    if np.count_nonzero(now.screened.aside):
+        parts |= _set_aside(state, now, log, taken)
     if work.window:
         parts["assimilated"] = state.assimilated + (taken & span.present)
     # After a pause the state is another one, too.
@@ -349,19 +342,43 @@ def stored(
         parts |= _trial(work, state, now, span, disturbed=bool(begun[0] & ~pause[0]))
     if work.window and np.count_nonzero(begun):
         parts |= _windows_from(state, now, log.shape[1] - 1, begun)
+    parts |= _points_of_return(work, state, now, taken, log.shape[1] - 1)
+    return changed(state, now=now, **parts)
+
+
+def _set_aside(
+    state: SensitivityState, now: FilterState, log: Array, taken: Mask
+) -> dict[str, Any]:
+    """Return the fields that change with sensors set aside, which bring no measurements.
+
+    From the first one that misfitted on. A refit under way that has used one of them is dropped.
+    """
+    kept = withdrawn(log, now.screened.aside & taken[:, None], now.screened.since)
+    if kept is log or not len(state.fork):
+        return {"log": kept}
+    row = int(state.fork.row[0]) + 1
+    if np.array_equal(kept[:, :row], log[:, :row], equal_nan=True):
+        return {"log": kept}
+    return {"log": kept, "fork": Fork.none(now), "due": state.assimilated}
+
+
+def _points_of_return(
+    work: SensitivityWork, state: SensitivityState, now: FilterState, taken: Mask, last: int
+) -> dict[str, Any]:
+    """Return the fields of the earlier filters after a sample in the `last` row of the log."""
     # Two earlier filters suffice: every `back` samples the newer one becomes the older one, and the
     # law can go back by at least `back` samples and less than twice as many.
-    last = log.shape[1] - 1
-    if work.back and last - state.since_newer.min() >= work.back:
-        due = taken & (last - state.since_newer >= work.back)
-        if due.any():
-            parts |= {
-                "older": where(due, state.newer, state.older),
-                "newer": where(due, now, state.newer),
-                "since_older": np.where(due, state.since_newer, state.since_older),
-                "since_newer": np.where(due, last, state.since_newer),
-            }
-    return changed(state, now=now, **parts)
+    if not work.back or last - state.since_newer.min() < work.back:
+        return {}
+    due = taken & (last - state.since_newer >= work.back)
+    if not due.any():
+        return {}
+    return {
+        "older": where(due, state.newer, state.older),
+        "newer": where(due, now, state.newer),
+        "since_older": np.where(due, state.since_newer, state.since_older),
+        "since_newer": np.where(due, last, state.since_newer),
+    }
 
 
 def _trial(
@@ -388,13 +405,6 @@ def _trial(
     if work.fits:
         return {"trial": trimmed(trial, trial.shape[1]), "trial_start": zeros(now)}
     return {"trial": trimmed(trial, trial.shape[1] - 1), "trial_start": now}
-
-
-def _differ(log: Array, other: Array, row: int) -> bool:
-    """Return whether two logs have other readings up to a row, for a refit that is under way."""
-    if log is other:
-        return False
-    return not np.array_equal(log[:, : row + 1], other[:, : row + 1], equal_nan=True)
 
 
 def _windows_from(
@@ -464,11 +474,10 @@ def _diagnosed(
         found = replace(found, jump=np.zeros(len(now)))
     if shadows is not None:
         found = found.updated(shadows.diagnostics(now, robust_factors(reduction, now)[1]))
-    estimate = now.q + now.da @ reduction.Phi.T
-    if reduction.bounded(estimate) is not estimate:
-        held = reduction.held(estimate)
-        if held.any():  # not only by bounds that a user has set
-            found = replace(found, bounded=np.where(held > 0, held, np.nan))
+    estimate = work.filter.estimate(now)
+    held = reduction.held(estimate)
+    if held.any():
+        found = replace(found, bounded=np.where(held > 0, held, np.nan))
     if len(samples) == 1:
         return [found]
     return [found.each(itemgetter([k])) for k in range(len(samples))]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
@@ -381,7 +381,6 @@ class StepShadow(Shadow):
 
     @classmethod
     def of(cls, process: MeanProcess, tolerance: StepTolerance) -> StepShadow:
-        """Return the shadow of a process."""
         control = process.control.divided(2)
         # Richardson: e(h) = c h^p, so that e(h) - e(h/2) = (1 - 2^-p) e(h).
         ratio = 2.0**control.scheme.order
@@ -520,6 +519,17 @@ class HeldInputShadow(InputShadow):
         # `InputShadow` reads its lines from the same fields: what it adds to them must stay.
         both = {name: parts[name] + missed for name in ("bend", "missed")}
         return parts | both | {"held": held}
+
+
+def input_shadows(process: MeanProcess, problem: Problem) -> Iterator[InputShadow]:
+    """Iterate over the shadows of the channels that are lines, and of those that are held."""
+    held, own = problem.control.held, problem.model.channels
+    lines = np.array([float(name in own and name not in held) for name in problem.channels])
+    signs = np.array([float(name in held.next) - (name in held.last) for name in problem.channels])
+    if lines.any():
+        yield InputShadow(process, lines)
+    if signs.any():
+        yield HeldInputShadow(process, signs)
 
 
 @dataclass(frozen=True, eq=False)

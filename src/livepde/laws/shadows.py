@@ -30,14 +30,13 @@ from livepde.laws.law import Problem
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadow_kinds import (
     HELD,
-    HeldInputShadow,
-    InputShadow,
     MeanProcess,
     MeshShadow,
     Shadow,
     ShadowedSteps,
     StepShadow,
     StepTolerance,
+    input_shadows,
     refusal,
 )
 from livepde.laws.step_diagnostics import Diagnostics
@@ -135,7 +134,6 @@ class ShadowSet:
         *,
         moves: bool,
     ) -> ShadowSet:
-        """Return the shadows of a filter."""
         process = MeanProcess(problem.control, stage, reduction, moves)
         refused = refusal(problem, options.largest) if options.mesh else "mesh = false"
         found: list[Shadow] = []
@@ -149,14 +147,7 @@ class ShadowSet:
             except LivepdeError as error:
                 refused = f"there is no halved mesh: {str(error).rstrip('.')}"
         if options.inputs and problem.model.channels:
-            held, own = problem.control.held, problem.model.channels
-            signs = {name: 1.0 if name in held.next else -1.0 for name in (*held.next, *held.last)}
-            of_held = np.array([signs.get(name, 0.0) for name in problem.channels])
-            lines = np.array([float(name in own and name not in held) for name in problem.channels])
-            if lines.any():
-                found.append(InputShadow(process, lines))
-            if of_held.any():
-                found.append(HeldInputShadow(process, of_held))
+            found += input_shadows(process, problem)
         # Without a step shadow nothing tells how short steps have to be. Where steps are to be
         # those of the samples and no others (no halvings), they stay so.
         most = options.parts if options.step and problem.control.halvings else 1
@@ -216,15 +207,7 @@ class ShadowSet:
             parts["bend"] = np.where(rows, 0.0, parts["bend"])
             parts["missed"] = np.where(rows, s.missed, parts["missed"])
         s = changed(s, **parts)
-        # After a jump of the drive the error of the step is another one at once.
-        due = (s.count >= s.due) | jumps
-        # A switch after a rest ends a block, which is one line: not from before it to after it.
-        if span.row is not None and s.held.size:
-            switches = (span.row != span.inputs1) & np.isfinite(span.row) & (s.held[:, 1] == 0.0)
-            due = due | switches.any(axis=1)
-        # What gaps miss counts at once: later it might cancel with that of the next one.
-        if span.gaps is not None:
-            due = due | (span.gaps > 0.0).any(axis=(1, 2))
+        due = self._due(s, span, jumps)
         # A block is one step for all members in it, which therefore have to begin together.
         for t in sorted(set(s.begun[due].tolist())) if np.count_nonzero(due) else ():
             group = np.flatnonzero(due & (s.begun == t))
@@ -235,6 +218,20 @@ class ShadowSet:
                 new = self._add_errors(some, one, after, span.part(group), jumps[group])
                 s = put(s, group, new)
         return changed(end, shadows=s)
+
+    @staticmethod
+    def _due(s: ShadowState, span: Span, jumps: Mask) -> Mask:
+        """Return the members whose block ends with a span."""
+        # After a jump of the drive the error of the step is another one at once.
+        due: Mask = (s.count >= s.due) | jumps
+        # A switch after a rest ends a block, which is one line: not from before it to after it.
+        if span.row is not None and s.held.size:
+            switches = (span.row != span.inputs1) & np.isfinite(span.row) & (s.held[:, 1] == 0.0)
+            due = due | switches.any(axis=1)
+        # What gaps miss counts at once: later it might cancel with that of the next one.
+        if span.gaps is not None:
+            due = due | (span.gaps > 0.0).any(axis=(1, 2))
+        return due
 
     def _add_errors(
         self, s: ShadowState, x: FilterState, end: FilterState, step: Span, jumps: Mask

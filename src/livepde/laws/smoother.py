@@ -110,8 +110,8 @@ def _begun(
     best = bare.about(bare.estimated)
     if best is None or best.refuses:
         # Unknowns that move are estimated about each estimate in turn, those that stay about one.
-        trajectories = (None, whole.estimated) if whole.moves else (whole.estimated, None)
-        best = next((one for each in trajectories if (one := whole.about(each))), None)
+        first, other = (None, whole.estimated) if whole.moves else (whole.estimated, None)
+        best = whole.about(first) or whole.about(other)
     if best is None:
         return bare, None
     decisions = best.decisions if used is None else _fitted(best.decisions, used, data)
@@ -189,8 +189,7 @@ def _backward(best: _SmootherPass, after: FilterState) -> Iterator[FilterState]:
 def _reduced(work: SensitivityWork, x: FilterState, da: Array | float = 0.0) -> Array:
     """Return the reduced unknowns of a linearisation point plus a difference da, shape (k,)."""
     reduction = work.filter.reduction
-    a: Array = (reduction.reduced(x.q - work.filter.problem.model.latent.prior) + da)[0]
-    return a
+    return np.asarray((reduction.reduced(x.q - work.filter.problem.model.latent.prior) + da)[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +206,6 @@ class _FixedInterval:
 
     @property
     def moves(self) -> bool:
-        """True if an unknown moves or jumps."""
         return self.work.filter.moves or bool(self.work.jumps is not None and self.data.jumps)
 
     def _absorbed(
@@ -218,7 +216,9 @@ class _FixedInterval:
         if self.decisions is not None:
             options = replace(options, decision=self.decisions[number])
         x, told = absorb(self.work.filter, x, span, options)
-        return x, told.decision
+        none = np.zeros_like(told.refused)
+        anchored = none if told.anchored is None else told.anchored
+        return x, GateDecision(told.refused, anchored)
 
     @property
     def estimated(self) -> Array:
@@ -324,5 +324,4 @@ def _forgotten(P: Array) -> Array:
     """Return R with R^T R = I - P^T P."""
     values, vectors = np.linalg.eigh(np.eye(P.shape[1]) - P.T @ P)
     lost = values > ROUNDING
-    R: Array = np.sqrt(values[lost])[:, None] * vectors[:, lost].T
-    return R
+    return np.asarray(np.sqrt(values[lost])[:, None] * vectors[:, lost].T)

@@ -98,7 +98,6 @@ class Diagnostics(Generic[Number]):
         return self._own() | {name: number for name, number in more.items() if known(number)}
 
     def each(self, change: Callable[[Number], Other]) -> Diagnostics[Other]:
-        """Return the diagnostics with a function of each number that is known."""
         extra = {name: change(number) for name, number in self.extra.items()}
         own = {name: change(number) for name, number in self._own().items()}
         return Diagnostics(**own, shifts=self.shifts.each(change), extra=extra)
@@ -111,11 +110,9 @@ class Diagnostics(Generic[Number]):
         return replace(self, **found, extra={**self.extra, **more.extra})
 
     def member(self: Diagnostics[Array], k: int) -> Diagnostics[float]:
-        """Return those of one member."""
         return self.each(lambda number: float(number[k]))
 
     def _own(self) -> dict[str, Any]:
-        """Return the attributes that are known numbers."""
         own = vars(self)
         some = ((name, own[name]) for name in OWN if own[name] is not NOT_KNOWN)
         return {name: number for name, number in some if known(number)}

@@ -71,7 +71,6 @@ class StoredSamples:
 
     @classmethod
     def of(cls, work: SensitivityWork, state: SensitivityState) -> StoredSamples:
-        """Return the samples in the window of one member."""
         sensors = work.filter.problem.observed.size
         return cls(work, state, LogRows.of(state.log[:, int(state.window[0]) :], sensors))
 
@@ -100,12 +99,10 @@ class StoredSamples:
 
     @property
     def times(self) -> Array:
-        """Times of the samples, (samples,)."""
         return self.rows.times[self._before :]
 
     @property
     def filter(self) -> Filter:
-        """The filter of the law."""
         return self.work.filter
 
     @property
@@ -148,7 +145,6 @@ class StoredSamples:
 
     @cached_property
     def seen(self) -> Mask:
-        """Samples with a reading, (samples,)."""
         return np.asarray(np.isfinite(self.readings).any(axis=1))
 
     @property
@@ -392,6 +388,6 @@ class StoredSamples:
                 x, told = assimilate(filter_, x, chosen, options)
             else:
                 x, told = absorb(filter_, x, chosen, options)
-            if not (told.status.ok and told.finite[0]):
+            if not told.good:
                 return None
         return changed(x, screened=now.screened)

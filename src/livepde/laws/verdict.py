@@ -162,18 +162,14 @@ def with_discretisation(verdict: Verdict, shadows: ShadowSet | None, s: ShadowSt
 
 def with_columns(verdict: Verdict, columns: Columns | str) -> Verdict:
     """Return a verdict that names the columns of the data which explain a misfit."""
-    if verdict.level == "trusted" or not (verdict.judged or _doubted(verdict)):
+    doubted = any(finding.severity != "note" for finding in verdict.findings)
+    if verdict.level == "trusted" or not (verdict.judged or doubted):
         return verdict
     if isinstance(columns, str):
         return verdict.with_untested(f"errors of single columns: {columns}")
     # Slow noise is a misfit, too, of which a column may explain a part by chance.
     known = any(finding.what == "misfit" for finding in verdict.findings)
     return verdict.with_causes(likely_columns(columns, 0.0 if known else LARGE))
-
-
-def _doubted(verdict: Verdict) -> bool:
-    """Return whether a verdict has a finding that is more than a note."""
-    return any(finding.severity != "note" for finding in verdict.findings)
 
 
 def with_errors(verdict: Verdict, work: SensitivityWork, state: SensitivityState) -> Verdict:
@@ -266,7 +262,6 @@ class StepLedger(NamedTuple):
 
     @classmethod
     def start(cls) -> StepLedger:
-        """Return the value before any sample."""
         return cls(np.zeros(COUNTS, dtype=np.int64), np.zeros(2))
 
     def add(self, code: str, length: float, stretched: bool) -> StepLedger:

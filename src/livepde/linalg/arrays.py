@@ -235,8 +235,7 @@ class Pattern:
     def product(self, data: Array, x: Array) -> Array:
         """Return `matrix(data) @ x`, for x of shape (columns,) or (columns, k)."""
         # No buffer is kept between two products: a pattern may be used by several threads at once.
-        product: Array = self.compact(data) @ x
-        return product
+        return self.compact(data) @ x
 
     def gather(self, rows: IntArray, cols: IntArray) -> sp.csr_array:
         """Return the 0/1 matrix that sums a list of entries into `data`, shape (nnz, entries)."""
@@ -255,12 +254,8 @@ def sandwich(
 ) -> tuple[IntArray, IntArray, sp.csr_array]:
     """Return the linear dependence of `left @ inner @ right` on the data of `inner`.
 
-    Returns
-    -------
-    rows, cols
-        Rows and columns of the entries of the product, repeated if several terms contribute.
-    weights
-        Sparse matrix (len(rows), inner.nnz): values of those entries from the data of `inner`.
+    Rows and columns of the entries of the product, repeated if several terms contribute, and a
+    sparse matrix, (entries, inner.nnz), which gives their values from the data of `inner`.
     """
     a, b = sp.csc_array(left), sp.csr_array(right)
     i, j = inner.rows, inner.indices
@@ -336,7 +331,6 @@ class _MatrixBlock:
     transposed: bool
 
     def alike(self, other: _MatrixBlock) -> bool:
-        """Return True if the other block consists of the same objects."""
         pairs = zip(*((b.inner, b.left, b.right) for b in (self, other)), strict=True)
         same = (self.at, self.transposed) == (other.at, other.transposed)
         return same and all(mine is theirs for mine, theirs in pairs)
@@ -388,5 +382,4 @@ def _diagonal(matrix: Sparse) -> Array | None:
     coo = sp.coo_array(matrix)
     if not np.array_equal(coo.row, coo.col):
         return None
-    found: Array = matrix.diagonal()
-    return found
+    return np.asarray(matrix.diagonal())

@@ -136,21 +136,12 @@ NONE = np.zeros(0, dtype=np.intp)
 
 
 class BlockFactor(NamedTuple):
-    """Factors of the diagonal blocks of a block-diagonal matrix.
+    """Factors of the diagonal blocks of a block-diagonal matrix."""
 
-    Attributes
-    ----------
-    solver
-        Order of the band and its width.
-    bad
-        Numbers of the blocks that could not be factorised.
-    lu, pivots
-        LAPACK's LU factors of the whole matrix, in the order of the band; None if `symmetric`, the
-        main diagonal of D and lower diagonal of L of L D L^T, is there.
-    """
-
-    solver: BandedSolver
-    bad: IntArray
+    solver: BandedSolver  # order of the band and its width
+    bad: IntArray  # numbers of the blocks that could not be factorised
+    # lu, pivots: LAPACK's LU factors of the whole matrix, in the order of the band; None if
+    # `symmetric`, the main diagonal of D and lower diagonal of L of L D L^T, is there.
     lu: Array | None
     pivots: IntArray | None
     symmetric: tuple[Array, Array] | None = None

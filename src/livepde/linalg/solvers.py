@@ -80,10 +80,8 @@ class Solver(Protocol):
     def factorise(self, data: Array) -> Factor:
         """Factorise the matrix `pattern.matrix(data)`.
 
-        Raises
-        ------
-        LinearAlgebraError
-            The matrix is singular to working precision or holds a value that is not finite.
+        Raises `LinearAlgebraError`: the matrix is singular to working precision or holds a value
+        that is not finite.
         """
 
 
@@ -141,8 +139,7 @@ class SuperLUFactor:
         # SuperLU solves the transposed system column by column; the other one takes all columns at
         # once, which is up to 1.5 times faster, but slower for a single column.
         several = b.ndim > 1 and b.shape[1] > 1
-        x: Array = self.lu.solve(b, trans="N" if self.symmetric and several else "T")
-        return x
+        return np.asarray(self.lu.solve(b, trans="N" if self.symmetric and several else "T"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -404,8 +401,7 @@ def conjugate_gradients(
 
 def _ratio(a: Array, b: Array) -> Array:
     """Return a/b, zero where b is zero."""
-    ratio: Array = np.divide(a, b, out=np.zeros_like(np.asarray(b, dtype=float)), where=b != 0)
-    return ratio
+    return np.asarray(np.divide(a, b, out=np.zeros_like(np.asarray(b, dtype=float)), where=b != 0))
 
 
 def gmres(
@@ -417,10 +413,7 @@ def gmres(
     Parameters and results are those of `conjugate_gradients`, with b of shape (n,), but `tolerance`
     bounds the preconditioned residual, an estimate of the error, relative to that of x = 0.
 
-    Raises
-    ------
-    LinearAlgebraError
-        A value is not finite, or `limit` was reached.
+    Raises `LinearAlgebraError`: a value is not finite, or `limit` was reached.
     """
     first = precondition(b)
     size = float(np.linalg.norm(first))
@@ -541,43 +534,54 @@ def analyse(pattern: Pattern, *, symmetric: bool = False, approximate: bool = Fa
 def choose(pattern: Pattern, *, symmetric: bool = False, approximate: bool = False) -> Choice:
     """Choose the solver for a pattern by its bandwidth and the installed packages.
 
-    Parameters
-    ----------
-    symmetric
-        True if every matrix is symmetric positive definite.
-    approximate
-        True if only `approximate_inverse` is needed: then multigrid serves from a bandwidth of 500.
+    `symmetric`: every matrix is symmetric positive definite. `approximate`: only
+    `approximate_inverse` is needed; then multigrid serves from a bandwidth of 500.
     """
     banded = BandedSolver(pattern)
     band = max(banded.band)
     wide = f"a band of {band}"
     if band <= WIDEST_BAND:
         return Choice(banded, f"{wide}, at most {WIDEST_BAND}")
-    superlu = SuperLUSolver(pattern, symmetric)
-    moderate = band <= WIDEST_SUPERLU
-    if symmetric and moderate and _installed("sksparse"):
-        return Choice(CholmodSolver(pattern), f"{wide}; scikit-sparse is installed")
-    limit = WIDEST_SUPERLU if symmetric else SMALL
-    if band <= limit:
-        return Choice(superlu, f"{wide}, at most {limit}")
+    if symmetric:
+        return _choose_definite(pattern, band, wide, approximate)
+    superlu = SuperLUSolver(pattern)
+    if band <= SMALL:
+        return Choice(superlu, f"{wide}, at most {SMALL}")
+    if _installed("pypardiso"):
+        return Choice(PardisoSolver(pattern), f"{wide}; pypardiso is installed")
+    return _superlu(superlu, band, wide)
+
+
+def _choose_definite(pattern: Pattern, band: int, wide: str, approximate: bool) -> Choice:
+    """Return the solver of symmetric positive definite matrices."""
+    superlu, cholmod = SuperLUSolver(pattern, True), _installed("sksparse")
+    if band <= WIDEST_SUPERLU:
+        if cholmod:
+            return Choice(CholmodSolver(pattern), f"{wide}; scikit-sparse is installed")
+        return Choice(superlu, f"{wide}, at most {WIDEST_SUPERLU}")
     # One V-cycle is enough for an approximate inverse, so multigrid pays for smaller matrices.
     most = WIDEST_SUPERLU if approximate else WIDEST_FACTOR
-    multigrid = symmetric and _installed("pyamg")
+    multigrid = _installed("pyamg")
     if multigrid and band > most:
         return Choice(MultigridSolver(pattern), f"{wide}, more than {most}")
-    if symmetric and _installed("sksparse"):
+    if cholmod:
         return Choice(CholmodSolver(pattern, blocks=True), f"{wide}; scikit-sparse is installed")
     if _installed("pypardiso"):
-        return Choice(PardisoSolver(pattern, symmetric), f"{wide}; pypardiso is installed")
-    if moderate:
-        return Choice(superlu, f"{wide}, at most {WIDEST_SUPERLU}")
+        return Choice(PardisoSolver(pattern, True), f"{wide}; pypardiso is installed")
     if multigrid:
         return Choice(
             MultigridSolver(pattern),
             f"{wide}, more than {WIDEST_SUPERLU}; neither scikit-sparse nor pypardiso is installed",
         )
+    return _superlu(superlu, band, wide)
+
+
+def _superlu(solver: SuperLUSolver, band: int, wide: str) -> Choice:
+    """Return the solver that needs no package, where no other one is installed."""
+    if band <= WIDEST_SUPERLU:
+        return Choice(solver, f"{wide}, at most {WIDEST_SUPERLU}")
     return Choice(
-        superlu, f"{wide}; slow at this size, pip install 'livepde[solvers]' brings a faster one"
+        solver, f"{wide}; slow at this size, pip install 'livepde[solvers]' brings a faster one"
     )
 
 

@@ -3,7 +3,16 @@
 from __future__ import annotations
 
 from livepde.stepping.forward import ForwardStage, simulate
-from livepde.stepping.interval import Between, End, Held, Interval, Moments, Span, own_noise
+from livepde.stepping.interval import (
+    Between,
+    End,
+    Held,
+    Interval,
+    Moments,
+    Span,
+    gaps_of,
+    own_noise,
+)
 from livepde.stepping.member_stage import (
     BandedStage,
     KeptFactors,
@@ -53,6 +62,7 @@ __all__ = [
     "Steps",
     "Sweep",
     "advance",
+    "gaps_of",
     "interruptible",
     "member_stage",
     "own_noise",

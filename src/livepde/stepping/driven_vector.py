@@ -68,7 +68,6 @@ class DrivenVector:
         return None if self.timed() else (base[None], changes)
 
     def without_inputs(self) -> Array:
-        """Return the vector at time 0 without inputs, (n,)."""
         return self._at(0.0, np.zeros(len(self.channels)))
 
     def assembled(self) -> tuple[Array, Array]:
@@ -79,7 +78,6 @@ class DrivenVector:
 
     @cached_property
     def zero(self) -> bool:
-        """True if the vector is always zero."""
         return self.responses is not None and not any(part.any() for part in self.responses)
 
     @cached_property

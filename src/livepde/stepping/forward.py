@@ -128,7 +128,6 @@ class ForwardStage:
 
     @property
     def solver(self) -> Solver:
-        """Solver of the matrix of a stage."""
         return self.engine.solver
 
     @cached_property
@@ -176,8 +175,7 @@ class ForwardStage:
         diagonal = np.abs(self.model.mass.diagonal())
         least = diagonal.max(initial=0.0) or 1.0
         # Algebraic components have no mass: they are weighed like the heaviest coefficient.
-        weights: Array = self.model.X.free / np.where(diagonal > 0.0, diagonal, least)
-        return weights
+        return self.model.X.free / np.where(diagonal > 0.0, diagonal, least)
 
     @cached_property
     def _mass(self) -> sp.csr_array | Array:
@@ -267,8 +265,7 @@ class ForwardStage:
         model, forms = self.model, (self.model.form_F, self.model.form_B, self.form)
 
         def load(moment: Moment) -> Array:
-            found: Array = model.F(moment) - self._at_zero(q, moment)
-            return found
+            return model.F(moment) - self._at_zero(q, moment)
 
         return DrivenVector(load, model.channels, lambda: any("t" in form.uses for form in forms))
 
@@ -362,21 +359,12 @@ class ForwardStage:
                 for part in groups:
                     new[:, part] = solved(tangent, driven(u, part) * free)
             return new, kept
-        at, keeps = At(q, h), len(kept.q) > 0
         # Linear extrapolation in time predicts the state; the error of the predictor decides how
         # many corrections are needed.
-        guess = begin + h * kept.trend if keeps else begin
+        guess = begin + h * kept.trend if len(kept.q) else begin
         system = self._system(q, h, moment)
         known = self._known(begin, system, q, h, moment)
-        corrected = Corrections(
-            system.matrix,
-            at,
-            model.X.free,
-            lambda q, h: self.factor(q, h, moment),
-            self.solver.price,
-            At(kept.q, kept.h) if keeps else at,
-            kept.spent,
-        )
+        corrected = self._corrections(system, At(q, h), moment, kept)
         new[:, 0] = u = corrected.solve(begin, model.impose(guess, moment), known, STATE, PASSES)
         for part in groups:
             start, known = c[:, part], driven(u, part)
@@ -386,14 +374,25 @@ class ForwardStage:
                 new[:, part] = corrected.solve(start, start, known, tolerance, PASSES - 1)
         return new, Kept(*corrected.factor_at, corrected.spent, (u - begin) / h)
 
+    def _corrections(self, system: _System, at: At, moment: Moment, kept: Kept) -> Corrections:
+        """Return the solver of a stage that begins with the factor of an earlier one."""
+        return Corrections(
+            system.matrix,
+            at,
+            self.model.X.free,
+            lambda q, h: self.factor(q, h, moment),
+            self.solver.price,
+            At(kept.q, kept.h) if len(kept.q) else at,
+            kept.spent,
+        )
+
     def _driven(
         self, u: Array, c: Array, q: Array, directions: Array, h: float, moment: Moment
     ) -> Array:
         """Return the right-hand sides of tangents, shape (n, r)."""
         at = {} if self.form.linear_in_parameter else {"q": self.model.latent.value(q)}
         forcing = self.form.product("v", "q", directions, moment, u=u, **at)
-        driven: Array = (self._mass @ c) / h - forcing
-        return driven
+        return (self._mass @ c) / h - forcing
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
@@ -33,10 +33,7 @@ class Held:
     def of(cls, between: Mapping[str, Any], inputs: Collection[str]) -> Held:
         """Return the channels of a mapping from channel to behaviour, checked.
 
-        Raises
-        ------
-        ConfigurationError
-            Another channel than those in `inputs`, or another behaviour.
+        Raises `ConfigurationError`: another channel than those in `inputs`, or another behaviour.
         """
         if not isinstance(between, Mapping):
             raise ConfigurationError(
@@ -146,10 +143,10 @@ class Interval:
         first, last = self.inputs0, self.inputs1
         if first is last or not held:
             return self
-        if all(name in held.next for name in last):
+        if set(last).issubset(held.next):
             return replace(self, inputs0=last)
         row = last if self.row is None else self.row
-        if all(name in held.last for name in first):
+        if set(first).issubset(held.last):
             return replace(self, inputs1=first, row=row)
         first = {name: row[name] if name in held.next else x for name, x in first.items()}
         last = {name: first[name] if name in held.last else x for name, x in last.items()}
@@ -199,7 +196,6 @@ class Interval:
 
 
 def _values(inputs: Mapping[str, float], channels: tuple[str, ...]) -> Array:
-    """Return the values of channels, shape (1, channels)."""
     return np.array([list(map(inputs.__getitem__, channels))])
 
 
@@ -207,6 +203,14 @@ def own_noise(noise: ArrayLike) -> Array | None:
     """Return noise standard deviations of readings; None if all are sensor defaults (NaN)."""
     found: Array = np.asarray(noise, dtype=float)
     return None if np.isnan(found).all() else found
+
+
+def gaps_of(
+    channels: Sequence[str], before: Iterable[float], again: Iterable[float]
+) -> dict[str, tuple[float, bool]]:
+    """Return channels held at either end, with how long before and whether at the end."""
+    each = zip(channels, before, again, strict=True)
+    return {name: (past, now > 0.0) for name, past, now in each if past or now}
 
 
 class Moments(NamedTuple):
@@ -222,7 +226,6 @@ class Moments(NamedTuple):
     interval: Interval | None = None
 
     def member(self, k: int) -> Moment:
-        """Return the moment of one member."""
         if self.interval is not None:
             return self.interval.at(self.t)
         row = self.inputs[k if len(self.inputs) > 1 else 0]
@@ -233,23 +236,11 @@ class Moments(NamedTuple):
 class Span:
     """Sample intervals of all members, with a common end, as arrays.
 
-    Attributes
-    ----------
-    t0, t1
-        Time of the last accepted sample of each member, shape (members,), and of this one.
-    inputs0, inputs1, row
-        As in `Interval`, shape (members, channels), or (1, channels) if the same for all.
-    z0, z1, noise
-        As in `Interval`, shape (members, sensors) or (1, sensors).
-    interval
-        Interval of a single process; None for members of a fleet.
-    gaps
-        Duration of the gap of each channel before this interval, and 1 if it lasts at its end,
-        shape (members, 2, channels) or (1, 2, channels); None without a gap.
-    parts
-        Number of parts of every substep, shape (members,); None if it is not chosen yet.
+    Shapes (members, channels) and (members, sensors), or (1, channels) and (1, sensors) if the same
+    for all. Other attributes are those of `Interval`.
     """
 
+    # Time of the last accepted sample of each member, shape (members,), and of this one.
     t0: Array
     t1: float
     channels: tuple[str, ...]
@@ -257,15 +248,16 @@ class Span:
     inputs1: Array
     z0: Array
     z1: Array
-    interval: Interval | None = None
+    interval: Interval | None = None  # that of a single process; None for members of a fleet
     noise: Array | None = None
+    # Duration of the gap of each channel before this interval, and 1 if it lasts at its end, shape
+    # (members, 2, channels) or (1, 2, channels); None without a gap.
     gaps: Array | None = None
     row: Array | None = None
-    parts: IntArray | None = None
+    parts: IntArray | None = None  # shape (members,); None if they are not chosen yet
 
     @classmethod
     def of(cls, interval: Interval, channels: tuple[str, ...]) -> Span:
-        """Return the span of one interval, common to all members."""
         first = last = NO_INPUTS
         if channels:
             first = last = _values(interval.inputs1, channels)
@@ -295,9 +287,9 @@ class Span:
         if first is last or not held:
             return self
         row = last if self.row is None else self.row
-        if all(name in held.next for name in self.channels):
+        if set(self.channels).issubset(held.next):
             return replace(self, inputs0=last)
-        if all(name in held.last for name in self.channels):
+        if set(self.channels).issubset(held.last):
             return replace(self, inputs1=first, row=row)
         first, last = held.acting(self.channels, first, last, row)
         return replace(self, inputs0=first, inputs1=last, row=row)
@@ -327,8 +319,7 @@ class Span:
     @property
     def together(self) -> Mask:
         """Mask of the members that start at `start`, shape (members,)."""
-        most: Mask = self.t0 == self.start
-        return most
+        return np.asarray(self.t0 == self.start)
 
     @property
     def present(self) -> Mask:
@@ -357,8 +348,6 @@ class Span:
         return Moments(t=self.t1, channels=self.channels, inputs=self.stated, interval=interval)
 
     def part(self, group: IntArray) -> Span:
-        """Return the span of some members."""
-
         def some(values: Array) -> Array:
             return values[group] if len(values) > 1 else values
 
@@ -369,17 +358,12 @@ class Span:
         return Span(**(parts | arrays))
 
     def member(self, k: int) -> Interval:
-        """Return the interval of one member."""
         if self.interval is not None:
             return self.interval
         first, last, row = (
             Inputs(dict(zip(self.channels, inputs[k].tolist(), strict=True)))
             for inputs in (self.inputs0, self.inputs1, self.stated)
         )
-        gaps = {}
-        if self.gaps is not None:
-            each = zip(self.channels, *self.gaps[k].tolist(), strict=True)
-            gaps = {name: (held, again > 0.0) for name, held, again in each if held or again}
         return Interval(
             t0=float(self.t0[k]),
             t1=self.t1,
@@ -388,7 +372,7 @@ class Span:
             z0=self.z0[k],
             z1=self.z1[k],
             noise=None if self.noise is None else self.noise[k],
-            gaps=gaps,
+            gaps={} if self.gaps is None else gaps_of(self.channels, *self.gaps[k].tolist()),
             row=None if self.row is None else row,
             parts=0 if self.parts is None else int(self.parts[k if len(self.parts) > 1 else 0]),
         )

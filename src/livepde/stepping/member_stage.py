@@ -71,37 +71,25 @@ class KeptFactors:
 
 
 class StageOfMembers(NamedTuple):
-    """Arguments of a batched stage, besides its initial states and tangents.
+    """Arguments of a batched stage, besides its initial states and tangents."""
 
-    Attributes
-    ----------
-    members
-        Numbers of the members, as keys of their cached factors, shape (members,).
-    q, directions
-        Latent parameters, (members, dim), and derivative of q along each tangent, (members, r, m).
-    h, at
-        Step length; time and inputs at its end.
-    kept
-        Warm-start data of the previous stage.
-    off_centre
-        Mask of members, (members,), whose last tangent is the offset of the estimated mean from the
-        linearisation point, which has to be more accurate than a covariance square root.
-    factors
-        Cache of factorised matrices for this q, keyed by step length, shared by the stages of one
-        step of a time scheme; a stage may read it and add to it.
-    apart
-        Number of trailing tangents that are solved separately, so that their presence does not
-        change the rounding of the other columns.
-    """
-
-    members: IntArray
+    members: IntArray  # numbers of the members, as keys of their cached factors, shape (members,)
+    # q, directions: latent parameters, (members, dim), and derivative of q along each tangent,
+    # (members, r, m).
     q: Array
     directions: Array
+    # h, at: step length; time and inputs at its end.
     h: float
     at: Moments
-    kept: KeptFactors
+    kept: KeptFactors  # warm-start data of the previous stage
+    # Mask of members, (members,), whose last tangent is the offset of the estimated mean from the
+    # linearisation point, which has to be more accurate than a covariance square root.
     off_centre: Mask
+    # Cache of factorised matrices for this q, keyed by step length, shared by the stages of one
+    # step of a time scheme; a stage may read it and add to it.
     factors: dict[float, Any]
+    # Number of trailing tangents that are solved separately, so that their presence does not change
+    # the rounding of the other columns.
     apart: int = 0
 
 
@@ -120,10 +108,7 @@ class MemberStage(ABC):
     def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
         """Return states and tangents, (1 + r, members, n), at the end of a stage; warm-start data.
 
-        Raises
-        ------
-        StepFailed
-            The solver finds no solution of a stage.
+        Raises `StepFailed`: the solver finds no solution of a stage.
         """
 
 
@@ -216,10 +201,7 @@ class BandedStage(MemberStage):
 
     def __init__(self, model: Model) -> None:
         self.model = model
-        form, zero, free = model.linear_A, np.zeros(model.X.dim), model.X.free
-        timeless = (int, float, Channel)
-        fixed_in_time = all(isinstance(value, timeless) for value in model.boundary_values)
-        units = np.eye(form.spaces["q"].dim)
+        free, unknowns = model.X.free, model.linear_A.spaces["q"].dim
         self.pattern, maps = _analysed(model)
         rows, cols = self.pattern.rows, self.pattern.indices
         # Masks of the entries between free coefficients, and of free rows with Dirichlet columns.
@@ -228,24 +210,35 @@ class BandedStage(MemberStage):
         self._mass = row_product(self._stacked(mass * free[rows]))
         # Those without inputs first: one of each unknown, then of B.
         terms = _matrix_terms(model, maps)
-        self._terms = terms[len(units) + 1 :]
+        self._terms = terms[unknowns + 1 :]
         slopes = [term.data for term in terms if term.unknown >= 0]
         self._slopes = row_product(self._stacked(*(slope * inner for slope in slopes)))
         # Fixed coefficients have rows of the identity, multiplied by h like all of the rest.
         ones = np.where(rows == cols, 1.0 - free[rows], 0.0)
         parts = [term.data * inner for term in terms]
-        parts[len(units)] = parts[len(units)] + ones
+        parts[unknowns] = parts[unknowns] + ones
         every = np.array([*parts, mass * inner])
         self._blocks = BandedBlocks.of(BandedSolver(self.pattern), *every)
         # The matrix of a stage is the sum of these with weights h q, h, those times inputs, and 1.
         self._bands = self._blocks.band(every)
         # The couplings of free coefficients to Dirichlet values are moved to the right-hand side.
         # They have few entries, and stay sparse: their products are formed once.
-        mass_edge = self._stacked(mass * outer)
-        rest_edge = self._stacked(terms[len(units)].data * outer)
-        slope_edge = self._stacked(*(term.data * outer for term in terms[: len(units)]))
+        self._drive(
+            self._stacked(mass * outer),
+            self._stacked(terms[unknowns].data * outer),
+            self._stacked(*(term.data * outer for term in terms[:unknowns])),
+        )
         edges = ((term, self._stacked(term.data * outer)) for term in self._terms)
         self._edges = [(term, edge) for term, edge in edges if edge.nnz]
+
+    def _drive(
+        self, mass_edge: sp.csr_array, rest_edge: sp.csr_array, slope_edge: sp.csr_array
+    ) -> None:
+        """Set the vectors that drive a stage, from couplings of M, of B, and of each A_j."""
+        model, form, free = self.model, self.model.linear_A, self.model.X.free
+        zero, units = np.zeros(model.X.dim), np.eye(form.spaces["q"].dim)
+        timeless = (int, float, Channel)
+        fixed_in_time = all(isinstance(value, timeless) for value in model.boundary_values)
 
         def boundary(moment: Moment) -> Array:
             return model.impose(zero, moment)
@@ -320,26 +313,12 @@ class BandedStage(MemberStage):
         # columns.
         (size, n), at = columns.shape[1:], stage.at
         step = stage.factors.get(stage.h) or self._begin(stage)
-        inputs = at.inputs
         if size == 1 and len(step.factor.bad):
             raise StepFailed("singular", f"the {n} by {n} matrix is singular or not finite")
-        # BLAS may round products of other shapes differently, so the separate columns share no
-        # product with the others. Each column is solved by itself, however many there are.
-        new, rows = np.empty(columns.shape), columns.reshape(-1, n)
-        known, together = new.reshape(-1, n), (len(columns) - stage.apart) * size
-        if self._mass.separate or not stage.apart:
-            self._mass(rows, known)
-        else:
-            self._mass(rows[:together], known[:together])
-            self._mass(rows[together:], known[together:])
-        u = known[:size]
-        if step.forced is not None:
-            base, changes = step.forced
-            u += base
-            if len(changes):
-                u += inputs[:, : len(changes)].dot(changes)
-        else:
-            u += stage.h * self._load(at) - self._mass_boundary(at)
+        together = (len(columns) - stage.apart) * size
+        new = self._times_mass(columns, together)
+        u = new[0]
+        self._add_load(u, step, stage)
         offset = None if self._offset.zero else self._offset(at).reshape(-1, len(step.amounts.T), n)
         if self._edges:
             offset = self._along_edges(u, offset, step, at)
@@ -348,18 +327,49 @@ class BandedStage(MemberStage):
         # The state first: the tangents need it.
         u[:] = step.factor.solve(new[:1])[0]
         if len(columns) > 1:
-            driven = self._driven(u, offset, step, inputs)
-            along, chosen = stage.h * stage.directions, together // size - 1
-            if step.slopes is not None:
-                along = along @ step.slopes.transpose(0, 2, 1)
-            if chosen:
-                known[size:together] -= _sums_along(along[:, :chosen], driven)
-            if stage.apart:
-                known[together:] -= _sums_along(along[:, chosen:], driven)
+            driven = self._driven(u, offset, step, at.inputs)
+            self._add_driven(new.reshape(-1, n), driven, stage, step, together)
             new[1:] = step.factor.solve(new[1:])
         if not self._boundary.zero:
             u += self._boundary(at)
         return new, stage.kept
+
+    def _times_mass(self, columns: Array, together: int) -> Array:
+        """Return the product of M with columns, of which those from `together` on are separate."""
+        # BLAS may round products of other shapes differently, so the separate columns share no
+        # product with the others. Each column is solved by itself, however many there are.
+        new, n = np.empty(columns.shape), columns.shape[2]
+        rows, known = columns.reshape(-1, n), new.reshape(-1, n)
+        if self._mass.separate or together == len(rows):
+            self._mass(rows, known)
+        else:
+            self._mass(rows[:together], known[:together])
+            self._mass(rows[together:], known[together:])
+        return new
+
+    def _add_load(self, u: Array, step: BandedStep, stage: StageOfMembers) -> None:
+        """Add what drives the state to its right-hand side, (members, n)."""
+        if step.forced is None:
+            u += stage.h * self._load(stage.at) - self._mass_boundary(stage.at)
+            return
+        base, changes = step.forced
+        u += base
+        if len(changes):
+            u += stage.at.inputs[:, : len(changes)].dot(changes)
+
+    @staticmethod
+    def _add_driven(
+        known: Array, driven: Array, stage: StageOfMembers, step: BandedStep, together: int
+    ) -> None:
+        """Subtract what drives the tangents from their right-hand sides, (columns * members, n)."""
+        size = len(stage.q)
+        along, chosen = stage.h * stage.directions, together // size - 1
+        if step.slopes is not None:
+            along = along @ step.slopes.transpose(0, 2, 1)
+        if chosen:
+            known[size:together] -= _sums_along(along[:, :chosen], driven)
+        if stage.apart:
+            known[together:] -= _sums_along(along[:, chosen:], driven)
 
     def _begin(self, stage: StageOfMembers) -> BandedStep:
         """Return what all stages of a length share, and keep it for the next one."""

@@ -70,18 +70,12 @@ class StageEquation(Protocol[Point]):
 
 @dataclass(frozen=True, eq=False)
 class Near:
-    """Predictor of a stage: starting value y and cached Jacobian factor.
-
-    Attributes
-    ----------
-    factor
-        Factor of a nearby Jacobian, for the first updates; None: the Jacobian at y is factorised.
-    refresh
-        Contraction factor of the residual above which `factor` is replaced by a new one.
-    """
+    """Predictor of a stage: starting value y and cached Jacobian factor."""
 
     y: Array
+    # Factor of a nearby Jacobian, for the first updates; None: the Jacobian at y is factorised.
     factor: Factor | None = None
+    # Contraction factor of the residual above which `factor` is replaced by a new one.
     refresh: float = 0.2
 
 
@@ -145,10 +139,7 @@ class Newton:
         `start` is the initial iterate, or a function that returns it: with `near`, the predicted
         solution, it may not be needed.
 
-        Raises
-        ------
-        StepFailed
-            "not_converged", "not_finite" or "singular".
+        Raises `StepFailed`: "not_converged", "not_finite" or "singular".
         """
         iteration = _Iteration(self, equation)
         if near is not None:
@@ -179,19 +170,14 @@ class _Iteration(Generic[Point]):
         newton, factor = self.newton, near.factor
         while not self._solved(at, allowed):
             fresh = factor is None
-            if self.updates >= newton.iterations or (fresh and factors == 0):
-                raise StepFailed(
-                    "not_converged",
-                    f"{self.updates} updates left a relative residual of {at.size:.1e}",
-                )
+            self._check_budget(at, spent=fresh and factors == 0)
             if factor is None:
                 factor, factors = self._factor(at), factors - 1
             new, update = self._updated(at, factor)
             if fresh and not new.size < at.size:
-                if self.equation.limited(at, allowed):
-                    break
-                if self.equation.limited(new, allowed):  # one line may be limited long before
-                    at = new
+                limited = self._limited(at, new, allowed)
+                if limited is not None:
+                    at = limited
                     break
                 new = self._damped(at, update)
             # A factor that came with the prediction has a limit of its own.
@@ -202,6 +188,17 @@ class _Iteration(Generic[Point]):
             at = new if new.size < at.size else at
             factor = None if slow else factor
         return Solution(at, self.updates, self.made)
+
+    def _check_budget(self, at: Point, *, spent: bool) -> None:
+        """Raise `StepFailed` without an update left; `spent`: it needs one factor too many."""
+        if spent or self.updates >= self.newton.iterations:
+            text = f"{self.updates} updates left a relative residual of {at.size:.1e}"
+            raise StepFailed("not_converged", text)
+
+    def _limited(self, at: Point, new: Point, allowed: float) -> Point | None:
+        """Return the first iterate whose residual is limited by rounding, or None."""
+        both = (one for one in (at, new) if self.equation.limited(one, allowed))
+        return next(both, None)
 
     def _solved(self, at: Point, allowed: float) -> bool:
         if not math.isfinite(at.size):

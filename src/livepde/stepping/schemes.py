@@ -207,14 +207,8 @@ def advance(
     Times are computed from integer counts, never accumulated. `begin` receives start and length of
     each substep before it is tried.
 
-    Returns
-    -------
-    y
-        State at the end of the interval, or after the last successful substep if halving failed.
-    steps
-        Number of substeps taken.
-    failure
-        None, or the failure of the shortest substep.
+    Returned are the state at the end of the interval, or after the last successful substep if
+    halving failed; the number of substeps taken; and the failure of the shortest substep, or None.
     """
     count = control.count(t1 - t0)
     h = control.parts * (t1 - t0) / count

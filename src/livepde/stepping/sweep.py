@@ -27,22 +27,15 @@ REPEATED = 8  # steps of each length, in the mean, from which its matrix is wort
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Steps:
-    """The substeps of the spans of one process.
+    """The substeps of the spans of one process."""
 
-    Attributes
-    ----------
-    starts, lengths, of
-        Of each substep its start, its length, and the number of its span.
-    after
-        How many substeps are taken at the end of each span.
-    ends, inputs0, inputs1, channels
-        Start and end of each span, (spans, 2), and the inputs there, (spans, channels).
-    """
-
+    # starts, lengths, of: of each substep its start, its length, and the number of its span.
     starts: Array
     lengths: Array
     of: IntArray
-    after: IntArray
+    after: IntArray  # how many substeps are taken at the end of each span
+    # ends, inputs0, inputs1, channels: start and end of each span, (spans, 2), and the inputs
+    # there, (spans, channels).
     ends: Array
     inputs0: Array
     inputs1: Array

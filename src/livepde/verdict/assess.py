@@ -53,9 +53,11 @@ from livepde.verdict.sentences import (
     LIKELY,
     Sentence,
     amount_of,
+    clause,
     estimating,
     percent,
     significance,
+    width,
 )
 
 PRIOR = 1e-4  # probability of an estimate as far from its prior, drawn from it
@@ -164,42 +166,46 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
     if evidence.whitened < limit:
         worst = float(evidence.correlation.max(initial=0.0))
         text, _ = FINDINGS["following, causes"].filled(correlation=worst)
-        e = math.exp(min(evidence.total, 700.0))
+        e = _e_value(evidence.total)
         yield Finding("following", "caution", text, evidence=e, measure="e-value")
         return
     order = [(w, d) for w, d in order if _possible(dictionary.directions[d], w, d, evidence, at)]
+    yield _explained(dictionary, at, evidence, order, recent)
+
+
+def _explained(
+    dictionary: Dictionary,
+    at: Position,
+    evidence: CauseEvidence,
+    order: Sequence[tuple[int, int]],
+    recent: bool,
+) -> Finding:
+    """Return the finding on a misfit with its possible causes, the likeliest first."""
+    p, e_value = significance(evidence.whitened), _e_value(evidence.whitened)
     if not order:
-        text, _ = FINDINGS["misfit, no cause"].filled(p=significance(evidence.whitened))
-        e_value = math.exp(min(evidence.whitened, 700.0))
-        yield Finding("misfit", "do not trust", text, evidence=e_value, measure="e-value")
-        return
+        text, _ = FINDINGS["misfit, no cause"].filled(p=p)
+        return Finding("misfit", "do not trust", text, evidence=e_value, measure="e-value")
     causes = tuple(_cause(dictionary.directions[d], w, evidence, at, d) for w, d in order[:NAMED])
     w, d = order[0]
-    shift = {name: float(moved[w, d] * evidence.size[w, d]) for name, moved in at.moved.items()}
+    shift = _shift(at, evidence, w, d)
     # A misfit whose cause is understood and moves no unknown leaves the estimate usable.
-    grave = max((abs(size) for size in shift.values()), default=math.inf) >= MOVES
+    grave = max(map(abs, shift.values()), default=math.inf) >= MOVES
     understood = evidence.share[w, d] >= EXPLAINED
-    p = significance(evidence.whitened)
-    e_value = math.exp(min(evidence.whitened, 700.0))
     # The state forgets where it began, so that later readings determine the unknowns without it.
     # What they show has another cause, and is no matter of the start.
     later = evidence.log_e[at.ledger.age < at.ledger.age[0]]
     forgotten = recent or (understood and unsuspicious(later))
     if causes[0].kind == "initial" and not grave and forgotten:
         text, _ = FINDINGS["start"].filled(p=p)
-        yield Finding("start", "note", text, "", e_value, "e-value", causes, shift=shift)
-        return
+        return Finding("start", "note", text, "", e_value, "e-value", causes, shift=shift)
     text, _ = FINDINGS["misfit"].filled(p=p)
-    yield Finding(
-        "misfit",
-        "do not trust" if grave or not understood else "caution",
-        text,
-        subject=causes[0].subject,
-        evidence=e_value,
-        measure="e-value",
-        causes=causes,
-        shift=shift,
-    )
+    severity: Severity = "caution" if understood and not grave else "do not trust"
+    subject = causes[0].subject
+    return Finding("misfit", severity, text, subject, e_value, "e-value", causes, shift=shift)
+
+
+def _e_value(log_e: float) -> float:
+    return math.exp(min(log_e, 700.0))
 
 
 def _mended(at: Position, evidence: CauseEvidence) -> bool:
@@ -218,11 +224,13 @@ def _recovered(at: Position, evidence: CauseEvidence, order: Sequence[tuple[int,
     """Return whether no likely cause has left the estimate off by a standard deviation."""
     limit = -math.log(CAUSES)
     likely = [(w, d) for w, d in order if evidence.log_e[w, d] > limit] or list(order[:NAMED])
-    return all(
-        abs(float(moved[w, d] * evidence.size[w, d])) < MOVES
-        for w, d in likely
-        for moved in at.moved.values()
-    )
+    return all(abs(size) < MOVES for w, d in likely for size in _shift(at, evidence, w, d).values())
+
+
+def _shift(at: Position, evidence: CauseEvidence, window: int, number: int) -> dict[str, float]:
+    """Return unknown -> its shift by a direction of the size that was found, in deviations."""
+    size = evidence.size[window, number]
+    return {name: float(moved[window, number] * size) for name, moved in at.moved.items()}
 
 
 def _ranked(evidence: CauseEvidence) -> list[tuple[int, int]]:
@@ -298,8 +306,8 @@ def _setting(direction: ScoreDirection, size: float, at: Position) -> str:
     """
     keys = {"offset": "offset", "gain": "gain", "position": "at_std"}
     if direction.kind in keys:
-        width = 2.0 * abs(_amount(direction, size, at))
-        return channel_setting(direction.subject, keys[direction.kind], f"{width:.2g}")
+        wide = 2.0 * abs(_amount(direction, size, at))
+        return channel_setting(direction.subject, keys[direction.kind], f"{wide:.2g}")
     if direction.kind == "lag":
         by = f"{size * LAG * float(at.ledger.times[1]):.4g}"
         late = f'"{by} {at.time_unit}"' if at.time_unit else by
@@ -324,42 +332,23 @@ def _jump(label: str) -> str:
 
 def _words(direction: ScoreDirection, size: float, at: Position) -> Sentence:
     """Return a cause of a size, and its remedy, in words."""
-    name, amount = direction.subject, _amount(direction, size, at)
-    kind, more = direction.kind, size > 0.0
-    level = "high" if more else "low"
-    values: dict[str, str] = {"name": name}
-    match kind:
-        case "offset":
-            values |= {"amount": amount_of(abs(amount), direction.unit), "side": level}
-        case "drift":
-            rate = amount_of(abs(amount) / DRIFT, direction.unit)
-            values["rate"] = f"{'+' if more else '-'}{rate}"
-        case "gain" | "channel":
-            share = in_percent(abs(amount))
-            values |= {"share": share, "side": "large" if more else "small"}
-        case "lag":
-            time = amount_of(abs(amount), at.time_unit)
-            values |= {"amount": time, "side": "late" if more else "early"}
-        case "position":
-            values |= {"amount": amount_of(abs(amount), direction.unit)}
-            values["where"] = _displaced(direction, amount)
-        case "boundary":
-            kind = "boundary, constant" if name == FIXED else kind
-            side = "high" if amount > 0.0 else "low"
-            values |= {"amount": amount_of(abs(amount), at.unit), "side": side}
-        case "source":
-            values["side"] = "source" if more else "sink"
-        case "flux":
-            values["side"] = "into" if more else "out of"
-        case "initial":
-            kind = "initial, uncertain" if at.start_uncertain else kind
-            values["side"] = "higher" if more else "lower"
-    found = LIKELY[kind].filled(**values)
-    if kind not in ESTIMATED:
-        return found
-    width, unit = f"{2.0 * abs(amount):.2g}", direction.unit.replace("degC", "K")
-    value = f'"{width} {unit}"' if unit else width
-    return found._replace(remedy=estimating(kind, name, value))
+    name, kind, amount = direction.subject, direction.kind, _amount(direction, size, at)
+    unit, positive, more = direction.unit, size > 0.0, dict[str, str]()
+    if kind == "lag":
+        unit = at.time_unit
+    elif kind == "boundary":
+        unit, positive = at.unit, amount > 0.0
+        kind = "boundary, constant" if name == FIXED else kind
+    elif kind == "drift":
+        more["rate"] = f"{'+' if positive else '-'}{amount_of(abs(amount) / DRIFT, unit)}"
+    elif kind == "position":
+        more["where"] = _displaced(direction, amount)
+    elif kind == "initial" and at.start_uncertain:
+        kind = "initial, uncertain"
+    found = clause(kind, name, amount, unit, positive=positive, **more)
+    if kind in ESTIMATED:
+        return found._replace(remedy=estimating(kind, name, width(amount, direction.unit)))
+    return found
 
 
 def _displaced(direction: ScoreDirection, amount: float) -> str:

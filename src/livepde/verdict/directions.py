@@ -8,7 +8,7 @@ its size, to distinguish causes, and so costs a fraction of a step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -111,8 +111,7 @@ class Process:
         mass = self.model.mass
 
         def loss(now: Now) -> Array:
-            found: Array = -LOSS / (REACH * now.unit) * (mass @ (now.u - now.rest))
-            return found
+            return -LOSS / (REACH * now.unit) * (mass @ (now.u - now.rest))
 
         yield Term("source", load=_constant(self._whole, self.level))
         yield Term("loss", load=loss)
@@ -210,8 +209,7 @@ def force(model: Model, now: Now) -> Array:
     """Return F - B(u) - A(u) q, (n,)."""
     u, moment = now.u, now.moment
     driven = model.physical_A.vector("v", moment, q=model.latent.value(now.q), u=u)
-    found: Array = model.F(moment) - model.B(u, moment) - driven
-    return found
+    return model.F(moment) - model.B(u, moment) - driven
 
 
 def scaled_channel(model: Model, name: str, now: Now, share: float) -> Array:
@@ -240,6 +238,10 @@ class ScoreDirection:
     least: float = -np.inf
     most: float = np.inf
     at: float = np.nan  # coordinate of the sensor along the axis; NaN if it is not a position
+
+
+# Amplitudes of errors of sensors that are the same at each sample, in units of the noise
+CONSTANT = {"offset": OFFSET, "drift": OFFSET / DRIFT}
 
 
 class Dictionary:
@@ -280,37 +282,52 @@ class Dictionary:
         self._add("process", [ScoreDirection(term.kind, term.subject) for term in terms])
         # Offsets and drifts, in units of the noise, are the same at each sample.
         self._constant = np.zeros((observed.size, len(self)))
-        for kind, size in (("offset", OFFSET), ("drift", OFFSET / DRIFT)):
-            if kind in self.parts:  # many sensors leave out kinds
-                self._constant[:, self.parts[kind]] = size * np.eye(observed.size)
-        changing = [self._places(kind) for kind in self.kinds if kind not in ("offset", "drift")]
-        self._changing: IntArray = np.concatenate([*changing, np.zeros(0, dtype=np.int64)])
+        for kind in CONSTANT.keys() & self.parts:  # many sensors leave out kinds
+            self._constant[:, self.parts[kind]] = CONSTANT[kind] * np.eye(observed.size)
 
-    def _add_sensors(self, model: Model, observed: Observed, noise: Array, room: int) -> None:
-        """Append the directions of single sensors, as many kinds as there is room for."""
+    @cached_property
+    def _changing(self) -> IntArray:
+        """Places of the directions of sensors whose signals change from sample to sample."""
+        places = [self._places(kind) for kind in self.kinds if kind not in CONSTANT]
+        return np.concatenate([*places, np.zeros(0, dtype=np.int64)])
+
+    def _amplitudes(
+        self, model: Model, observed: Observed, noise: Array, room: int, shifts: int, step: Array
+    ) -> dict[str, tuple[Array, Sequence[str], int]]:
+        """Return the amplitudes of the kinds of errors of sensors that there is room for.
+
+        Those of each sensor, their units, and along how many axes there is one. Where room is short
+        the last kinds are left out first.
+        """
         sensors, units = observed.size, observed.units
         none = ("",) * sensors
-        shifts, step = sensor_shifts(model, observed)
-        amplitudes = {  # of each sensor, with their unit; where room is short the last go first
-            "offset": (OFFSET * noise, units),
-            "lag": (np.full(sensors, np.nan), none),
-            "position": (step, (model.length_unit,) * sensors),
-            "gain": (np.full(sensors, GAIN), none),
-            "drift": (OFFSET * noise, units),
+        amplitudes: dict[str, tuple[Array, Sequence[str], int]] = {
+            "offset": (OFFSET * noise, units, 1),
+            "lag": (np.full(sensors, np.nan), none, 1),
+            "position": (step, (model.length_unit,) * sensors, shifts),
+            "gain": (np.full(sensors, GAIN), none, 1),
+            "drift": (OFFSET * noise, units, 1),
         }
         if not shifts:
             del amplitudes["position"]
-        axes = {kind: len(shifts) if kind == "position" else 1 for kind in amplitudes}
-        while amplitudes and sensors * sum(axes[kind] for kind in amplitudes) > room:
+        while amplitudes and sensors * sum(axes for *_, axes in amplitudes.values()) > room:
             kind, _ = amplitudes.popitem()
             self.left_out.append(f"{kind} of single sensors: there are {sensors}")
+        return amplitudes
+
+    def _add_sensors(self, model: Model, observed: Observed, noise: Array, room: int) -> None:
+        """Append the directions of single sensors, as many kinds as there is room for."""
+        shifts, step = sensor_shifts(model, observed)
+        amplitudes = self._amplitudes(model, observed, noise, room, len(shifts), step)
         self.kinds = tuple(amplitudes)
-        for kind, (size, of) in amplitudes.items():
-            own = list(zip(observed.names, size.tolist(), of, strict=True))
-            each = [(axis, *one) for axis in range(axes[kind]) for one in own]
-            found = [ScoreDirection(kind, name, one, unit, k) for k, name, one, unit in each]
+        for kind, (size, of, axes) in amplitudes.items():
+            found = [
+                ScoreDirection(kind, name, one, unit, axis)
+                for axis in range(axes)
+                for name, one, unit in zip(observed.names, size.tolist(), of, strict=True)
+            ]
             self._add(kind, _within_reach(model, observed, found) if kind == "position" else found)
-        self.own: IntArray = np.arange(len(self.directions)) % sensors  # sensor of each so far
+        self.own: IntArray = np.arange(len(self.directions)) % observed.size  # sensors
         self.axes = len(shifts) if "position" in amplitudes else 0  # along which sensors may be off
         if self.axes:
             # The coefficients of the state that matter, and the matrices of all axes on them.

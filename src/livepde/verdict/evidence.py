@@ -88,8 +88,7 @@ class LinearModel:
     @cached_property
     def squares(self) -> Array:
         """Z^T Z."""
-        found: Array = self.Z.T @ self.Z
-        return found
+        return self.Z.T @ self.Z
 
     @cached_property
     def left(self) -> tuple[Array, Array, float]:
@@ -126,7 +125,6 @@ class Mixture(NamedTuple):
         return self._replace(deviations=np.hypot(self.deviations, shift))
 
     def quantile(self, share: float) -> Array:
-        """Return a quantile of each number."""
         target = scipy.special.ndtri(share)
         ends = self.means + target * self.deviations
         low, high = ends.min(axis=0), ends.max(axis=0)
@@ -135,8 +133,7 @@ class Mixture(NamedTuple):
             below = scipy.special.ndtr((middle - self.means) / self.deviations)
             less = self.weights @ below < share
             low, high = np.where(less, middle, low), np.where(less, high, middle)
-        found: Array = 0.5 * (low + high)
-        return found
+        return np.asarray(0.5 * (low + high))
 
     @property
     def interval(self) -> tuple[Array, Array]:
@@ -185,7 +182,6 @@ class _Tried(NamedTuple):
 
 
 def _alone(model: LinearModel, axes: _Axes, size: float) -> _Tried:
-    """Return a family of a size."""
     D = 1.0 + size**2 * axes.effect
     gained = size**2 * axes.along / D
     return _Tried(
@@ -237,16 +233,22 @@ def averaged(model: LinearModel, causes: Causes, families: Sequence[Family]) -> 
     squares, volume, shift, more = (np.concatenate(part) for part in zip(*tried, strict=True))
     squares = np.maximum(squares, 0.0)
     told = -0.5 * (NU + n) * np.log((NU + squares) / (NU + total)) - volume
-    kinds, counts = list[IntArray](), [0, 0, 0]
+    kinds, counts = _kinds(groups)
+    shares = (NOTHING, 0.5 * (1.0 - NOTHING), 0.5 * (1.0 - NOTHING))
+    weights = _tempered(told, kinds, shares, counts)
+    level = np.maximum(1.0, (NU + squares) / (NU + n))
+    return Mixture(weights, mean + shift, np.sqrt((variance + more) * level[:, None]))
+
+
+def _kinds(groups: Sequence[Sequence[Sequence[_Tried]]]) -> tuple[IntArray, list[int]]:
+    """Return the kind of each hypothesis, and how many kinds each group has."""
+    kinds, counts = list[IntArray](), [0] * len(groups)
     for number, group in enumerate(groups):
         for sizes in filter(None, group):
             count = len(sizes[0].squares)
             kinds += [sum(counts) + np.arange(count)] * len(sizes)
             counts[number] += count
-    shares = (NOTHING, 0.5 * (1.0 - NOTHING), 0.5 * (1.0 - NOTHING))
-    weights = _tempered(told, np.concatenate(kinds), shares, counts)
-    level = np.maximum(1.0, (NU + squares) / (NU + n))
-    return Mixture(weights, mean + shift, np.sqrt((variance + more) * level[:, None]))
+    return np.concatenate(kinds), counts
 
 
 def _tempered(
@@ -268,8 +270,7 @@ def _tempered(
     excess = float((of_kind + prior).max() - of_kind[0] - prior[0])
     eta = 1.0 if excess <= TEMPER else TEMPER / excess
     weights = (prior + eta * of_kind - total)[kinds] + told
-    found: Array = np.exp(weights - scipy.special.logsumexp(weights))
-    return found
+    return np.asarray(np.exp(weights - scipy.special.logsumexp(weights)))
 
 
 def averaged_causes(ledger: Ledger, moved: Array, most: Array, std: Array) -> Mixture:
@@ -328,8 +329,7 @@ def levels(ledger: Ledger) -> Array:
     differences = np.maximum(squares - products, 0.0)
     # Short windows lean on the level of the whole run, and that on the stated one.
     whole = (differences[0] + NU) / (pairs[0] + NU)
-    found: Array = (differences + TRUSTED_LEVEL * whole) / (pairs + TRUSTED_LEVEL)
-    return found
+    return np.asarray((differences + TRUSTED_LEVEL * whole) / (pairs + TRUSTED_LEVEL))
 
 
 def weighted_median(values: Array, weights: Array) -> float:
@@ -342,8 +342,7 @@ def weighted_median(values: Array, weights: Array) -> float:
 def mean_squares(ledger: Ledger) -> Array:
     """Return mean squares of the whitened innovations, 1 if as stated, (windows, sensors)."""
     count, _, squares, *_ = ledger.noise
-    found: Array = squares / np.maximum(count, 1.0)
-    return found
+    return np.asarray(squares / np.maximum(count, 1.0))
 
 
 def causes_of(ledger: Ledger) -> CauseEvidence:
@@ -458,8 +457,9 @@ def _weights(ledger: Ledger, directions: int) -> Array:
     windows = len(epoch)
     share = np.full(windows, 0.5 / max(windows - 1, 1)) / ((epoch + 1.0) * (epoch + 2.0))
     share[0] = 0.5
-    found: Array = np.log(share)[:, None] - np.log(max(directions, 1)) + np.zeros((1, directions))
-    return found
+    return np.asarray(
+        np.log(share)[:, None] - np.log(max(directions, 1)) + np.zeros((1, directions))
+    )
 
 
 @dataclass(frozen=True, eq=False)

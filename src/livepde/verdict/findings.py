@@ -97,7 +97,6 @@ class Cause:
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> Cause:
-        """Return the cause that `to_dict` has written."""
         return cls(**{**stored, **{name: _number(stored[name]) for name in ("share", "size")}})
 
     def to_dict(self) -> dict[str, Any]:
@@ -172,7 +171,6 @@ class Finding:
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> Finding:
-        """Return the finding that `to_dict` has written."""
         own = {name: value for name, value in stored.items() if name != "sentence"}
         causes = tuple(map(Cause.from_dict, own["causes"]))
         return cls(**{**own, "causes": causes, "evidence": _number(own["evidence"])})
@@ -228,14 +226,14 @@ def _ranked(findings: Iterable[Finding], errors: ModelErrors) -> list[Finding]:
     given = [finding for finding in findings if finding.what != "effect"]
     doubted = any(finding.what in DOUBTS for finding in given)
     level = errors.level(doubted=doubted)
+    severity = NAMES[level]
     ranked = [
-        replace(one, severity=NAMES[level])
+        replace(one, severity=severity)
         if one.what in RANKED and one.severity != "note" and not _gross(one)
         else one
         for one in given
     ]
     text = errors.sentence(doubted=doubted)
-    severity = NAMES[level]
     effect = Finding("effect", severity, text, evidence=errors.effect, remedy=errors.remedy)
     return ranked if level == "trusted" else [effect, *ranked]
 
@@ -244,6 +242,28 @@ def _gross(finding: Finding) -> bool:
     """Whether a column is in another unit, or of another sensor: then no estimate is right."""
     first = finding.causes[0] if finding.causes else None
     return first is not None and first.kind in GROSS and first.share >= HALF
+
+
+def _graver(finding: Finding) -> Finding:
+    return replace(finding, severity="do not trust") if _gross(finding) else finding
+
+
+def _merged(causes: Sequence[Cause], known: Sequence[Cause]) -> tuple[Cause, ...]:
+    """Return causes that were fitted, with those that a run has named before, by their shares."""
+    before = {(one.kind, one.subject): one for one in known}
+    # What frees a cause is known where the run has named it already. A key that corrects a column
+    # has the size that was fitted.
+    causes = [
+        replace(one, remedy=named.remedy, setting=named.setting)
+        if not one.setting and (named := before.get((one.kind, one.subject)))
+        else one
+        for one in causes
+    ]
+    # An offset or a gain of an input is that of a boundary value, or of a channel.
+    said = {(kind, one.subject) for one in causes for kind in (one.kind, "boundary", "channel")}
+    others = [one for one in known if (one.kind, one.subject) not in said]
+    # Of the same share what was fitted counts more than what a linear model says.
+    return tuple(sorted([*causes, *others], key=lambda one: -one.share)[:NAMED])
 
 
 @dataclass(frozen=True)
@@ -308,7 +328,6 @@ class Verdict:
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> Verdict:
-        """Return the verdict that `to_dict` has written."""
         findings = [Finding.from_dict(item) for item in stored["findings"]]
         errors, judged = ModelErrors.from_dict(stored.get("errors")), bool(stored["judged"])
         return cls.of(findings, stored["untested"], stored["unseen"], judged=judged, errors=errors)
@@ -352,35 +371,13 @@ class Verdict:
             if not causes or not causes[0].share >= HALF:
                 return self
             text, _ = FINDINGS["misfit, columns"]
-            severity: Severity = "do not trust" if causes[0].kind in GROSS else "caution"
-            found = Finding("misfit", severity, text, causes[0].subject, causes=tuple(causes))
-            return self.with_findings([found])
-        before = {(one.kind, one.subject): one for one in misfit.causes}
-        # What frees a cause is known where the run has named it already. A key that corrects a
-        # column has the size that was fitted.
-        causes = [
-            replace(one, remedy=named.remedy, setting=named.setting)
-            if not one.setting and (named := before.get((one.kind, one.subject)))
-            else one
-            for one in causes
-        ]
-        said = {(cause.kind, cause.subject) for cause in causes}
-        # An offset or a gain of an input is that of a boundary value, or of a channel.
-        said |= {(kind, cause.subject) for cause in causes for kind in ("boundary", "channel")}
-        others = [one for one in misfit.causes if (one.kind, one.subject) not in said]
-        # Of the same share what was fitted counts more than what a linear model says.
-        ranked = sorted([*causes, *others], key=lambda one: -one.share)[:NAMED]
-        first = misfit.causes[0] if misfit.causes else ranked[0]
+            found = Finding("misfit", "caution", text, causes[0].subject, causes=tuple(causes))
+            return self.with_findings([_graver(found)])
+        ranked = _merged(causes, misfit.causes)
+        first = (*misfit.causes, *ranked)[0]
         same = (ranked[0].kind, ranked[0].subject) == (first.kind, first.subject)
-        # With a column in another unit, or of another sensor, no estimate can be right.
-        gross = ranked[0].kind in GROSS and ranked[0].share >= HALF
-        better = replace(
-            misfit,
-            severity="do not trust" if gross else misfit.severity,
-            subject=ranked[0].subject,
-            causes=tuple(ranked),
-            shift=misfit.shift if same else {},
-        )
+        shift = misfit.shift if same else {}
+        better = _graver(replace(misfit, subject=ranked[0].subject, causes=ranked, shift=shift))
         return self._with(findings=[better, *(one for one in self.findings if one is not misfit)])
 
     @property
@@ -432,7 +429,6 @@ class Shifts(Generic[Number]):
         return {"discretisation_shift": self.largest, **sizes, **shifts}
 
     def each(self, change: Callable[[Number], Other]) -> Shifts[Other]:
-        """Return the shifts with a function of each number that is known."""
         return Shifts(
             change(self.largest) if known(self.largest) else NOT_KNOWN,
             {kind: change(size) for kind, size in self.sizes.items()},
@@ -453,10 +449,7 @@ def discretised(shifts: Shifts[float]) -> Iterator[Finding]:
     sizes = {kind: abs(shifts.sizes[kind]) for kind in REFINE if kind in shifts.sizes}
     if not total > SHIFTED or not sizes:
         return
-    # Shares may cancel in the total: the largest is named, and each from `SHARED` on.
-    largest = max(sizes.values())
-    parts = sorted(sizes, key=lambda kind: -sizes[kind])
-    parts = [kind for kind in parts if sizes[kind] >= min(largest, SHARED)]
+    parts = _named(sizes)
     each = [f"{REFINE[kind][0]} by {sizes[kind]:.1f}{_listed(shifts.by(kind))}" for kind in parts]
     text, _ = FINDINGS["discretisation"].filled(total=total, each=", ".join(each))
     remedy = " ".join(REFINE[kind][1] for kind in parts)
@@ -465,6 +458,14 @@ def discretised(shifts: Shifts[float]) -> Iterator[Finding]:
     unsure = total > DECIDES or sizes.get("input", 0.0) > GUESSED
     severity: Severity = "caution" if unsure else "note"  # the interval holds it
     yield Finding("discretisation", severity, text, evidence=total, remedy=remedy)
+
+
+def _named(sizes: Mapping[str, float]) -> list[str]:
+    """Return the largest kind of shift, and each from `SHARED` on, the largest first."""
+    # Shares may cancel in the total.
+    least = min(max(sizes.values()), SHARED)
+    kinds = sorted(sizes, key=sizes.__getitem__, reverse=True)
+    return [kind for kind in kinds if sizes[kind] >= least]
 
 
 def held_inputs(shifts: Shifts[float]) -> Iterator[Finding]:

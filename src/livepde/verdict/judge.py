@@ -130,9 +130,18 @@ class Judge:
         follows = self.terms > 0 and members <= MOST_MEMBERS
         if follows and np.count_nonzero(reached) < members:
             ledger = self._extend_answers(ledger, sample)
-        rows, at, waiting = ledger.rows.copy(), self._at, ledger.waiting
-        alone = members == 1
-        row = rows[:, int(waiting[0])] if alone else np.empty((members, self.numbers))
+        rows, waiting = ledger.rows.copy(), ledger.waiting
+        rows[np.arange(members), waiting] = self._row(sample, M)
+        # The update of this sample multiplies M by W^T, and predictions by what moves the rows of
+        # [U C].
+        one = self._eye[:, :r]
+        after = changed(ledger, seen=ledger.seen + 1, waiting=ledger.waiting + 1, rows=rows)
+        return one if members == 1 else np.repeat(one, members, axis=0), after
+
+    def _row(self, sample: ScoredSample, M: Array) -> Array:
+        """Return the numbers of a sample, (members, numbers)."""
+        members, at = len(M), self._at
+        row = np.empty((members, self.numbers))
         row[:, 0] = sample.at.t
         for name in ("used", "d", "noise", "z", "predicted"):
             row[:, at[name]] = getattr(sample, name)
@@ -148,13 +157,7 @@ class Judge:
             known = sample.C.shape[1] == self.unknowns
             row[:, at["a"]] = sample.a() if known else 0.0
             row[:, at["C"]] = sample.C.reshape(members, -1) if known else 0.0
-        if not alone:
-            rows[np.arange(members), waiting] = row
-        # The update of this sample multiplies M by W^T, and predictions by what moves the rows of
-        # [U C].
-        one = self._eye[:, :r]
-        after = changed(ledger, seen=ledger.seen + 1, waiting=ledger.waiting + 1, rows=rows)
-        return one if members == 1 else np.repeat(one, members, axis=0), after
+        return row
 
     @nonfinite_allowed()  # counted as nothing
     def summed_up(self, ledger: Ledger, M: Array) -> tuple[Array, Ledger]:
@@ -363,8 +366,7 @@ class Judge:
 def _reached(ledger: Ledger, t: float) -> Mask:
     """Return whether the responses reach a time; where samples are regular, they end at one."""
     begin, end = ledger.reached.T
-    found: Mask = end >= t - REACHED * (end - begin)
-    return found
+    return np.asarray(end >= t - REACHED * (end - begin))
 
 
 def _in_windows(effect: Array, growth: Array) -> Array:

@@ -150,8 +150,7 @@ class Ledger:
     @property
     def due(self) -> Mask:
         """Windows that restart with the next sample, shape (members, windows)."""
-        due: Mask = (self.age >= LENGTHS[: self.age.shape[1]]) | (self.age == 0)
-        return due
+        return np.asarray((self.age >= LENGTHS[: self.age.shape[1]]) | (self.age == 0))
 
     def clipped(self, r: Array) -> Array:
         """Return whitened innovations, (members, batch, sensors), none far beyond usual."""
@@ -258,7 +257,6 @@ class InputLedger:
 
     @classmethod
     def start(cls, channels: int) -> InputLedger:
-        """Return the value before any sample."""
         none = np.zeros(channels)
         return cls(counts=np.zeros(1 + channels, dtype=np.int64), held=none, unstated=none)
 
@@ -317,7 +315,6 @@ class ValidationLedger:
 
     @classmethod
     def start(cls, sensors: int) -> ValidationLedger:
-        """Return the value before any sample."""
         return cls(np.zeros((9, sensors)), np.full(sensors, np.nan))
 
     def add(self, z: Array, predicted: Array, variance: Array) -> ValidationLedger:
@@ -352,34 +349,25 @@ class ValidationLedger:
     def findings(
         self, names: Sequence[str], ignored: Collection[str] = (), units: Sequence[str] = ()
     ) -> Iterator[Finding]:
-        """Return which sensors, but ignored ones, are missed by more than is allowed.
-
-        That is prediction and noise.
+        """Return which sensors, without ignored ones, are missed by more than prediction and noise.
 
         The errors of one sensor are correlated as far as they come from the unknowns: so their mean
         square over its expected value counts as one draw of chi-square. The noise is estimated from
         successive differences.
         """
-        scored = len(names) - len(ignored)
         for k, name in enumerate(names):
-            if name in ignored:
+            if name in ignored or self.sums[0, k] < FEWEST:
                 continue
             count, pairs, differences, squares, errors, *_, variance = self.sums[:, k]
-            if count < FEWEST:
-                continue
             noise = differences / max(pairs, 1.0)
-            expected = noise + variance / count
-            ratio = squares / count / max(expected, 1e-300)
-            p = min(1.0, chance(ratio, 1) * scored)
+            ratio = squares / count / max(noise + variance / count, 1e-300)
+            p = min(1.0, chance(ratio, 1) * (len(names) - len(ignored)))
             if p > CHANCE:
                 continue
-            size, mean = math.sqrt(squares / count), errors / count
+            size = math.sqrt(squares / count)
+            unit = f" {units[k]}".replace("degC", "K").rstrip() if units else ""
             text, _ = FINDINGS["validation"].filled(
-                name=name,
-                size=size,
-                mean=mean,
-                ratio=math.sqrt(ratio),
-                unit=f" {units[k]}".replace("degC", "K") if units and units[k] else "",
+                name=name, size=size, mean=errors / count, ratio=math.sqrt(ratio), unit=unit
             )
             likely, remedy = LIKELY["validation"].filled(name=name)
             cause = self._unit(k, name) or Cause("validation", name, likely, remedy=remedy)

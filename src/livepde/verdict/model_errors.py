@@ -60,11 +60,6 @@ class Allowed:
     def _size(self) -> float:
         return max(abs(self.value), abs(self.plain_low), abs(self.plain_high))
 
-    @property
-    def usable(self) -> bool:
-        """Whether the interval is narrow enough to use."""
-        return self.effect <= USELESS
-
     def about(self, value: float, plain_low: float, plain_high: float) -> Allowed:
         """Return a later estimate with an interval that is as much wider than the plain one."""
 
@@ -159,13 +154,22 @@ class ModelErrors:
             return "do not trust"
         if not self.asked:  # no unknown of which an effect could be harmless
             return "caution" if doubted else "trusted"
-        wide = max((one.effect for one in self.asked if one.wider > WIDER), default=0.0)
         if not doubted:
-            return "caution" if wide > HIDDEN else "trusted"
+            return "caution" if self.wide > HIDDEN else "trusted"
         # One unknown that is too uncertain does not take the value from the others.
-        if wide > USELESS and not any(one.usable for one in self.asked):
+        if self.wide > USELESS and len(self.useless) == len(self.asked):
             return "do not trust"
         return "trusted" if self.effect <= HARMLESS else "caution"
+
+    @property
+    def wide(self) -> float:
+        """Largest effect on an unknown whose interval is much wider than by the noise alone."""
+        return max((one.effect for one in self.asked if one.wider > WIDER), default=0.0)
+
+    @property
+    def useless(self) -> list[str]:
+        """Unknowns of the model whose interval is too wide to use."""
+        return [one.label for one in self.asked if one.effect > USELESS]
 
     def sentence(self, *, doubted: bool) -> str:
         """Return fit and effect in words."""
@@ -186,8 +190,7 @@ class ModelErrors:
         """What to do with such intervals."""
         if self.failed:
             return "Do not use the estimates. Find the error in the model or the data first."
-        useless = [one.label for one in self.asked if not one.usable]
-        if not useless:
+        if not (useless := self.useless):
             return "Use these intervals: the others assume an exact model."
         if len(useless) == len(self.asked):
             return "These intervals are too wide to use. Find the error first."

@@ -11,6 +11,8 @@ import math
 import re
 from typing import NamedTuple
 
+from livepde.showing import in_percent
+
 SMALLEST = 1e-6  # p-value that is printed
 CENTI = {"m": ("cm", "mm")}  # unit -> those of a hundredth and a thousandth
 
@@ -369,6 +371,30 @@ ESTIMATED = {
 }
 """Kind of an error of a sensor -> what to estimate, and the key that makes it an unknown."""
 
+SIDES = {
+    "offset": ("high", "low"),
+    "boundary": ("high", "low"),
+    "boundary, constant": ("high", "low"),
+    "gain": ("large", "small"),
+    "channel": ("large", "small"),
+    "factor": ("large", "small"),
+    "lag": ("late", "early"),
+    "source": ("source", "sink"),
+    "flux": ("into", "out of"),
+    "initial": ("higher", "lower"),
+    "initial, uncertain": ("higher", "lower"),
+}
+"""Kind of a cause -> its side in words if it is positive, and if it is negative."""
+
+
+def clause(
+    kind: str, name: str, size: float, size_unit: str, *, positive: bool, **more: object
+) -> Sentence:
+    """Return a cause of a size in a unit as a clause, and its remedy."""
+    side = SIDES[kind][not positive] if kind in SIDES else ""
+    amount, share = amount_of(abs(size), size_unit), in_percent(abs(size))
+    return LIKELY[kind].filled(name=name, amount=amount, share=share, side=side, **more)
+
 
 def table_of(name: str) -> str:
     """Return the table of a channel in a case, as a sentence has it.
@@ -393,6 +419,12 @@ def estimating(kind: str, name: str, value: str) -> str:
     """
     what, key = ESTIMATED[kind]
     return f"To test this, estimate {what}: add `{key} = {value}` to {table_of(name)}."
+
+
+def width(size: float, unit: str) -> str:
+    """Return a standard deviation of twice a size, with its unit as TOML."""
+    value, unit = f"{2.0 * abs(size):.2g}", unit.replace("degC", "K")
+    return f'"{value} {unit}"' if unit else value
 
 
 def percent(share: float, digits: int = 0) -> str:

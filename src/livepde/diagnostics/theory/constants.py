@@ -256,10 +256,7 @@ def constants(
     C is taken at the (physical) parameter q, q* in a twin, shape (m,), and at states along the run,
     at least one. The gain of the law divides the inner product of Q: C_A grows with its root.
 
-    Raises
-    ------
-    ConfigurationError
-        No state is given, or C is not linear in the latent parameter.
+    Raises `ConfigurationError`: no state is given, or C is not linear in the latent parameter.
     """
     if not len(states):
         raise ConfigurationError("constants: give at least one state.")

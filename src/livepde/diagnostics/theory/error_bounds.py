@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any, Literal
@@ -46,35 +46,20 @@ UNUSED = (
 
 @dataclass(frozen=True)
 class Errors:
-    """Error norms of a twin experiment at one sample.
-
-    Attributes
-    ----------
-    e
-        ||q - q*||_Q, gain-scaled.
-    r, p, d, r_alpha
-        Norms of R(u - u*), P(u - u*), u_alpha - R u* and R u - u_alpha. With a `Subdomain` they are
-        integrals of u - u* over omega (r) and over its complement (p).
-    Pu
-        ||P u*||_V^.
-    rate
-        ||d~||_X, the rate of change of d since the previous sample; 0 at the first.
-    theta
-        Value of the damping rule for r_alpha.
-    u_alpha
-        ||u_alpha||_X, the reference of relative floors.
-    """
+    """Error norms of a twin experiment at one sample."""
 
     t: float
-    e: float
+    e: float  # ||q - q*||_Q, gain-scaled
+    # r, p, d, r_alpha: norms of R(u - u*), P(u - u*), u_alpha - R u* and R u - u_alpha. With a
+    # `Subdomain` they are integrals of u - u* over omega (r) and over its complement (p).
     r: Norms
     p: Norms
     d: Norms
     r_alpha: Norms
-    Pu: float
-    rate: float
-    theta: float
-    u_alpha: float = 0.0
+    Pu: float  # ||P u*||_V^
+    rate: float  # ||d~||_X, the rate of change of d since the previous sample; 0 at the first
+    theta: float  # value of the damping rule for r_alpha
+    u_alpha: float = 0.0  # ||u_alpha||_X, the reference of relative floors
 
     @property
     def energy(self) -> float:
@@ -195,7 +180,6 @@ class TwinTracker:
 
     @property
     def q_true(self) -> float:
-        """||q*||_Q, gain-scaled."""
         return self.twin.model.Q.norm(self.twin.q) / float(np.sqrt(self.gain))
 
 
@@ -341,21 +325,9 @@ def bounds(
             "The energy grew. " + UNUSED,
         )
     ]
-    p0 = kept[0].p.X ** 2
-    largest_p = float(_values(kept, attrgetter("p.X")).max()) ** 2
-    if nu > 0:
-        C = c.hidden_VX_X
-        b = c.C_N**2 * C**4 / c.c_N**2 * float(_values(kept, lambda item: item.Pu**2).max())
-        b += c.C_A * C**2 / (c.c_N * nu) * limit
-        lines.append(
-            Check.at_most(
-                "2. ||p||^2", largest_p, max(p0, 2.0 * b) * (1 + ROUNDING), "p grew. " + UNUSED
-            )
-        )
-    elif largest_p == 0.0:
-        lines.append(Check.at_most("2. ||p||^2 (all observed)", largest_p, 0.0, ""))
+    lines += _unobserved(kept, c, nu, limit)
     if sigma == 0 and c.L_C > 0:
-        values = _values(kept, lambda item: item.p.V * residual(item))
+        values = _values(kept, attrgetter("p.V")) * _values(kept, residual)
         widths = np.diff(_values(kept, attrgetter("t")))  # by hand: NumPy 1.26 has no `trapezoid`
         part = float((widths * (values[1:] + values[:-1]) / 2.0).sum())
         lines.append(
@@ -367,6 +339,19 @@ def bounds(
             )
         )
     return CheckReport(f"error bounds, {data} data", tuple(lines))
+
+
+def _unobserved(kept: Sequence[Errors], c: Constants, nu: float, limit: float) -> Iterator[Check]:
+    """Iterate over the bound of the unobserved error, if there is one; `limit`: of the others."""
+    largest = float(_values(kept, attrgetter("p.X")).max()) ** 2
+    if nu > 0:
+        C = c.hidden_VX_X
+        b = c.C_N**2 * C**4 / c.c_N**2 * float((_values(kept, attrgetter("Pu")) ** 2).max())
+        b += c.C_A * C**2 / (c.c_N * nu) * limit
+        most = max(kept[0].p.X ** 2, 2.0 * b) * (1 + ROUNDING)
+        yield Check.at_most("2. ||p||^2", largest, most, "p grew. " + UNUSED)
+    elif largest == 0.0:
+        yield Check.at_most("2. ||p||^2 (all observed)", largest, 0.0, "")
 
 
 # Number of sensors up to which the error norms are computed exactly, sensor by sensor.

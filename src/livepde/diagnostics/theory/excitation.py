@@ -64,35 +64,24 @@ class Spectrum:
         not determined by data whose error changes at that rate.
         """
         tiny = np.finfo(float).tiny
-        bounds: Array = 2.0 * window * rate / np.maximum(self.strength, tiny)
-        return bounds
+        return 2.0 * window * rate / np.maximum(self.strength, tiny)
 
 
 @dataclass(frozen=True, eq=False)
 class ExcitationState:
-    """State of `Excitation`: accumulated integrals, as a plain value.
+    """State of `Excitation`: accumulated integrals, as a plain value."""
 
-    Attributes
-    ----------
-    t, begun
-        Times of the last sample and of the start of the open window; NaN before the first.
-    last
-        A(w) at t for latent coefficients, dual vectors of X in columns, shape (n, m).
-    integral, latest
-        Integrals over the open window, and over the last whole one, None before.
-    gram
-        Sum over whole windows of their Gramians, shape (m, m); None beyond 1000 parameters.
-    windows
-        Number of whole windows.
-    """
-
+    # t, begun: times of the last sample and of the start of the open window; NaN before the first.
     t: float = np.nan
     begun: float = np.nan
+    # A(w) at t for latent coefficients, dual vectors of X in columns, shape (n, m).
     last: sp.csr_array | None = None
+    # integral, latest: integrals over the open window, and over the last whole one, None before.
     integral: sp.csr_array | None = None
     latest: sp.csr_array | None = None
+    # Sum over whole windows of their Gramians, shape (m, m); None beyond 1000 parameters.
     gram: Array | None = None
-    windows: int = 0
+    windows: int = 0  # number of whole windows
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,15 +142,9 @@ class Excitation:
     ) -> ExcitationState:
         """Take the state estimate w at a time; return the new state.
 
-        Parameters
-        ----------
-        w
-            State u_alpha + P u, or the estimate u if they hardly differ; shape (n,).
-        inputs
-            Input channels at t.
-        q
-            Estimate of the parameter, shape (m,), default the prior mean: the linearisation point
-            of A for a model that is nonlinear in the latent coefficients (with a transform).
+        `w`: u_alpha + P u, or the estimate u if they hardly differ; shape (n,). `inputs`: input
+        channels at t. `q`: estimate of the parameter, shape (m,), default the prior mean: the
+        linearisation point of A for a model that is nonlinear in the latent coefficients.
         """
         model, moment = self.spaces.model, Moment(t, Inputs(inputs or {}))
         at = None
@@ -197,10 +180,7 @@ class Excitation:
         All modes are computed up to 1000 parameters; beyond, the `count` strongest of the latest
         window by Lanczos.
 
-        Raises
-        ------
-        ConfigurationError
-            No window is complete yet.
+        Raises `ConfigurationError`: no window is complete yet.
         """
         integral = state.latest
         if integral is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -164,6 +164,9 @@ class OnlineTracker:
         w = estimate.u if self.damping is None else estimate.u - r
         self.excited = self.excitation.add(self.excited, estimate.t, w, self.inputs, estimate.q)
         self.last = estimate
+        self._keep_state(estimate)
+
+    def _keep_state(self, estimate: Estimate) -> None:
         if (len(self.moments) - 1) % self._every == 0:
             self.states.append(estimate.u)
             if len(self.states) > 2 * SNAPSHOTS:
@@ -180,16 +183,7 @@ class OnlineTracker:
         # One matrix for each octave of alpha: the discrepancy principle gives another alpha for
         # every sample, and each matrix is dense.
         key = round(float(np.log2(alpha))) if alpha > 0 else 0
-        if key not in self._matrices:
-            if len(self._matrices) >= MATRICES:
-                self._matrices.clear()
-                self._sizes.clear()
-            self._matrices[key] = (
-                error_bounds.reconstruction_matrix(observed, alpha)
-                if alpha > 0
-                else observed.split().inverse
-            )
-        matrix = self._matrices[key]
+        matrix = self._matrix(key, alpha)
         if callable(self.noise) or key not in self._sizes:
             given = self.noise(z) if callable(self.noise) else self.noise
             std = np.broadcast_to(np.asarray(given, dtype=float), (observed.size,))
@@ -199,6 +193,20 @@ class OnlineTracker:
             return noise
         lost = part.norms(matrix @ (observed.G @ u_alpha) - u_alpha)
         return Norms(*(float(np.hypot(getattr(noise, n), getattr(lost, n))) for n in NORMS))
+
+    def _matrix(self, key: int, alpha: float) -> Array | sp.csr_array:
+        """Return the matrix of G_alpha, cached by the number of the octave of alpha."""
+        if key not in self._matrices:
+            if len(self._matrices) >= MATRICES:
+                self._matrices.clear()
+                self._sizes.clear()
+            observed = self.identifier.observed
+            self._matrices[key] = (
+                error_bounds.reconstruction_matrix(observed, alpha)
+                if alpha > 0
+                else observed.split().inverse
+            )
+        return self._matrices[key]
 
     @property
     def moment(self) -> Moment:
@@ -259,22 +267,12 @@ def theory_report(
         The stream holds fewer than two samples, or the gain is not constant.
     """
     items = [sample_of(item) for item in samples]
-    if len(items) < 2:
-        raise ConfigurationError(f"theory: needs at least two samples; got {len(items)}.")
-    if getattr(identifier.law, "gain", 1.0) == "auto":
-        raise ConfigurationError(
-            "theory: the paper's quantities are those of a constant gain; give a number for `gain`."
-        )
+    _check(identifier, items)
     if window is None:
         window = max((items[-1].t - items[0].t) / 20.0, 1e-12)
     tracker = OnlineTracker(identifier, window, noise)
     notes: list[str] = []
-    followed = None
-    if twin is not None:
-        try:
-            followed = error_bounds.TwinTracker(twin, tracker.spaces, tracker.gain, tracker.damping)
-        except ConfigurationError as error:
-            notes.append(str(error))
+    followed = None if twin is None else _followed(tracker, twin, notes)
     for sample in items:
         estimate = identifier.step(sample.t, sample.z, sample.inputs)
         tracker.add(estimate, sample)
@@ -292,6 +290,25 @@ def theory_report(
         reports = _with_truth(followed, found, identifier.law, tables)
         notes.append(LINKED)
     return TheoryReport(tuple(tables), tuple(reports), tuple(notes), found, spectrum, stopping)
+
+
+def _check(identifier: Identifier, items: Sequence[Sample]) -> None:
+    if len(items) < 2:
+        raise ConfigurationError(f"theory: needs at least two samples; got {len(items)}.")
+    if getattr(identifier.law, "gain", 1.0) == "auto":
+        raise ConfigurationError(
+            "theory: the paper's quantities are those of a constant gain; give a number for `gain`."
+        )
+
+
+def _followed(
+    tracker: OnlineTracker, twin: Twin, notes: list[str]
+) -> error_bounds.TwinTracker | None:
+    try:
+        return error_bounds.TwinTracker(twin, tracker.spaces, tracker.gain, tracker.damping)
+    except ConfigurationError as error:
+        notes.append(str(error))
+        return None
 
 
 def _constants(tracker: OnlineTracker, tables: list[Table], notes: list[str]) -> Constants | None:

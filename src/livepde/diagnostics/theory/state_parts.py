@@ -231,11 +231,9 @@ class Part:
     def image(self, x: Array) -> Array:
         """Return the X-Gram product of M: x -> E^T M^T X^{-1} M E x."""
         dual = self._tested @ (self.basis @ x)
-        result: Array = self.basis.T @ (self._tested.T @ self.space.riesz(dual))
-        return result
+        return np.asarray(self.basis.T @ (self._tested.T @ self.space.riesz(dual)))
 
     def gram_V(self, x: Array) -> Array:
-        """Return (x, .)_V on the basis."""
         if self._V is not None:
             result: Array = self.basis.T @ (self._V @ (self.basis @ x))
             return result
@@ -252,7 +250,6 @@ class Part:
 
     @cached_property
     def inverse_V(self) -> Map:
-        """Inverse of `gram_V`."""
         if self._V is not None:
             return HilbertSpace(self._on_basis(self._V)).riesz
         # On the basis gram_V is M S^{-1} M with the Schur complement S of X.

@@ -45,7 +45,6 @@ class KeptFactor:
 
     @classmethod
     def none(cls) -> KeptFactor:
-        """Return the value without a factor."""
         return cls(np.zeros(0), np.zeros(0), 0.0, 0.0, 0.0, np.zeros(0), math.nan, 0)
 
     @classmethod

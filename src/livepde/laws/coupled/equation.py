@@ -348,9 +348,7 @@ class StageTerms:
         return learned if J is None else learned + J @ change
 
     def dual(self, q: Array) -> Array:
-        """Return G_Q q."""
-        dual: Array = self.forms.model.Q.dual(q) if self.auxiliary else self._small_gram @ q
-        return dual
+        return self.forms.model.Q.dual(q) if self.auxiliary else self._small_gram @ q
 
     @cached_property
     def _small_gram(self) -> Any:

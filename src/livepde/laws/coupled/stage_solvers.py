@@ -176,13 +176,11 @@ class MonolithicSolver(StageSolver):
         )
         free = np.concatenate([terms.free, terms.free_q, np.ones(terms.auxiliary)])
         diagonal[(free == 0.0) | (diagonal == 0.0)] = 1.0
-        units: Array = np.exp2(np.round(-0.5 * np.log2(diagonal)))
-        return units
+        return np.asarray(np.exp2(np.round(-0.5 * np.log2(diagonal))))
 
     @cached_property
     def _pull(self) -> Array:
-        found: Array = self.maps["pull"] @ _stored(self.terms.forms.pull)
-        return found
+        return self.maps["pull"] @ _stored(self.terms.forms.pull)
 
     @cached_property
     def _parts(self) -> dict[str, Array]:
@@ -222,8 +220,7 @@ class _Bordered:
 def _stored(matrix: sp.csr_array) -> Array:
     """Return the data of a matrix in the order of its pattern."""
     coo = sp.coo_array(matrix)
-    data: Array = Pattern.of(matrix).gather(coo.row, coo.col) @ coo.data
-    return data
+    return np.asarray(Pattern.of(matrix).gather(coo.row, coo.col) @ coo.data)
 
 
 class BilinearSolver(MonolithicSolver):
@@ -282,7 +279,6 @@ class BilinearSolver(MonolithicSolver):
 
     @cached_property
     def _offset(self) -> Array:
-        """B(0), shape (n,)."""
         return self.terms.forms.model.B(np.zeros(self.terms.n))
 
     @cached_property
@@ -500,7 +496,6 @@ class BlockJacobian:
 
     @cached_property
     def approximate(self) -> ApproximateFactor:
-        """The approximate inverse."""
         solver, terms = self.solver, self.solver.terms
         state = solver.factorise("S", self.S)
         C = sp.csr_array(self.H + _widened(self._information(state), terms.auxiliary))

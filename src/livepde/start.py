@@ -1,0 +1,134 @@
+"""The stated start of a run, the noise of its inputs, and the problem that these make, checked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from numbers import Real
+from typing import Any
+
+import numpy as np
+
+from livepde.errors import ConfigurationError
+from livepde.laws import InitialReading, Law, Problem
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.observation import Observation, Observed
+from livepde.samples import check_noise
+from livepde.stepping import Advance, Scheme
+
+
+def check_parts(*parts: object) -> None:
+    """Refuse what is not a model, an observation and a law, in this order."""
+    for part, kind in zip(parts, (Model, Observation, Law), strict=True):
+        if not isinstance(part, kind):
+            remedy = ": call it" if isinstance(part, type) and issubclass(part, kind) else ""
+            raise ConfigurationError(
+                "Identifier(model, observation, law): as "
+                f"{kind.__name__.lower()}, got {part!r:.80}{remedy}."
+            )
+
+
+def time_option(name: str, value: Any) -> float:
+    """Return a time or duration of the options; raises `ConfigurationError`."""
+    if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf" or math.isnan(value):
+        raise ConfigurationError(
+            f"{name} must be a number, in the unit of time of the model; got {value!r}."
+        )
+    return float(value)
+
+
+def check_kinds(validation: Any, scheme: Any) -> None:
+    """Refuse a validation that is no observation, and a scheme that is none."""
+    for what, part, kind, expected in (
+        ("validation", validation, Observation, "an observation, such as Points"),
+        ("scheme", scheme, Scheme, "a time scheme, such as Alexander2()"),
+    ):
+        if part is not None and not isinstance(part, kind):
+            raise ConfigurationError(f"{what}: got {part!r:.80}; expected {expected}.")
+
+
+def check_start(model: Model, t0: float, u0: Any, uncertain: Mapping[str, Any]) -> None:
+    """Refuse an initial time that is not finite, and an initial state given twice or not at all."""
+    if not np.isfinite(t0):
+        raise ConfigurationError(f"t0 must be a finite number; got {t0}.")
+    for name, given in uncertain.items():
+        if given and u0 is None:
+            raise ConfigurationError(f"{name} describes u0: give u0, too.")
+    if u0 is not None and model.form_initial is not None:
+        raise ConfigurationError("the model has its own initial state (initial=): leave out u0.")
+
+
+def check_ignored(names: Iterable[str], validation: tuple[str, ...]) -> None:
+    """Refuse names of ignored sensors that are not among those for validation."""
+    for name in names:
+        if name not in validation:
+            raise ConfigurationError(
+                f"ignored: '{name}' is none of the sensors in validation, {list(validation)}."
+            )
+
+
+def with_sensors(model: Model, observation: Observation) -> Model:
+    """Return a model with the unknowns of its sensors besides, such as an offset."""
+    known = model.parameter_space.unknowns
+    own = {name: item for name, item in observation.unknowns.items() if name not in known}
+    return model.with_unknowns(own) if own else model
+
+
+def stated_problem(
+    model: Model,
+    observed: Observed,
+    control: Advance,
+    u0: Any,
+    *,
+    input_noise: Mapping[str, float] | None,
+    u0_from: Mapping[str, Any] | None,
+    u0_errors: Iterable[Any],
+) -> Problem:
+    """Return the problem of an identifier from its options."""
+    noise = _input_noise(model, input_noise or {})
+    readings = initial_readings(model, observed, u0_from or {})
+    return Problem(model, observed, control, noise, readings, initial_errors(model, u0_errors), u0)
+
+
+def _input_noise(model: Model, given: Mapping[str, float]) -> dict[str, float]:
+    stds: Mapping[str, Any] = given
+    for name, std in stds.items():
+        if name not in model.channels:
+            raise ConfigurationError(
+                f"input_noise: the model has no channel '{name}'; it has "
+                f"{list(model.channels)}. Specify the noise of sensors in the observation."
+            )
+        if not (isinstance(std, Real) and 0.0 < float(std) < math.inf):
+            raise ConfigurationError(
+                f"input_noise of '{name}' must be a positive number; got {std!r}."
+            )
+    return dict(given)
+
+
+def initial_readings(
+    model: Model, observed: Observed, u0_from: Mapping[str, Any]
+) -> dict[str, InitialReading]:
+    """Return the readings that u0 was made of, each with the derivative of u0 in it."""
+    known = {*observed.names, *model.channels}
+    for name in u0_from:
+        if name not in known:
+            raise ConfigurationError(
+                f"u0_from: '{name}' is neither an assimilated sensor nor a channel of the "
+                f"model; these are {sorted(known)}."
+            )
+    found = {}
+    for name, given in u0_from.items():
+        weight, noise = given if isinstance(given, tuple) else (given, math.nan)
+        at = model.state_space.interpolate(weight)
+        found[name] = InitialReading(at, check_noise(name, noise))
+    return found
+
+
+def initial_errors(model: Model, u0_errors: Iterable[Any]) -> Array:
+    """Return coefficients of the errors of u0, shape (errors, n)."""
+    found = np.array([model.state_space.interpolate(error) for error in u0_errors])
+    found = found.reshape(-1, model.X.dim)
+    if not np.isfinite(found).all():
+        raise ConfigurationError("u0_errors: an error of u0 is not finite; give finite values.")
+    return found

@@ -1,0 +1,296 @@
+"""Whole runs of an identifier: estimates of all samples of a stream, smoothed ones, readings."""
+
+from __future__ import annotations
+
+import copy
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from datetime import datetime
+from functools import partial
+from typing import TYPE_CHECKING, Any, Self, cast
+
+import numpy as np
+
+from livepde.dates import origin_at, since_1970
+from livepde.errors import ConfigurationError, LawError
+from livepde.fem import Inputs
+from livepde.forecast import seen_rows
+from livepde.hindsight import Hindsight, LinearReadings
+from livepde.laws import AnyLaw, Belief, Problem
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.observation import Observed
+from livepde.records import Layout
+from livepde.result import Estimate, Result
+from livepde.samples import Channels, Readings, Sample, is_tabular, sample_of
+from livepde.showing import Shown
+from livepde.stepping import Interval
+from livepde.taken import TakenSamples
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class StreamRuns(Shown):
+    """What `Identifier` makes of whole streams, by taking their samples one by one."""
+
+    model: Model
+    observed: Observed
+    validation: Observed | None
+    ignored: Sequence[str]
+    law: AnyLaw
+    problem: Problem
+    assimilate_from: float
+    _channels: Channels
+    _so_far: TakenSamples
+    _work: Any
+    _state: Any
+    _q0: Array
+    _u0: Array
+
+    @abstractmethod
+    def step(self, t: Any, z: Readings, inputs: Mapping[str, float] | None = None) -> Estimate:
+        """Take one sample and return the estimate at its time."""
+
+    @abstractmethod
+    def _taken(
+        self, t: Any, z: Readings, inputs: Mapping[str, float] | None
+    ) -> tuple[Estimate, Interval]: ...
+
+    @abstractmethod
+    def _settled(self, estimate: Estimate, *, columns: bool = True) -> Estimate: ...
+
+    @abstractmethod
+    def _start(self, inputs: Inputs) -> Any: ...
+
+    @abstractmethod
+    def _started(self, q0: Array, u0: Array, errors: Array) -> Self: ...
+
+    @abstractmethod
+    def _forget(self) -> None: ...
+
+    @abstractmethod
+    def _latent_belief(self) -> Belief: ...
+
+    @abstractmethod
+    def _belief(self) -> Belief: ...
+
+    @property
+    def origin(self) -> datetime | None:
+        """The date of t = 0 in UTC, once a sample with a date was taken; the first is at t0."""
+        origin = self._so_far.origin
+        return None if np.isnan(origin) else origin_at(origin)
+
+    def run(
+        self,
+        stream: Any,
+        *,
+        on_estimate: Callable[[Estimate], object] | None = None,
+        progress: bool = False,
+        total: int | None = None,
+        fields_every: int = 1,
+        time: str | None = None,
+        time_unit: str | None = None,
+        columns: Mapping[str, str] | None = None,
+        units: Mapping[str, str] | None = None,
+        strict: bool | None = None,
+    ) -> Result:
+        """Take every sample of a table, a file or a stream, and collect the estimates.
+
+        Parameters
+        ----------
+        stream
+            A pandas table or an xarray dataset with a column for each channel; the name of a file
+            (`.csv`, `.jsonl`, `.parquet`); or an iterable of (t, z), (t, z, inputs) or `Sample`.
+            Times are numbers or dates; the first date is at t0. Dates without a zone are in UTC.
+        on_estimate
+            Called with each estimate before the next sample is asked for: a controller, say. Its
+            return value is ignored; an exception ends the run.
+        progress
+            Show a bar with rate and time left.
+        total
+            Number of samples, for the time left; default len(stream) if it has one.
+        fields_every
+            Keep the fields of every so many samples (scalars and innovations of all).
+        time
+            Column of the times; this and the options below are of tables and files. Default: the
+            index of a table, the coordinate of a dataset, or the one column that is called time,
+            date or the like.
+        time_unit
+            Unit of times that are numbers; default that of the model. Required if the name of
+            their column has another one, such as time_min.
+        columns
+            Channel -> name of its column, where they differ: {"T_10": "TS_3_2_1"}.
+        units
+            Sensor -> unit of its column, where that is not the unit of the sensor.
+        strict
+            Refuse columns that are no channel; by default they are ignored.
+
+        Raises
+        ------
+        DataError
+            A channel without a column; text or infinity in one; times that do not increase.
+        ConfigurationError
+            Options that do not fit; dates for a model without `time_unit`.
+
+        Examples
+        --------
+        >>> import pandas as pd
+        >>> import livepde as lp
+        >>> from livepde.models import heat
+        >>> model = heat(lp.interval(0.0, 1.0, 20), lp.Normal(0.1, std=0.05))
+        >>> rod = lp.Identifier(model, lp.Points({"middle": 0.5}, noise=0.1), u0=20.0)
+        >>> table = pd.DataFrame({"middle": [20.0, 20.1]}, index=[1.0, 2.0])
+        >>> len(rod.run(table))
+        2
+        """
+        options: dict[str, Any] = {"time": time, "time_unit": time_unit, "columns": columns}
+        options |= {"units": units, "strict": strict}
+        given = {name: value for name, value in options.items() if value is not None}
+        stream, result = self._samples_of(stream, given), self._result(fields_every)
+        begun, taken = copy.copy(self), list[Sample]()  # states of laws are values
+        result.smoother = partial(begun.smoothed, taken, fields_every=fields_every)
+        result.readings = partial(self._channels.readings, taken)
+        if progress:
+            from livepde.progress import watched
+
+            stream = watched(stream, total)
+        for item in stream:
+            sample = sample_of(item)
+            estimate = self.step(sample.t, sample.z, sample.inputs)
+            if not len(result):
+                result.layout = self._dated(result.layout)
+            result.add(estimate)
+            taken.append(Sample(t=sample.t, z=copy.copy(sample.z), inputs=copy.copy(sample.inputs)))
+            if on_estimate is not None:
+                on_estimate(estimate)
+        if result.last is not None:
+            result._settle(self._settled(result.last))
+            noise = self.law.reading_noise(self._work, self._state)
+            if noise is not None and not begun._so_far.samples and not self.model.latent.moves:
+                result.expected = partial(begun._expected, taken, noise)
+        return result
+
+    def _samples_of(self, data: Any, reading: Mapping[str, Any]) -> Iterable[Any]:
+        """Return a stream as it is, and the samples of a table with times of the model."""
+        if not is_tabular(data):
+            if reading:
+                raise ConfigurationError(
+                    f"run: {next(iter(reading))} describes a table or a file; got "
+                    f"{type(data).__name__}."
+                )
+            return cast("Iterable[Any]", data)
+        from livepde.streams.given import Reading
+
+        optional = [name for name in self._channels.inputs if name in self._channels.optional]
+        needed = [name for name in self._channels.names if name not in optional]
+        units = {
+            name: unit
+            for sensors in self._channels.sensors
+            for name, unit in zip(sensors.names, sensors.units, strict=True)
+        }
+        how = Reading(
+            channels=needed,
+            optional=[*optional, *self._channels.noise],
+            unit=self.model.time_unit,
+            sensor_units=units,
+            **reading,
+        )
+        table = how.table(data)
+        if table.origin is None:
+            return table
+        stamp = since_1970(table.origin)
+        t0, origin = self._so_far.since(stamp, self.model.time_unit)
+        self._so_far = replace(self._so_far, origin=origin)
+        return replace(table, t=table.t + t0)
+
+    def _result(self, fields_every: int) -> Result:
+        parts = self.model, self.observed, self.validation, fields_every
+        return Result(*parts, ignored=self.ignored)
+
+    def _dated(self, layout: Layout) -> Layout:
+        """Return the layout of a run with the date of t = 0, if times are dates."""
+        if self.origin is None:
+            return layout
+        return replace(layout, attrs={**layout.attrs, "origin": self.origin.isoformat(sep=" ")})
+
+    @property
+    def _unsmoothed(self) -> str:
+        """Why the law smooths nothing; empty if it does."""
+        return self.law.unsmoothed(self._work)
+
+    def smoothed(self, stream: Any, *, fields_every: int = 1) -> xr.Dataset:
+        """Return the smoothed unknowns and state at each sample of a run, given all of them.
+
+        A fixed-interval smoother: see `livepde.laws.smoother`. All samples are taken by a copy of
+        this identifier, as in a run, and then at least once more; this one stays as it is.
+
+        Parameters
+        ----------
+        stream, fields_every
+            As for `run`.
+
+        Returns
+        -------
+        smoothed
+            As `Result.to_xarray` of the run, without innovations. A constant unknown
+            has one value at all times: the last one.
+
+        Raises
+        ------
+        ConfigurationError
+            An identifier that has taken a sample.
+        LawError
+            A law without a covariance that a smoother could follow.
+        """
+        if self._so_far.samples:
+            raise ConfigurationError(
+                "smoothed takes a run from its first sample on: call it of an identifier that has "
+                "taken none."
+            )
+        if why := self._unsmoothed:
+            raise LawError(f"smoothed: {why}; use SensitivityLaw.")
+        stream = self._samples_of(stream, {})
+        who, run, before = copy.copy(self), Hindsight(self._q0), self._state
+        for item in stream:
+            sample = sample_of(item)
+            estimate, interval = who._taken(sample.t, sample.z, sample.inputs)
+            if before is None:  # the law begins with the first sample
+                before = self._start(Inputs(interval.inputs0))
+            run.add(estimate, interval, who._latent_belief().q)
+        result = self._result(fields_every)
+        result.layout = who._dated(result.layout)
+        data = run.fixed_interval(fields_every)
+        beliefs = data and self.law.smoothed(self._work, before, who._state, data)
+        return run.dataset(result, self.problem, beliefs or ())
+
+    def _expected(
+        self, samples: Iterable[Sample], noise: Array, q: Array, draws: Array
+    ) -> tuple[Array, Array]:
+        """Return readings that draws of the unknowns lead to, and their standard deviation.
+
+        Linear about q, shape (m,), for draws of shape (n, m): the samples are taken again from
+        there, without their readings. Shapes (n, samples, sensors) and (samples, sensors); NaN
+        where a step fails.
+        """
+        latent = self.model.latent
+        centre = latent.inverse(q)
+        found = LinearReadings(np.array([latent.inverse(draw) for draw in draws]) - centre)
+        who = self._started(centre, self._u0, self.problem.initial_errors)
+        who._forget()
+        nothing = np.full(self.observed.size, np.nan)
+        for sample in samples:
+            _, own, _, named = self._channels.parse(sample.z, sample.inputs)
+            inputs = {name: named[name] for name in self._channels.inputs if name in named}
+            estimate, interval = who._taken(sample.t, nothing, inputs)
+            std = noise if own is None else np.where(np.isnan(own), noise, own)
+            used = estimate.status.ok and estimate.t >= self.assimilate_from
+            latent_factor = who._latent_belief().q_factor
+            belief = who._belief()
+            predicted = self.observed.predict(belief.u, belief.q, interval.end)
+            rows = seen_rows(self.observed, belief, interval.end)
+            if latent_factor is None or rows is None:
+                raise LawError(f"{type(self.law).__name__} has no covariance: use SensitivityLaw.")
+            found.add(predicted, rows, latent_factor, std if used else nothing)
+        return found.readings, found.std
