@@ -25,7 +25,7 @@ from livepde.verdict import (
     Verdict,
     discretised,
 )
-from livepde.verdict.evidence import NU, TEMPER, Causes, Family, LinearModel, averaged
+from livepde.verdict.evidence import NU, TEMPER, Causes, Family, LinearModel, Mixture, averaged
 
 # --- the average --------------------------------------------------------------------------------
 
@@ -101,6 +101,35 @@ def test_the_average_is_that_of_dense_normal_models(strength):
     for share in (0.025, 0.5, 0.975):
         at = scipy.special.ndtr((found.quantile(share) - means) / deviations)
         assert found.weights @ at == pytest.approx(share, abs=1e-9)
+
+
+def test_quantiles_take_few_evaluations(monkeypatch):
+    """Components are apart by their deviations, which differ by a factor of ten."""
+    rng = np.random.default_rng(2)
+    means, deviations = (
+        3.0 * rng.standard_normal((200, 30)),
+        10.0 ** rng.uniform(0.0, 1.0, (200, 30)),
+    )
+    mixture = Mixture(np.full(200, 1.0 / 200), means, deviations)
+    calls, ndtr = [], scipy.special.ndtr
+    monkeypatch.setattr(scipy.special, "ndtr", lambda x: (calls.append(x), ndtr(x))[1])
+    low, high = mixture.interval
+    assert len(calls) < 20  # halves of the interval alone take 100
+    for end, share in ((low, 0.025), (high, 0.975)):
+        below = mixture.weights @ ndtr((end - means) / deviations)
+        assert below == pytest.approx(np.full(30, share), abs=1e-9)
+
+
+def test_hypotheses_without_weight_are_left_out():
+    rng = np.random.default_rng(3)
+    J, Z = rng.standard_normal((200, 2)), rng.standard_normal((200, 5))
+    z = 40.0 * Z[:, 0] + rng.standard_normal(200)
+    model = LinearModel(J=J, Z=Z, z=z, T=np.eye(2))
+    causes = Causes(np.arange(5), np.full(5, math.inf), (1.0, 40.0))
+    found = averaged(model, causes, [])
+    # The first cause explains the readings with its larger size alone.
+    assert len(found.weights) == len(found.means) == len(found.deviations) == 10
+    assert found.weights.sum() == pytest.approx(1.0, abs=1e-12)
 
 
 # --- the answers of the process ------------------------------------------------------------------
