@@ -378,9 +378,13 @@ class ForwardStage:
             kept.spent,
         )
         new[:, 0] = u = corrected.solve(begin, model.impose(guess, moment), known, STATE, PASSES)
+        exact = at.same(*corrected.factor_at)
         for part in groups:
             start, known = c[:, part], driven(u, part)
-            if part.start == end:
+            if exact:  # no iteration, and so no start
+                known *= free
+                new[:, part] = solved(self.factor(q, h, moment), known)
+            elif part.start == end:
                 new[:, part] = corrected.once(start, known)
             else:
                 new[:, part] = corrected.solve(start, start, known, tolerance, PASSES - 1)
@@ -392,7 +396,9 @@ class ForwardStage:
         """Return the right-hand sides of tangents, shape (n, r)."""
         at = {} if self.form.linear_in_parameter else {"q": self.model.latent.value(q)}
         forcing = self.form.product("v", "q", directions, moment, u=u, **at)
-        driven: Array = (self._mass @ c) / h - forcing
+        driven: Array = self._mass @ c
+        driven /= h
+        driven -= forcing
         return driven
 
 
