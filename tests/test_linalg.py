@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
 from threading import Event, Thread
 
@@ -181,12 +183,32 @@ def test_engines_agree_with_dense_algebra(engine):
     data = pattern.gather(*matrix.tocoo().coords) @ matrix.tocoo().data
     factor = solver.factorise(data)
     other = solver.factorise(2.0 * data)  # leaves the first as it is
-    for shape in ((25,), (25, 1), (25, 4)):
+    for shape in ((25,), (25, 1), (25, 4), (25, 21)):
         b = rng.standard_normal(shape)
         kept = b.copy()
         np.testing.assert_allclose(matrix @ factor.solve(b), b, atol=1e-9)
         np.testing.assert_allclose(2.0 * (matrix @ other.solve(b)), b, atol=1e-9)
         np.testing.assert_array_equal(b, kept)  # right-hand sides are not written over
+
+
+def test_cholmod_solves_for_some_columns_at_a_time():
+    """Many columns at once leave the cache; the numbers are the same."""
+    pytest.importorskip("sksparse")
+    rng = np.random.default_rng(1)
+    matrix = regular(25, rng, spd=True)
+    pattern = Pattern.of(matrix)
+    data = pattern.gather(*matrix.tocoo().coords) @ matrix.tocoo().data
+    factor = CholmodSolver(pattern).factorise(data)
+    whole, widths = factor.solve.args[0], []
+
+    def noted(b):
+        widths.append(b.shape[1])
+        return whole(b)
+
+    b = rng.standard_normal((25, 21))
+    found = replace(factor, solve=partial(factor.solve.func, noted)).solve(b)
+    assert widths == [8, 8, 5]
+    np.testing.assert_array_equal(found, whole(b))
 
 
 @pytest.mark.slow

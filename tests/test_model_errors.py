@@ -17,6 +17,7 @@ from livepde.laws.error_columns import SMALL, ErrorColumns, radial_power
 from livepde.laws.model_errors import linear_model, model_errors
 from livepde.laws.stored_samples import StoredSamples
 from livepde.models import pumping_test
+from livepde.stepping import ForwardStage
 from livepde.verdict import (
     Allowed,
     Cause,
@@ -26,7 +27,8 @@ from livepde.verdict import (
     Verdict,
     discretised,
 )
-from livepde.verdict.evidence import NU, TEMPER, Causes, Family, LinearModel, averaged
+from livepde.verdict.directions import Now, boundary_lifts, later
+from livepde.verdict.evidence import NU, TEMPER, Causes, Family, LinearModel, Mixture, averaged
 
 # --- the average --------------------------------------------------------------------------------
 
@@ -102,6 +104,35 @@ def test_the_average_is_that_of_dense_normal_models(strength):
     for share in (0.025, 0.5, 0.975):
         at = scipy.special.ndtr((found.quantile(share) - means) / deviations)
         assert found.weights @ at == pytest.approx(share, abs=1e-9)
+
+
+def test_quantiles_take_few_evaluations(monkeypatch):
+    """Components are apart by their deviations, which differ by a factor of ten."""
+    rng = np.random.default_rng(2)
+    means, deviations = (
+        3.0 * rng.standard_normal((200, 30)),
+        10.0 ** rng.uniform(0.0, 1.0, (200, 30)),
+    )
+    mixture = Mixture(np.full(200, 1.0 / 200), means, deviations)
+    calls, ndtr = [], scipy.special.ndtr
+    monkeypatch.setattr(scipy.special, "ndtr", lambda x: (calls.append(x), ndtr(x))[1])
+    low, high = mixture.interval
+    assert len(calls) < 20  # halves of the interval alone take 100
+    for end, share in ((low, 0.025), (high, 0.975)):
+        below = mixture.weights @ ndtr((end - means) / deviations)
+        assert below == pytest.approx(np.full(30, share), abs=1e-9)
+
+
+def test_hypotheses_without_weight_are_left_out():
+    rng = np.random.default_rng(3)
+    J, Z = rng.standard_normal((200, 2)), rng.standard_normal((200, 5))
+    z = 40.0 * Z[:, 0] + rng.standard_normal(200)
+    model = LinearModel(J=J, Z=Z, z=z, T=np.eye(2))
+    causes = Causes(np.arange(5), np.full(5, math.inf), (1.0, 40.0))
+    found = averaged(model, causes, [])
+    # The first cause explains the readings with its larger size alone.
+    assert len(found.weights) == len(found.means) == len(found.deviations) == 10
+    assert found.weights.sum() == pytest.approx(1.0, abs=1e-12)
 
 
 # --- the answers of the process ------------------------------------------------------------------
@@ -187,6 +218,33 @@ def identified(z: Any) -> lp.Identifier:
     for t, row in zip(TIMES, z, strict=True):
         found.step(t, row, ends(t))
     return found
+
+
+def test_responses_that_have_not_begun_take_no_solve():
+    stage, rng = ForwardStage(rod()), np.random.default_rng(5)
+    n = stage.model.X.dim
+    inputs = lp.fem.Inputs({"left": 0.0, "right": 0.0})
+    now = Now(np.zeros(n), stage.model.latent.prior, lp.fem.Moment(0.1, inputs))
+    p, loads, lifts = np.zeros((3, 4, n))
+    p[0], loads[1] = rng.standard_normal((2, n)) * stage.model.X.free
+    lifts[2] = boundary_lifts(stage.model)["left"]
+    factor, rows = stage.linearised(now.u, now.q, 0.1, now.moment)
+    solved = []
+
+    class Noted:
+        def solve(self, b: Any) -> Any:
+            solved.append(b.shape)
+            return factor.solve(b)
+
+    stage.linearised = lambda *args: (Noted(), rows)  # type: ignore[method-assign]
+    found = later(stage, p, now, 0.1, loads, lifts)
+    assert solved == [(n, 3)]
+    free = stage.model.X.free
+    matrix = rows if isinstance(rows, np.ndarray) else rows.toarray()
+    left = (matrix @ found.T - (stage.model.mass @ p.T) / 0.1 - loads.T) * free[:, None]
+    assert np.abs(left).max() < 1e-10
+    assert (found[3] == 0.0).all()
+    assert (found * (1.0 - free) == lifts).all()
 
 
 @pytest.mark.slow

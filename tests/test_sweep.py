@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from skfem import ElementQuad1
 
 import livepde as lp
 from livepde.laws.stored_samples import Passed, StoredSamples
-from livepde.stepping import Sweep, sweep
+from livepde.stepping import ForwardStage, Sweep, sweep
 
 PLACES = {"a": 0.2, "b": 0.55, "c": 0.8}
 ENDS = {"left": lp.Channel("T_0"), "right": lp.Channel("T_1")}
@@ -113,3 +114,30 @@ def test_where_stages_differ_or_lengths_do_not_repeat_stages_follow_each_other(m
     assert Sweep.of(*parts) is not None
     monkeypatch.setattr(sweep, "MOST_ENTRIES", 15.0 * 15.0)  # of one matrix, and there are several
     assert Sweep.of(*parts) is None
+
+
+def test_trajectories_with_a_factor_each_are_followed_one_by_one(monkeypatch):
+    """Side by side they would take turns with the one factor that is kept."""
+    mesh = lp.fem.rectangle((0.0, 1.0), (0.0, 1.0), (6, 6))
+    field = lp.Field(mesh, ElementQuad1(), dirichlet=ENDS)
+    k = lp.LogNormal(0.1, std=0.05)
+    plate = lp.Model(field, {"k": k, "w": lp.Normal(0.1, 0.3)}, A=flowing)
+    sensors = lp.Points({"a": (0.3, 0.4)}, noise=0.1)
+    identifier = lp.Identifier(plate, sensors, lp.SensitivityLaw(), u0=10.0)
+    for time in (1.0 + 0.25 * np.arange(6)).tolist():
+        identifier.step(time, {"a": 10.5}, {"T_0": 12.0, "T_1": 10.0})
+    samples = StoredSamples.of(identifier._work, identifier._state)
+    made, factorised = [], ForwardStage._factorise
+
+    def noted(stage: ForwardStage, data: Any) -> Any:
+        made.append(stage)
+        return factorised(stage, data)
+
+    monkeypatch.setattr(ForwardStage, "_factorise", noted)
+    points = np.random.default_rng(0).standard_normal((4, len(samples.reached)))
+    used = np.isfinite(samples.readings)
+    alone = [samples.costs(one[None], used)[0][0] for one in points]
+    each, made[:] = len(made), []
+    together, _ = samples.costs(points, used)
+    assert len(made) <= each
+    assert together == pytest.approx(alone, rel=1e-12)

@@ -5,13 +5,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
+from dataclasses import replace
 from functools import cached_property
 from itertools import chain
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from skfem import Basis, Dofs
+from skfem import Basis, Dofs, Mesh
 from skfem.element import DiscreteField, ElementQuadBFS
 
 from livepde.errors import ObservationError, SpaceError
@@ -535,31 +536,37 @@ class FieldBlock(Block):
 
     def contains(self, point: Array) -> bool:
         """Return True if a point, shape (d,), lies in the mesh."""
-        return self._outside(point[:, None]) is None
+        return self._located(point[:, None])[1] is None
 
-    def _outside(self, points: Array) -> int | None:
-        """Return the index of the first point, of shape (d, k), outside the mesh; or None."""
+    def _located(self, points: Array) -> tuple[IntArray, int | None]:
+        """Return the cell of each point, of shape (d, k), and the number of the first one outside.
+
+        There are no cells if a point is outside, and no number if none is.
+        """
         low, high = (corner[:, None] for corner in self.box)
-        # Points on the boundary may lie outside by rounding; `probe` clips them to the bounding
-        # box.
-        slack = 1e-12 * (high - low)
+        slack, nowhere = 1e-12 * (high - low), np.zeros(0, dtype=np.int64)
         out = ~((points >= low - slack) & (points <= high + slack)).all(axis=0)
         if out.any():
-            return int(out.argmax())
-        if len(low) > 1 and not self._inside(points):
-            return next(k for k in range(points.shape[1]) if not self._inside(points[:, [k]]))
-        return None
-
-    def _inside(self, points: Array) -> bool:
+            return nowhere, int(out.argmax())
         try:
-            self._cells(points)
+            return self._cells(np.clip(points, low, high)), None
         except ValueError:
-            return False
-        return True
+            count = points.shape[1]
+            alone = (k for k in range(count) if self._located(points[:, [k]])[1] is not None)
+            return nowhere, 0 if count == 1 else next(alone)
+
+    @cached_property
+    def _unnamed(self) -> Mesh:
+        """The mesh without boundaries and subdomains.
+
+        To find a cell, scikit-fem makes triangles of quadrilaterals, and searches all of their
+        facets for each one of a boundary.
+        """
+        return replace(self.field.mesh, _boundaries=None, _subdomains=None)
 
     def _cells(self, points: Array) -> IntArray:
         """Return the cell of each point, shape (k,); raise ValueError for a point outside."""
-        mesh, whole = self.field.mesh, Measure(self.field.mesh, 1)
+        mesh, whole = self._unnamed, Measure(self.field.mesh, 1)
         if not whole.kept:  # scikit-fem keeps its search tree on the mesh, for good
             mesh = copy(mesh)
         finder = mesh.element_finder(mapping=whole.mapping)
@@ -576,13 +583,13 @@ class FieldBlock(Block):
             raise ObservationError(
                 f"{what}: coordinates of dimension {points.shape[0]}; the mesh has {len(low)}."
             )
-        if (lost := self._outside(points)) is not None:
+        cells, lost = self._located(points)
+        if lost is not None:
             raise ObservationError(
                 f"{what} {lost} at {points[:, lost].tolist()} lies outside the mesh, which "
                 f"spans {low.tolist()} to {high.tolist()}: check its coordinates and their unit."
             )
         points = np.clip(points.T, low, high).T
-        cells = self._cells(points)
         mapping = Measure(self.field.mesh, 1, members=cells).mapping
         X = mapping.invF(points[:, :, None], tind=cells)
         count = len(self.element_dofs)

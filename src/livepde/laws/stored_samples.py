@@ -150,7 +150,12 @@ class StoredSamples:
     @property
     def together(self) -> int:
         """Trajectories that cost little more than one."""
-        return TOGETHER if isinstance(self.filter.stage, BandedStage) else 1
+        return TOGETHER if self._batched else 1
+
+    @property
+    def _batched(self) -> bool:
+        """True if trajectories as one array take less time: else they would share one factor."""
+        return isinstance(self.filter.stage, BandedStage)
 
     @property
     def reached(self) -> Array:
@@ -304,8 +309,9 @@ class StoredSamples:
         """
         found = 0.5 * (points**2).sum(axis=1)
         whole, taken = np.zeros(len(points), dtype=bool), 0
-        for first in range(0, len(points), AT_ONCE):
-            part = slice(first, first + AT_ONCE)
+        width = AT_ONCE if self._batched else 1
+        for first in range(0, len(points), width):
+            part = slice(first, first + width)
             compared = self._compared(self.placed(points[part], rows=False))
             for some, _, missed, _ in compared:
                 taken += missed.shape[1] * len(missed)

@@ -366,9 +366,13 @@ class ForwardStage:
         known = self._known(begin, system, q, h, moment)
         corrected = self._corrections(system, At(q, h), moment, kept)
         new[:, 0] = u = corrected.solve(begin, model.impose(guess, moment), known, STATE, PASSES)
+        exact = At(q, h).same(*corrected.factor_at)
         for part in groups:
             start, known = c[:, part], driven(u, part)
-            if part.start == end:
+            if exact:  # no iteration, and so no start
+                known *= free
+                new[:, part] = solved(self.factor(q, h, moment), known)
+            elif part.start == end:
                 new[:, part] = corrected.once(start, known)
             else:
                 new[:, part] = corrected.solve(start, start, known, tolerance, PASSES - 1)
@@ -392,7 +396,10 @@ class ForwardStage:
         """Return the right-hand sides of tangents, shape (n, r)."""
         at = {} if self.form.linear_in_parameter else {"q": self.model.latent.value(q)}
         forcing = self.form.product("v", "q", directions, moment, u=u, **at)
-        return (self._mass @ c) / h - forcing
+        driven: Array = self._mass @ c
+        driven /= h
+        driven -= forcing
+        return driven
 
 
 @dataclass(frozen=True, eq=False)

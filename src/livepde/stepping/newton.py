@@ -320,10 +320,10 @@ class Corrections:
         while True:
             update = solved(self.factor(*self.factor_at), r)
             x, count = x + update, count + 1
+            if exact:  # the factor of the stage's own matrix needs no iteration
+                return x
             moved, size = float(np.linalg.norm(update)), float(np.linalg.norm(x))
-            # The factor of the stage's own matrix needs no iteration, and at rounding level
-            # corrections only exchange rounding errors.
-            if exact or moved <= ROUNDING * size:
+            if moved <= ROUNDING * size:  # corrections only exchange rounding errors
                 return x
             last, r = float(np.linalg.norm(r)), (b - self.matrix @ x) * free
             # The contraction rate is estimated from residuals, not from updates: the residual of

@@ -150,15 +150,27 @@ class Process:
 def later(stage: ForwardStage, p: Array, now: Now, h: float, loads: Array, lifts: Array) -> Array:
     """Return responses p of a process a time h later; p, loads and lifts: (responses, n).
 
-    M (p+ - p)/h + S_u p+ = load, with p+ = lift on the boundary.
+    M (p+ - p)/h + S_u p+ = load, with p+ = lift on the boundary. A response that has not begun
+    stays zero, and takes no solve.
     """
-    model = stage.model
+    lifted = lifts.any(axis=1)
+    begun = p.any(axis=1) | loads.any(axis=1) | lifted
+    if not begun.any():
+        return np.zeros_like(p)
+    if not begun.all():
+        found = np.zeros_like(p)
+        found[begun] = later(stage, p[begun], now, h, loads[begun], lifts[begun])
+        return found
+    free = stage.model.X.free
     factor, rows = stage.linearised(now.u, now.q, h, now.moment)
-    known = np.asarray((model.mass @ p.T).T) / h + loads
-    if lifts.any():
-        known -= np.asarray((rows @ lifts.T).T)
-    solved: Array = factor.solve((known * model.X.free).T).T
-    return solved * model.X.free + lifts
+    known = np.array([stage.model.mass @ one for one in p]) / h + loads
+    if lifted.any():
+        known[lifted] -= np.asarray((rows @ lifts[lifted].T).T)
+    known *= free
+    solved: Array = factor.solve(known.T).T
+    solved *= free
+    solved[lifted] += lifts[lifted]
+    return solved
 
 
 def _constant(shape: Array, level: float) -> Load:

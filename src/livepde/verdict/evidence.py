@@ -17,7 +17,7 @@ exceeds that of "nothing is wrong" by more than e^TEMPER (Grünwald 2012; Miller
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -29,6 +29,8 @@ from livepde.linalg import Array, IntArray
 from livepde.verdict.ledger import BLOCKS, Ledger, chance
 
 NU = 10.0  # degrees of freedom of the prior of the noise level
+SAME = 1e-10  # standard deviations: quantiles that are the same
+NEGLIGIBLE = 1e-15  # weight of a hypothesis, one of some thousands, that moves no quantile
 TEMPER = 8.0  # logarithm of the largest ratio of evidences: 3 to 8 do much the same
 AMPLITUDES = (1.0 / 3.0, 4.0 / 3.0, 16.0 / 3.0, 64.0 / 3.0)  # prior sizes of a direction
 NOTHING = 0.5  # prior mass on "nothing is wrong"; the rest on single causes and on families alike
@@ -125,15 +127,26 @@ class Mixture(NamedTuple):
         return self._replace(deviations=np.hypot(self.deviations, shift))
 
     def quantile(self, share: float) -> Array:
+        """Return a quantile of each number.
+
+        Newton's method for x -> ndtri(F(x)), which is a line for a single component, and halves of
+        the interval where it would leave it.
+        """
         target = scipy.special.ndtri(share)
         ends = self.means + target * self.deviations
-        low, high = ends.min(axis=0), ends.max(axis=0)
-        for _ in range(60):  # each component has its quantile between the ends
-            middle = 0.5 * (low + high)
-            below = scipy.special.ndtr((middle - self.means) / self.deviations)
-            less = self.weights @ below < share
-            low, high = np.where(less, middle, low), np.where(less, high, middle)
-        return np.asarray(0.5 * (low + high))
+        low, high = ends.min(axis=0), ends.max(axis=0)  # that of each component is between them
+        x = self.weights @ ends
+        for _ in range(60):
+            away = (x - self.means) / self.deviations
+            below = self.weights @ scipy.special.ndtr(away)
+            low, high = np.where(below < share, x, low), np.where(below < share, high, x)
+            score = scipy.special.ndtri(below)
+            if not (np.abs(score - target) > SAME).any():
+                break
+            density = self.weights @ (np.exp(-0.5 * away**2) / self.deviations)
+            newton = x - (score - target) * np.exp(-0.5 * score**2) / density
+            x = np.where((low < newton) & (newton < high), newton, 0.5 * (low + high))
+        return np.asarray(x)
 
     @property
     def interval(self) -> tuple[Array, Array]:
@@ -176,19 +189,23 @@ class _Tried(NamedTuple):
     # Sum of squares that is left, and half the logarithm of a determinant, (hypotheses,)
     squares: Array
     volume: Array
-    # Shapes (hypotheses, numbers)
-    shift: Array
-    variance: Array
+    # Numbers of some hypotheses -> their shifts and variances, both (some, numbers). Most of them
+    # have no weight, and the numbers of a field are many.
+    moves: Callable[[IntArray], tuple[Array, Array]]
 
 
 def _alone(model: LinearModel, axes: _Axes, size: float) -> _Tried:
     D = 1.0 + size**2 * axes.effect
     gained = size**2 * axes.along / D
+
+    def moves(some: IntArray) -> tuple[Array, Array]:
+        shift, variance = -(axes.moved @ gained), axes.moved**2 @ (size**2 / D)
+        return shift[None].repeat(len(some), axis=0), variance[None].repeat(len(some), axis=0)
+
     return _Tried(
         np.array([model.left[2] - float(gained @ axes.along)]),
         np.array([0.5 * float(np.log(D).sum())]),
-        -(axes.moved @ gained)[None],
-        (axes.moved**2 @ (size**2 / D))[None],
+        moves,
     )
 
 
@@ -205,12 +222,15 @@ def _beside(model: LinearModel, axes: _Axes, causes: Causes, asked: float) -> _T
     rest = np.maximum(np.diag(S)[columns] - (u * axes.shared[:, some]).sum(axis=0), 0.0)
     kappa = 1.0 + size**2 * rest
     beta = s[columns] - u.T @ axes.along
-    moved = model.asked[2][:, columns] - axes.moved @ u
+
+    def moves(some: IntArray) -> tuple[Array, Array]:
+        ((shift,), (variance,)) = alone.moves(np.zeros(1, dtype=np.int64))
+        moved = (model.asked[2][:, columns[some]] - axes.moved @ u[:, some]).T
+        gained = (size**2 / kappa)[some, None]
+        return shift - moved * (gained * beta[some, None]), variance + moved**2 * gained
+
     return _Tried(
-        alone.squares - size**2 * beta**2 / kappa,
-        alone.volume + 0.5 * np.log(kappa),
-        alone.shift - (moved * (size**2 * beta / kappa)).T,
-        alone.variance + (moved**2 * (size**2 / kappa)).T,
+        alone.squares - size**2 * beta**2 / kappa, alone.volume + 0.5 * np.log(kappa), moves
     )
 
 
@@ -218,7 +238,10 @@ NO_FAMILY = Family((), ())
 
 
 def averaged(model: LinearModel, causes: Causes, families: Sequence[Family]) -> Mixture:
-    """Return the tempered average over "nothing is wrong", single causes and families."""
+    """Return the tempered average over "nothing is wrong", single causes and families.
+
+    Hypotheses without weight are left out.
+    """
     total, (mean, variance, _) = model.left[2], model.asked
     n, none = len(model.z), _Axes.of(model, NO_FAMILY, causes.columns)
     single = [_beside(model, none, causes, size) for size in causes.sizes]
@@ -230,14 +253,18 @@ def averaged(model: LinearModel, causes: Causes, families: Sequence[Family]) -> 
     # Blocks of hypotheses that differ in their size, which is the outer axis.
     groups = [[[_alone(model, none, 0.0)]], [single], several]
     tried = [one for group in groups for sizes in group for one in sizes]
-    squares, volume, shift, more = (np.concatenate(part) for part in zip(*tried, strict=True))
-    squares = np.maximum(squares, 0.0)
+    squares = np.maximum(np.concatenate([one.squares for one in tried]), 0.0)
+    volume = np.concatenate([one.volume for one in tried])
     told = -0.5 * (NU + n) * np.log((NU + squares) / (NU + total)) - volume
     kinds, counts = _kinds(groups)
     shares = (NOTHING, 0.5 * (1.0 - NOTHING), 0.5 * (1.0 - NOTHING))
     weights = _tempered(told, kinds, shares, counts)
     level = np.maximum(1.0, (NU + squares) / (NU + n))
-    return Mixture(weights, mean + shift, np.sqrt((variance + more) * level[:, None]))
+    used = ~(weights < NEGLIGIBLE)
+    each = np.split(used, np.cumsum([len(one.squares) for one in tried])[:-1])
+    moves = [one.moves(np.flatnonzero(own)) for one, own in zip(tried, each, strict=True)]
+    shift, more = (np.concatenate(part) for part in zip(*moves, strict=True))
+    return Mixture(weights[used], mean + shift, np.sqrt((variance + more) * level[used, None]))
 
 
 def _kinds(groups: Sequence[Sequence[Sequence[_Tried]]]) -> tuple[IntArray, list[int]]:
