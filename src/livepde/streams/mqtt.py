@@ -517,17 +517,21 @@ class MqttSink(_Peer):
                 discovered = not self._discovery
                 self._publish(f"{self._topic}/status", "running")
             if estimate is not None:
-                if not discovered:
-                    for topic, content in home_assistant(estimate, self._topic, self._title):
-                        self._publish(topic, json.dumps(content))
-                    discovered = True
-                row = estimate.to_dict()
-                self._publish(self._topic, json.dumps(row), retain=False)
-                for label, known in row["unknowns"].items():
-                    self._publish(_topic_of(self._topic, label), json.dumps(known))
+                self._publish_numbers(estimate, discovered)
+                discovered = True
             if last:
                 self._publish(f"{self._topic}/status", "offline")
                 return
+
+    def _publish_numbers(self, estimate: Estimate, discovered: bool) -> None:
+        """Publish an estimate, after the messages by which its numbers are discovered."""
+        if not discovered:
+            for topic, content in home_assistant(estimate, self._topic, self._title):
+                self._publish(topic, json.dumps(content))
+        row = estimate.to_dict()
+        self._publish(self._topic, json.dumps(row), retain=False)
+        for label, known in row["unknowns"].items():
+            self._publish(_topic_of(self._topic, label), json.dumps(known))
 
     def _publish(self, topic: str, content: str, *, retain: bool = True) -> None:
         while not self._free.acquire(timeout=0.1):
