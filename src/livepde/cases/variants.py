@@ -341,7 +341,8 @@ def _worse_sensors(one: VariantRun, base: VariantRun) -> list[str]:
 
 def conclusions(base: VariantRun, others: Sequence[VariantRun]) -> list[str]:
     """Return sentences on the recommendation, and on what other variants disagree about."""
-    best, remarks = recommended(base, others), _remarks(base, others)
+    best = recommended(base, others)
+    remarks = _remarks(base, [one for one in others if not one.error])
     text = _recommendation(base, best)
     if math.isnan(base.log_evidence):
         text = (
@@ -384,8 +385,7 @@ def _remarks(base: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
             )
     if refuted := _names_of(one for one in others if one.gained(base) < -GAINED):
         yield f"The data contradict {refuted}: lower evidence than the case."
-    apart = (one for one in others if not one.error and math.isnan(one.gained(base)))
-    if names := _names_of(apart):
+    if names := _names_of(one for one in others if math.isnan(one.gained(base))):
         yield f"The evidence of {names} is missing or counts other readings: it is not compared."
 
 

@@ -15,7 +15,7 @@ from rich.markup import escape
 
 from livepde import runs
 from livepde.cli import options
-from livepde.cli.printing import CHECK_FAILED, can_draw, figures_of, present, terminal
+from livepde.cli.printing import can_draw, exit_if_failed, figures_of, present, terminal
 from livepde.dates import dated
 from livepde.errors import ConfigurationError, RunError
 from livepde.runs.directory import attempted, drawn_into, markdown, write_text
@@ -79,8 +79,8 @@ def report(
         run=str(folder),
         status=opened.status,
     )
-    if as_json and not all(item.ok for item in checks):
-        raise typer.Exit(CHECK_FAILED)
+    if as_json:
+        exit_if_failed(checks)
 
 
 def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: bool) -> None:

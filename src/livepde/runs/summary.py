@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -289,9 +290,8 @@ def _estimates(data: xr.Dataset, labels: Sequence[str]) -> Table:
     rows: list[tuple[Any, ...]] = []
     for label, row in known.iterrows():
         value, deviation = digits(row["value"], row["std"])
-        plain, allowed = (
-            interval(row[f"{kind}low"], row[f"{kind}high"], row["std"]) for kind in ("", "model_")
-        )
+        plain = interval(row["low"], row["high"], row["std"])
+        allowed = interval(row["model_low"], row["model_high"], row["std"])
         # The wider interval comes first. The plain one tells the standard deviation, too.
         # Relative to zero an error says nothing.
         zero = row["model_low"] <= 0.0 <= row["model_high"]
@@ -360,14 +360,7 @@ def _channels(data: xr.Dataset) -> Table:
     refuses = any(item.refused for item in channels.values())
     errors = model_errors(data)
     fits = {} if errors is None else errors.sensors
-    fitted = [name for name in channels if name in fits]
-    units = {
-        str(name): str(unit)
-        for dimension in ("sensor", "validation")
-        if f"{dimension}_unit" in data.coords
-        for name, unit in zip(data[dimension].values, data[f"{dimension}_unit"].values, strict=True)
-    }
-    common = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
+    fitted, units = not fits.keys().isdisjoint(channels), _channel_units(data)
     rows = [
         (
             name,
@@ -378,7 +371,7 @@ def _channels(data: xr.Dataset) -> Table:
             len(own),
             *([refused] if refuses else []),
             *([shown(fits.get(name, math.nan), ".2g")] if fitted else []),
-            units.get(name, common),
+            units[name],
         )
         for name, (role, own, later, refused) in channels.items()
     ]
@@ -386,6 +379,17 @@ def _channels(data: xr.Dataset) -> Table:
     more += ["/ noise"] if fitted else []
     columns = ("channel", "role", "RMSE", "2nd half", "mean", "samples", *more, "unit")
     return Table("Measured minus predicted, one step ahead", columns, rows)
+
+
+def _channel_units(data: xr.Dataset) -> defaultdict[str, str]:
+    """Return the unit of each channel: its own, or that of all innovations."""
+    common = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
+    found: defaultdict[str, str] = defaultdict(lambda: common)
+    for dimension in ("sensor", "validation"):
+        if f"{dimension}_unit" in data.coords:
+            units = data[f"{dimension}_unit"].values
+            found.update(zip(map(str, data[dimension].values), map(str, units), strict=True))
+    return found
 
 
 def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:
