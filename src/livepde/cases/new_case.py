@@ -20,10 +20,8 @@ from livepde.cases.measured import IN_BRACKETS, Measured, measured, unit_in
 from livepde.cases.read import BLANK, beside, toml_line
 from livepde.cases.schema import CaseSpec, DataSpec
 from livepde.errors import RunError
-from livepde.fem import Channel, Normal, interval
 from livepde.linalg import Array
-from livepde.models import EQUATIONS, Equation, Variable, heat
-from livepde.stepping import Advance, Alexander2, simulate
+from livepde.models import EQUATIONS, Equation, Variable
 from livepde.streams.oddities import sentinels, switches
 
 SCHEMA_FILE = "livepde.schema.json"  # beside a case that `livepde init` writes
@@ -84,9 +82,7 @@ VALUES = """\
 # have a flux or an exchange in [boundary], such as left = {{ flux = "1 {flux}" }}."""
 ENDS = """\
 # A measured value at a boundary: role = "boundary", at = its name. Other boundaries are closed."""
-TRUE_ALPHA = 9.7e-5  # aluminium; m^2/s
-NOISE = 0.05
-ROD = Path(__file__).with_name("rod.toml")  # the case of the data that are made up
+ROD = Path(__file__).with_name("rod.toml")  # the case of the made-up data beside it
 
 
 @dataclass(frozen=True)
@@ -433,9 +429,9 @@ def write_template(
     The case is for a table of measurements, or else for made-up data that are written beside it.
     """
     if table is None:
-        check_free(folder, ["rod.csv", "case.toml"])  # before the simulation, which takes a while
         text = HEAD.format(case=folder / "case.toml") + ROD.read_text(encoding="utf-8")
-        write_files(folder, {"rod.csv": _measurements(), "case.toml": text})
+        made = ROD.with_suffix(".csv").read_text(encoding="utf-8")
+        write_files(folder, {"rod.csv": made, "case.toml": text})
         return folder / "case.toml", folder / "rod.csv"
     check_free(folder, ["case.toml"])
     found = measured(table, equation.time_unit)
@@ -473,29 +469,3 @@ def write_files(folder: Path, files: Mapping[str, str]) -> None:
             (folder / name).write_text(text, encoding="utf-8")
     except OSError as error:
         raise RunError(f"{folder}: cannot be written: {error.strerror or error}.") from error
-
-
-@cache
-def _measurements() -> str:
-    """Return noisy temperatures of a rod, simulated on a finer mesh than the case uses."""
-    times = np.arange(0.0, 3601.0, 20.0)
-
-    def ends(t: float) -> dict[str, float]:
-        left = 20.0 + 15.0 * np.sin(2 * np.pi * t / 1200.0) + 10.0 * (t / 3600.0)
-        return {"T_left": left, "T_right": 20.0 + 1.0 * np.sin(2 * np.pi * t / 3600.0)}
-
-    values = {"left": Channel("T_left"), "right": Channel("T_right")}
-    model = heat(interval(0.0, 0.4, 80), Normal(TRUE_ALPHA), values)
-    at = {"T_10": 20, "T_20": 40, "T_30": 60}  # vertices
-    rng = np.random.default_rng(1)
-    lines = ["time_s,T_left,T_10,T_20,T_30,T_right"]
-    block, q = model.state_block, model.initial_parameter({"alpha": TRUE_ALPHA})
-    control = Advance(Alexander2(), 5.0)
-    for t, u in simulate(model, q, 20.0, times.tolist(), control, ends):
-        profile = block.at_vertices @ u
-        inner = [profile[k] + NOISE * rng.standard_normal() for k in at.values()]
-        cells = [f"{value:.3f}" for value in (ends(t)["T_left"], *inner, ends(t)["T_right"])]
-        if t in (600.0, 620.0):
-            cells[1] = ""  # a sensor may fail for a while: an empty cell is a missing sample
-        lines.append(",".join([f"{t:g}", *cells]))
-    return "\n".join(lines) + "\n"

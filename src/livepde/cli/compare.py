@@ -80,9 +80,7 @@ def compare(
             metavar="FILE.toml",
         ),
     ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="With --write: replace an existing file.")
-    ] = False,
+    force: Annotated[bool, option("With --write: replace an existing file.", "--force")] = False,
     figure: Annotated[
         Path | None, option("Draw the intervals of all variants to a figure.", metavar="FILE.png")
     ] = None,

@@ -32,10 +32,10 @@ def report(
     folder: options.RunArgument,
     theory: Annotated[
         bool,
-        typer.Option(
-            "--theory",
-            help="Evaluate the paper's theory for the run: constants, excitation, conditions, T*. "
+        options.option(
+            "Evaluate the paper's theory for the run: constants, excitation, conditions, T*. "
             "Processes the samples again and writes theory.md.",
+            "--theory",
         ),
     ] = False,
     data: Annotated[

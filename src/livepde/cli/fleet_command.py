@@ -89,13 +89,12 @@ def fleet(
         ),
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Resume the runs in --out, and start the missing ones.")
+        bool, option("Resume the runs in --out, and start the missing ones.", "--resume")
     ] = False,
     separately: Annotated[
         bool,
-        typer.Option(
-            "--separately",
-            help="Run each member separately, with results identical to 'livepde run'.",
+        option(
+            "Run each member separately, with results identical to 'livepde run'.", "--separately"
         ),
     ] = False,
     as_json: JsonOption = False,

@@ -65,19 +65,19 @@ def run(
     out: options.OutOption = None,
     resume: Annotated[
         bool,
-        typer.Option(
-            "--resume",
-            help="Resume the run in --out, with the same results as without the interruption. If "
+        options.option(
+            "Resume the run in --out, with the same results as without the interruption. If "
             "there is no run, start one. Standard input is then read as with --realtime, and rows "
             "that were sent before are only counted.",
+            "--resume",
         ),
     ] = False,
     realtime: Annotated[
         bool,
-        typer.Option(
-            "--realtime",
-            help="Run online: late, malformed and missing rows are counted and do not end the run. "
+        options.option(
+            "Run online: late, malformed and missing rows are counted and do not end the run. "
             "A complete file is replayed. This is the default if the source is live.",
+            "--realtime",
         ),
     ] = False,
     speed: Annotated[
@@ -108,9 +108,7 @@ def run(
     ] = "",
     estimates: Annotated[
         bool,
-        typer.Option(
-            "--estimates", help="Print each estimate to standard output as a line of JSON."
-        ),
+        options.option("Print each estimate to standard output as a line of JSON.", "--estimates"),
     ] = False,
     log: Annotated[LogKind, typer.Option(help="Format of the log of a live run.")] = LogKind.text,
     as_json: options.JsonOption = False,
