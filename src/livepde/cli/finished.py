@@ -121,21 +121,14 @@ def export(
     Example:  livepde export runs/mycase mycase.nc mycase.csv mycase.html
     ParaView: livepde export runs/mycase mycase.xdmf
     """
-    from livepde.runs.exported import FORMATS, NEEDS, need, refuse_file
+    from livepde.runs.exported import FORMATS, check_target, need, refuse_file
     from livepde.runs.exported import export as write
 
     opened = runs.open(folder)
-    known = [*FORMATS, REPORT]
     for target in targets:  # all of them, before one is written
-        ending = target.suffix.lower()
-        if ending not in known:
-            raise ConfigurationError(
-                f"{target}: there is no format '{target.suffix}'; expected one of "
-                f"{', '.join(known)}."
-            )
-        if ending == REPORT:
+        check_target(target, [*FORMATS, REPORT])
+        if target.suffix.lower() == REPORT:
             need(target, ["plotly", "jinja2"], "dashboard")
-        need(target, NEEDS.get(ending, []))
         refuse_file(target, force)
     moment = None if at is None else _moment(at, opened.dataset)
     for target in targets:

@@ -420,7 +420,7 @@ def _health(wiring: LiveCase) -> Mapping[str, Any]:
     }
 
 
-class _Heartbeat:
+class _Heartbeat(Sink):
     """A sink that logs the progress of a run at intervals."""
 
     def __init__(self) -> None:
@@ -434,9 +434,6 @@ class _Heartbeat:
         numbers = estimate.parameters.items()
         shown = ", ".join(f"{label} = {value:.6g} +- {std:.2g}" for label, (value, std) in numbers)
         LOG.info("t = %g: %s", estimate.t, shown or estimate.status.code)
-
-    def close(self) -> None:
-        """Do nothing: there are no resources to release."""
 
 
 def _observers(

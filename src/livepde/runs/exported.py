@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -294,12 +294,8 @@ def export(run: Run, target: Path, *, at: float | None = None, force: bool = Fal
     ConfigurationError
         There is no such format, or it needs a package that is not installed.
     """
+    check_target(target, FORMATS)
     ending = target.suffix.lower()
-    if ending not in FORMATS:
-        raise ConfigurationError(
-            f"{target}: there is no format '{target.suffix}'; expected one of {', '.join(FORMATS)}."
-        )
-    need(target, NEEDS.get(ending, []))
     if at is not None and ending not in AT_ONE_TIME:
         raise ConfigurationError(
             f"{target}: contains all times; a time is only chosen for {' and '.join(AT_ONE_TIME)}."
@@ -307,6 +303,16 @@ def export(run: Run, target: Path, *, at: float | None = None, force: bool = Fal
     if not run.dataset.sizes["time"]:
         raise RunError(f"{run.path} contains no estimates yet, so there is nothing to export.")
     into_place(target, lambda path: FORMATS[ending](run, path, at), force=force)
+
+
+def check_target(target: Path, known: Collection[str]) -> None:
+    """Raise `ConfigurationError` if a format is unknown, or needs a package that is missing."""
+    ending = target.suffix.lower()
+    if ending not in known:
+        raise ConfigurationError(
+            f"{target}: there is no format '{target.suffix}'; expected one of {', '.join(known)}."
+        )
+    need(target, NEEDS.get(ending, []))
 
 
 def need(target: Path, packages: Iterable[str], extra: str = "formats") -> None:

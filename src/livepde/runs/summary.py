@@ -14,7 +14,7 @@ import numpy as np
 from livepde.dates import when
 from livepde.diagnostics.check_report import Bound, Check, Sense, Table
 from livepde.diagnostics.information_gain import TRADED, InformationGain
-from livepde.frames import estimates, model_errors, relative_error
+from livepde.frames import ERRORS, estimates, model_errors, relative_error
 from livepde.plots.style import modes_told, note, prior_left
 from livepde.records import NORMAL_95, field_names, refused_readings, scalars, used_errors
 from livepde.runs.journal import Journal
@@ -43,7 +43,6 @@ STATES = {
     "moves": "changes with time",
 }
 """How well the data determine a number, as `determination` returns it -> words."""
-CHANNELS = (("innovation", "sensor", ROLES[0]), ("validation_error", "validation", ROLES[1]))
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,7 @@ def channel_errors(data: xr.Dataset) -> dict[str, ChannelErrors]:
     kept = data["time"].values >= start
     found, refused = {}, refused_readings(data)
     ignored = str(data.attrs.get("ignored", "")).split("\n")
-    for variable, dimension, role in CHANNELS:
+    for (variable, dimension), role in zip(ERRORS, ROLES, strict=True):
         if variable not in data:
             continue
         columns = used_errors(data, variable, dimension)[kept].T
@@ -385,7 +384,7 @@ def _channel_units(data: xr.Dataset) -> defaultdict[str, str]:
     """Return the unit of each channel: its own, or that of all innovations."""
     common = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
     found: defaultdict[str, str] = defaultdict(lambda: common)
-    for dimension in ("sensor", "validation"):
+    for _, dimension in ERRORS:
         if f"{dimension}_unit" in data.coords:
             units = data[f"{dimension}_unit"].values
             found.update(zip(map(str, data[dimension].values), map(str, units), strict=True))

@@ -148,9 +148,7 @@ class _Peer:
             self._refusal = reason
             self._started.set()
 
-    def _on_connect(
-        self, client: Client, userdata: Any, flags: Any, reason: Any, properties: Any
-    ) -> None:
+    def _on_connect(self, client: Any, data: Any, flags: Any, reason: Any, more: Any) -> None:
         if reason.is_failure:
             self._refused(str(reason))
             return
@@ -159,9 +157,7 @@ class _Peer:
             log.info("connected to the broker at %s again", self._broker.address)
         self._connected(bool(flags.session_present))
 
-    def _on_disconnect(
-        self, client: Client, userdata: Any, flags: Any, reason: Any, properties: Any
-    ) -> None:
+    def _on_disconnect(self, client: Any, data: Any, flags: Any, reason: Any, more: Any) -> None:
         if reason.is_failure and self._started.is_set():
             soon = time.monotonic() - self._since < PATIENCE
             remedy = "; has another client the same client_id?" if soon else ""
@@ -274,9 +270,7 @@ class MqttSource(_Peer, RowSource):
             self._taken_over = True
             self._client.disconnect()  # and do not take it back
 
-    def _on_subscribe(
-        self, client: Client, userdata: Any, mid: int, reasons: Any, properties: Any
-    ) -> None:
+    def _on_subscribe(self, client: Any, data: Any, mid: int, reasons: Any, more: Any) -> None:
         for topic, reason in zip(self._topics, reasons, strict=True):
             if reason.is_failure:
                 self._refused(f"topic '{topic}': {reason}")
@@ -539,9 +533,7 @@ class MqttSink(_Peer):
                 return
         self._client.publish(topic, content, qos=1, retain=retain)
 
-    def _on_publish(
-        self, client: Client, userdata: Any, mid: int, reason: Any, properties: Any
-    ) -> None:
+    def _on_publish(self, client: Any, data: Any, mid: int, reason: Any, more: Any) -> None:
         if reason.is_failure:
             log.warning("the broker at %s accepts no estimate: %s", self._broker.address, reason)
         self._free.release()
