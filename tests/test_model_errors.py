@@ -14,6 +14,7 @@ import scipy
 
 import livepde as lp
 from livepde.laws.error_columns import SMALL, ErrorColumns, radial_power
+from livepde.laws.model_errors import linear_model, model_errors
 from livepde.laws.stored_samples import StoredSamples
 from livepde.models import pumping_test
 from livepde.verdict import (
@@ -218,6 +219,67 @@ def test_an_answer_is_the_change_of_the_readings_by_that_error(kind, mode, size)
     change = (readings(rod(**size), q) - readings(rod(), q)) / amplitude
     scale = np.abs(change).max()
     assert found == pytest.approx(change[1:], abs=0.02 * scale)
+
+
+def best_fit(model: lp.Model, sensors: Any, z: Any) -> tuple[StoredSamples, Any]:
+    """Return the samples of a run, and the fit that ended it."""
+    identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=0.0)
+    for t, row in zip(TIMES[: len(z)], z, strict=True):
+        identifier.step(t, row, ends(t))
+    samples = StoredSamples.of(identifier._work, identifier._state)
+    return samples, samples.about(samples.reached)
+
+
+@pytest.mark.parametrize("what", ["flow", "source", "loss"])
+def test_what_an_unknown_does_is_no_error_of_the_model(what):
+    """Where the velocity is unknown, a steady flow is no error, and one that varies is."""
+    more = {
+        "flow": lambda q, u, v, x: q.s * lp.grad(u)[0] * v,
+        "source": lambda q, u, v, x: -q.s * v,
+        "loss": lambda q, u, v, x: q.s * u * v,
+    }[what]
+    model = lp.Model(
+        rod().state,
+        {"k": PRIOR, "s": lp.Normal(0.0, std=1.0)},
+        A=[lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)), more],
+    )
+    samples, one = best_fit(model, lp.Points(SENSORS, noise=0.01), truth(1)[:40])
+    errors = ErrorColumns(samples, SMALL)
+    answers, *_ = errors.followed(one)
+    constant = {"flow": {"steady flow"}, "source": {"switched"}, "loss": {"loss"}}[what]
+    varies = {"flow": {"flow"}, "source": {"source", "switched"}, "loss": {"loss"}}[what]
+    for first, (answer, course) in zip(errors.first, errors.answers, strict=True):
+        own = answers[:, :, first : first + course.size]
+        if answer.kind in constant:
+            assert not own[:, :, 0].any()
+        elif answer.kind in ("steady flow", "switched", "loss"):
+            assert own[:, :, 0].any()
+        if answer.kind in varies and answer.mode == 0:
+            assert own.any()
+        if answer.kind in ("flow", "source"):  # hat functions that add up to one
+            same = answer.kind == what and answer.mode == 0
+            size = np.abs(own).max()
+            assert (np.abs(own.sum(axis=2)).max() < 1e-9 * size) == same
+
+
+def test_an_error_that_is_an_unknown_of_a_sensor_is_no_error_of_the_model():
+    """An offset that is estimated has a prior, which says how large it may be."""
+    process = lp.Model(
+        rod().state,
+        {"k": PRIOR, "offset": lp.Normal(0.0, std=0.05)},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    own, points = np.array([0.0, 1.0, 0.0]), lp.Points(SENSORS)
+    sensors = lp.observation.Calibrated(points, lambda y, q, x: y + own * q.offset, noise=0.01)
+    samples, one = best_fit(process, sensors, truth(1)[:40])
+    used = np.isfinite(one.residuals)
+    T = samples.filter.reduction.Phi @ samples.start.C[0].T
+    model, causes, _ = linear_model(samples, one, used, T)
+    effects = [effect[effect != 0.0] for effect in model.Z[:, causes.columns].T]
+    assert sum(bool(effect.size) and np.ptp(effect) < 1e-9 for effect in effects) == 2
+    found = model_errors(samples, lp.laws.Refit(), np.full(2, 0.1), np.zeros(2))
+    assert isinstance(found, ModelErrors)
+    assert {one.label: one.of_sensor for one in found.unknowns} == {"k": False, "offset": True}
 
 
 # --- runs ----------------------------------------------------------------------------------------
@@ -469,6 +531,18 @@ def test_one_unknown_that_is_too_uncertain_leaves_the_others_their_use():
     alone = Verdict.of([misfit]).with_errors(wide)
     assert alone.level == "do not trust"
     assert "These intervals are too wide to use." in alone.sentences[0]
+
+
+def test_an_unknown_near_zero_is_known_well_if_little_of_its_prior_is_left():
+    """A velocity of either sign: relative to its value any error is large."""
+    misfit = Finding("misfit", "do not trust", "Model misfit.")
+    for size, level in ((0.001, "trusted"), (0.05, "caution"), (0.3, "do not trust")):
+        v = Allowed("v", "m/s", 0.0, -size, size, -0.01 * size, 0.01 * size, 9.0, usual=0.2)
+        found = ModelErrors(2.0, 0.01, {"T": 2.0}, (v,))
+        assert Verdict.of([misfit]).with_errors(found).level == level
+        assert v.text.endswith(f"(error up to {100 * size:.2g} % of its prior standard deviation)")
+    far = Allowed("v", "m/s", 3.0, 2.7, 3.3, 2.9, 3.1, 3.0, usual=0.2)
+    assert far.effect == pytest.approx(0.3 / 3.1)
 
 
 def test_a_doubted_run_without_unknowns_of_the_model_is_not_trusted():

@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 
 from livepde.fem import dot, grad, shares
 from livepde.laws.filter_state import PAUSE
@@ -41,6 +42,8 @@ STARTS = (0.25, 0.5, 0.75)  # of the run, where something is switched on or chan
 PLACES = (0.2, 0.4, 0.6, 0.8)  # of the length, where a contact may resist
 STEP = 0.01  # of a difference: prior standard deviations of an unknown, share of a channel
 NARROW = 0.03  # of the length: a contact
+COMPARED = 4  # moments at which loads are compared
+ALIKE = 1e-3  # relative difference of loads that are the same
 SAME = 1e-9  # relative difference of weights that are the same
 ROUNDING = 1e-11  # share of its terms, below which an effect is none: it would be scaled to one
 
@@ -64,6 +67,13 @@ class Course(NamedTuple):
 
     size: int
     at: Callable[[float], Array]
+    constant: Array | None = None  # the amplitudes with which they are constant; None: ones
+
+    def varying(self, columns: Array) -> Array:
+        """Return the columns, (..., columns), with no effect of what is constant in time."""
+        one = np.ones(self.size) if self.constant is None else self.constant
+        found: Array = columns - (columns @ one)[..., None] * one / (one @ one)
+        return found
 
 
 def hats(count: int) -> Course:
@@ -73,7 +83,11 @@ def hats(count: int) -> Course:
 
 
 ALWAYS = Course(1, lambda s: np.ones(1))
-SWITCHED = Course(1 + len(STARTS), lambda s: np.array([1.0, *(float(s > one) for one in STARTS)]))
+SWITCHED = Course(
+    1 + len(STARTS),
+    lambda s: np.array([1.0, *(float(s > one) for one in STARTS)]),
+    constant=np.array([1.0, *(0.0 for _ in STARTS)]),
+)
 CHANGES = Course(1 + len(STARTS), lambda s: np.array([s, *(float(s > one) for one in STARTS)]))
 
 
@@ -252,7 +266,7 @@ class ErrorColumns:
         largest = np.abs(p).max(axis=1)
         states: list[Array] = []
         predicted = np.empty(found.shape[:2])
-        last = begin
+        last, seen = begin, list[Now]()
         for number, (x, span) in enumerate(zip(samples.along(one), spans, strict=True)):
             states.append(x.u[0])
             predicted[number] = samples.filter.sensors.observe(x, span.end)[0][0]
@@ -261,6 +275,7 @@ class ErrorColumns:
             if due:
                 moment = span.end.member(0)
                 now = Now(x.u[0], q, moment, rates=_rates(span))
+                seen.append(now)
                 if t > last:
                     share = max(0.5 * (t + last) - late, 0.0) / (end - late)
                     p = self._advanced(stage, p, now, t - last, share)
@@ -273,7 +288,41 @@ class ErrorColumns:
         found = _filled(found, times)
         for column, most in enumerate(largest):
             found[:, :, column] = beyond_rounding(found[:, :, column], most)
+        # What an unknown does is no error of the model.
+        some = np.linspace(0, len(seen) - 1, min(COMPARED, len(seen))).astype(int)
+        for number in self._of_unknowns([seen[k] for k in some]):
+            first, (_, course) = self.first[number], self.answers[number]
+            own = slice(first, first + course.size)
+            found[:, :, own] = course.varying(found[:, :, own])
         return found, states, predicted
+
+    def _of_unknowns(self, nows: Sequence[Now]) -> list[int]:
+        """Return the answers whose loads are those of changed constant unknowns, at some moments.
+
+        An error of that shape and a wrong value of the unknown are one thing, as a steady flow is
+        where the velocity is unknown.
+        """
+        reduction, free = self.samples.filter.reduction, self.model.X.free
+
+        def at_all(load: Load | Array) -> Array:
+            each = (load(now) if callable(load) else load for now in nows)
+            return np.concatenate([one * free for one in each])
+
+        changes = [at_all(_changed(self.model, one)) for one in reduction.Phi.T[reduction.still]]
+        sizes = np.linalg.norm(changes, axis=1) if changes else np.zeros(0)
+        if not sizes.any():
+            return []
+        known = np.array(changes)[sizes > 0.0] / sizes[sizes > 0.0, None]
+        basis, found = scipy.linalg.orth(known.T), list[int]()
+        for number, (answer, _) in enumerate(self.answers):
+            if answer.load is None or answer.kind == "unknown":
+                continue
+            own = at_all(answer.load)
+            size = float(np.linalg.norm(own))
+            rest = float(np.linalg.norm(own - basis @ (basis.T @ own)))
+            if size > 0.0 and rest <= ALIKE * size:
+                found.append(number)
+        return found
 
     def _advanced(self, stage: ForwardStage, p: Array, now: Now, h: float, share: float) -> Array:
         """Return the answers a time h later, shape (columns, n)."""

@@ -15,8 +15,9 @@ from functools import partial
 from typing import TypeAlias
 
 import numpy as np
+import scipy
 
-from livepde.fem import Scalar
+from livepde.fem import Inputs, Moment, Scalar
 from livepde.laws.error_columns import FULL, MOST_WORK, SMALL, ErrorColumns, beyond_rounding, hats
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
@@ -24,6 +25,7 @@ from livepde.laws.policies import Refit
 from livepde.laws.refit import plausible
 from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
+from livepde.model import Model
 from livepde.verdict.directions import (
     SHIFT,
     sensor_shifts,
@@ -38,7 +40,7 @@ from livepde.verdict.evidence import (
     levels,
     weighted_median,
 )
-from livepde.verdict.model_errors import Allowed, ModelErrors
+from livepde.verdict.model_errors import USUAL, Allowed, ModelErrors
 
 MANY = 150  # samples that tell apart what the full list has
 MOST_COLUMNS = 250  # of the process in the full list
@@ -53,6 +55,7 @@ TIMES = (1.0 / 30.0, 1.0 / 6.0, 2.0, math.inf)  # correlation times over the len
 MOST_GAIN = 0.3  # standard deviation of the scale of a sensor that is plausible
 FARTHEST = 0.1  # the same of its place, over the length of the domain
 FEWEST = 20  # readings
+SAME_ERROR = 0.03  # relative difference of two errors of a sensor that are one
 NEAR = 0.03  # posterior standard deviations within which a trajectory is that of the best fit
 QUANTILE = 1.96  # standard deviations to the end of a 95 % interval
 SHRINK = 10.0  # pairs of readings that the stated noise counts
@@ -264,6 +267,30 @@ def _columns(values: Array, used: Mask) -> Iterator[tuple[Array, Mask]]:
             yield column, there
 
 
+def _of_process(model: Model) -> set[str]:
+    """Return the unknowns that equation or initial state read: others are errors of sensors.
+
+    Errors of inputs, which the equation reads, are none of the process either. Probed at a drawn
+    state, with all inputs one.
+    """
+    rng = np.random.default_rng(0)
+    latent, inputs = model.latent, Inputs(dict.fromkeys(model.channels, 1.0))
+    moment, u = Moment(0.3, inputs), rng.uniform(0.5, 1.5, model.X.dim)
+    q = latent.value(latent.prior + latent.deviations * rng.standard_normal(latent.dim))
+    with np.errstate(all="ignore"):  # what is not finite is read
+        parts = [model.physical_A.matrix("v", "q", moment, u=u, q=q)]
+        if (form := model.form_initial) is not None:
+            parts.append(form.matrix("v", "q", moment, q=latent.prior))
+    found = np.sum([abs(part).sum(axis=0) for part in parts], axis=0)
+    read = {name for name in latent.parts if found[model.parameter_space.part(name)].any()}
+    corrected = {
+        name
+        for name, item in latent.parts.items()
+        if isinstance(item.unknown, Scalar) and item.unknown.corrects
+    }
+    return read - corrected
+
+
 def _allowed(
     filter_: Filter, x: FilterState, ends: tuple[Array, Array], narrow: Array, std: Array
 ) -> Iterator[Allowed]:
@@ -274,10 +301,7 @@ def _allowed(
     """
     problem, reduction = filter_.problem, filter_.reduction
     latent = problem.model.latent
-    own = set(problem.observed.observation.unknowns)
-    for name, item in latent.parts.items():
-        if isinstance(item.unknown, Scalar) and item.unknown.corrects:  # an input
-            own.add(name)
+    own = set(latent.parts) - _of_process(problem.model)
     known = filter_.estimate(x)[0]
     both = (known, *ends, known - QUANTILE * std, known + QUANTILE * std)
     value, low_end, high_end, plain_low, plain_high = (
@@ -290,19 +314,20 @@ def _allowed(
     for name, item in latent.parts.items():
         part = slice(item.part.start, item.part.start + item.size)
         labels = item.block.labels(name)
-        unit = item.unknown.unit
+        prior, unit = item.unknown.prior, item.unknown.unit
+        usual = USUAL * float(prior.latent_std) if prior.symmetric else 0.0
         if len(labels) == item.size:
             rows = zip(labels, range(part.start, part.stop), strict=True)
             for label, k in rows:
                 numbers = [float(one[k]) for one in (value, *ends, plain_low, plain_high, wider)]
-                yield Allowed.of(label, unit, numbers, of_sensor=name in own)
+                yield Allowed.of(label, unit, numbers, usual=usual, of_sensor=name in own)
             continue
         size = float(np.sqrt((value[part] ** 2).mean()))
         every = (*ends, plain_low, plain_high)
         off = [float(np.sqrt(((end[part] - value[part]) ** 2).mean())) for end in every]
         numbers = [size, size - off[0], size + off[1], size - off[2], size + off[3]]
         numbers.append(float(np.sqrt((wider[part] ** 2).mean())))
-        yield Allowed.of(name, unit, numbers, of_sensor=name in own)
+        yield Allowed.of(name, unit, numbers, usual=usual, of_sensor=name in own)
 
 
 def linear_model(
@@ -346,15 +371,19 @@ def linear_model(
         count = members[0][2]
         columns = np.concatenate([one for _, one, _ in members])
         families[kind] = (columns, partial(_root, modes, count))
+    J = one.slopes / level
+    stated = _basis_of_sensors(samples, J[used])
     for effect, largest in _sensor_columns(samples, predicted, states):
-        causes.append((int(add(effect[:, :, None])[0]), largest))
+        column = int(add(effect[:, :, None])[0])
+        parts[-1] = _beyond(parts[-1], stated)
+        causes.append((column, largest))
     times = samples.times
     sensors = predicted.shape[1]
     together, apart = _slow_noise(times, sensors, numbers.noise)
     families["common"] = (add(together), partial(_root, np.zeros(1), numbers.noise))
     if 1 < sensors <= MOST_SENSORS:
         families["sensors"] = (add(apart), partial(_root, np.zeros(sensors), numbers.noise))
-    J = (one.slopes / level)[used]
+    J = J[used]
     z = (one.residuals / level)[used] + J @ one.xi
     Z = np.concatenate(parts, axis=1)
     # Beside a missing position of a sensor that moves, rates are not known.
@@ -364,6 +393,37 @@ def linear_model(
     most = np.array([largest for _, largest in causes])
     single = Causes(columns, most, CAUSE_SIZES)
     return LinearModel(J=J, Z=Z, z=z, T=T), single, list(_families(families))
+
+
+def _basis_of_sensors(samples: StoredSamples, J: Array) -> Array:
+    """Return an orthonormal basis of what unknowns of sensors do to the readings, (readings, k).
+
+    `J`: derivatives of these by the coordinates xi, (readings, r).
+    """
+    filter_ = samples.filter
+    model, own = filter_.problem.model, np.zeros(filter_.reduction.size, dtype=bool)
+    process = _of_process(model)
+    for name, evolution in zip(model.latent.parts, filter_.reduction.evolutions, strict=True):
+        own[evolution.part] = name not in process
+    if not own.any():
+        return np.zeros((len(J), 0))
+    by_unknown = J @ np.linalg.pinv(samples.start.C[0].T)
+    some = by_unknown[:, own]
+    some[~np.isfinite(some).all(axis=1)] = 0.0
+    sizes = np.linalg.norm(some, axis=0)
+    found: Array = scipy.linalg.orth(some / np.where(sizes > 0.0, sizes, 1.0))
+    return found
+
+
+def _beyond(effect: Array, basis: Array) -> Array:
+    """Return an effect, (readings, 1), or zeros if it is that of an unknown of a sensor.
+
+    An error that is an unknown is no error of the model: its prior says how large it may be.
+    """
+    known = np.where(np.isfinite(effect), effect, 0.0)
+    rest = known - basis @ (basis.T @ known)
+    same = np.linalg.norm(rest) <= SAME_ERROR * np.linalg.norm(known)
+    return np.zeros_like(effect) if same else effect
 
 
 def _level(residuals: Array, used: Mask) -> float:

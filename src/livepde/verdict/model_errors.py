@@ -16,6 +16,7 @@ OF_SIGNAL = 0.1  # ... misfit over signal from which a fit has failed
 HARMLESS = 0.02  # relative effect of an error that the data show, but that does no harm
 USELESS = 0.5  # relative effect from which an interval is too wide to use
 HIDDEN = 0.1  # relative effect of errors that the data do not show
+USUAL = 0.2  # prior standard deviations below which an unknown of either sign is near zero
 WIDER = 2.0  # width over that of the noise alone from which such effects count
 DIFFERENT = 1.1  # the same from which the interval is shown
 MOST = 3  # unknowns in a sentence
@@ -36,21 +37,28 @@ class Allowed:
     plain_low: float
     plain_high: float
     wider: float  # width over that of the noise alone
+    # Least size that an error is relative to, where the prior allows either sign: an unknown near
+    # zero is known well if little of its prior is left.
+    usual: float = 0.0
     # Whether it is an error of a sensor, such as an offset, or a correction of an input
     of_sensor: bool = False
 
     @classmethod
-    def of(cls, label: str, unit: str, numbers: Iterable[float], *, of_sensor: bool) -> Allowed:
-        """Return an unknown with its numbers in the order of the attributes."""
-        names = ("value", "low", "high", "plain_low", "plain_high", "wider")
-        return cls(label, unit, **dict(zip(names, numbers, strict=True)), of_sensor=of_sensor)
+    def of(cls, label: str, unit: str, numbers: Iterable[float], **rest: Any) -> Allowed:
+        """Return an unknown with its numbers in the order of the attributes, and the rest."""
+        value, low, high, plain_low, plain_high, wider = numbers
+        return cls(label, unit, value, low, high, plain_low, plain_high, wider, **rest)
 
     @property
     def effect(self) -> float:
-        """Largest error of the value, relative to it."""
+        """Largest error of the value, relative to it; near zero to `usual`."""
         off = max(abs(self.low - self.value), abs(self.high - self.value))
-        size = max(abs(self.value), abs(self.plain_low), abs(self.plain_high))
+        size = max(self._size, self.usual)
         return off / size if size > 0.0 else math.inf
+
+    @property
+    def _size(self) -> float:
+        return max(abs(self.value), abs(self.plain_low), abs(self.plain_high))
 
     @property
     def usable(self) -> bool:
@@ -73,10 +81,15 @@ class Allowed:
     def text(self) -> str:
         """The unknown with its interval, and its effect in per cent."""
         unit = f" {self.unit}" if self.unit else ""
-        off = f"error up to {self.effect:.2g} times its value"
-        if self.effect < 1.0:
-            off = f"error up to {in_percent(self.effect)}"
-        return f"{self.label} is between {self.low:.4g} and {self.high:.4g}{unit} ({off})"
+        if self._size < self.usual:
+            off = f"{in_percent(USUAL * self.effect)} of its prior standard deviation"
+        elif self.effect < 1.0:
+            off = in_percent(self.effect)
+        else:
+            off = f"{self.effect:.2g} times its value"
+        return (
+            f"{self.label} is between {self.low:.4g} and {self.high:.4g}{unit} (error up to {off})"
+        )
 
 
 @dataclass(frozen=True)
