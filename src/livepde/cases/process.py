@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -352,11 +351,39 @@ def conditioned(case: CaseContent) -> CaseContent:
         name: (names.amount(item.value, units.source, f"sources.{name}.value"), item.over)
         for name, item in spec.sources.items()
     }
-    build = partial(_built, names, equation.build, boundary, sources, per)
     unknowns = {**equation.unknowns, **names.unknowns}
     inputs = {**equation.inputs, **names.inputs}
+    build = _Conditioned(case, names.unknowns, boundary, sources, per)
     changed = replace(equation, unknowns=unknowns, inputs=inputs, build=build)
     return replace(case, equation=changed)
+
+
+@dataclass(frozen=True, eq=False)
+class _Conditioned:
+    """The model of a case's equation with its fluxes and sources."""
+
+    case: CaseContent  # before its equation has them
+    unknowns: Mapping[str, Variable]  # that they name
+    boundary: Mapping[str, list[Flux | Exchange]]
+    sources: Mapping[str, tuple[Amount, Any]]
+    per: str | None
+
+    def __call__(
+        self, mesh: Any, unknowns: Mapping[str, Any], dirichlet: Mapping[str, Any], **options: Any
+    ) -> Model:
+        case = self.case
+        # The equation gets its own unknowns; those of fluxes and sources are added afterwards.
+        more = {name: item for name, item in unknowns.items() if name in self.unknowns}
+        own = {name: item for name, item in unknowns.items() if name not in more}
+        for name in self.boundary:
+            case.require(name, mesh.boundaries or {}, "boundary", f"no boundary '{name}'")
+        placed = {
+            name: Source(amount, None if over is None else _place(case, mesh, over, name))
+            for name, (amount, over) in self.sources.items()
+        }
+        model = case.equation.build(mesh, own, dirichlet, **options)
+        with case.located("boundary", ModelError):
+            return with_conditions(model, self.boundary, placed, more, self.per)
 
 
 def _boundary(
@@ -386,33 +413,6 @@ def _without_conditions(
     known = [other for other, one in EQUATIONS.items() if one.fluxes is not None]
     text = f"the equation '{name}' takes no fluxes and no sources of a case; "
     return case.error(keys[0], f"{text}{', '.join(known)} do.")
-
-
-def _built(
-    names: _ConditionNames,
-    build: Callable[..., Model],
-    boundary: Mapping[str, list[Flux | Exchange]],
-    sources: Mapping[str, tuple[Amount, Any]],
-    per: str | None,
-    mesh: Any,
-    unknowns: Mapping[str, Any],
-    dirichlet: Mapping[str, Any],
-    **options: Any,
-) -> Model:
-    """Return the model of an equation, by its `build`, with fluxes and sources of a case."""
-    case = names.case
-    # The equation gets its own unknowns; those that fluxes and sources name are added afterwards.
-    own = {name: item for name, item in unknowns.items() if name not in names.unknowns}
-    more = {name: item for name, item in unknowns.items() if name in names.unknowns}
-    for name in boundary:
-        case.require(name, mesh.boundaries or {}, "boundary", f"no boundary '{name}'")
-    placed = {
-        name: Source(amount, None if over is None else _place(case, mesh, over, name))
-        for name, (amount, over) in sources.items()
-    }
-    model = build(mesh, own, dirichlet, **options)
-    with case.located("boundary", ModelError):
-        return with_conditions(model, boundary, placed, more, per)
 
 
 def _shifted(case: CaseContent) -> dict[str, ChannelSpec]:

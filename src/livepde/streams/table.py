@@ -475,7 +475,7 @@ class JsonLines:
         rows = islice(self._timed_rows(thinned), 0, None, stride)
         for k, (where, row, t, dates) in enumerate(rows):
             values, dated = self._values(row, where), clock if dates else None
-            t += _second_pass(t, last, row, values, first, dated)
+            t += _second_pass(t, last, row.get(clock.name), values, first, dated)
             if t <= last:
                 raise _disorder(where, t, last, dated)
             if dates and math.isinf(last):  # the first sample is t = 0
@@ -520,19 +520,13 @@ class JsonLines:
 
 
 def _second_pass(
-    t: float,
-    last: float,
-    row: Mapping[str, Any],
-    values: Array,
-    first: dict[float, Array],
-    clock: Clock | None,
+    t: float, last: float, cell: Any, values: Array, first: dict[float, Array], clock: Clock | None
 ) -> float:
     """Return how much later a row is than its date shows, in an hour that clocks show twice.
 
     `first`: time -> values in the first pass of such an hour. `clock`: of times that are dates.
     """
-    naive = clock is not None and is_naive(row.get(clock.name), clock)
-    again = clock.repeated_hour(t) if clock is not None and naive else 0.0
+    again = clock.repeated_hour(t) if clock is not None and is_naive(cell, clock) else 0.0
     if not again:
         first.clear()
     elif t <= last and not np.array_equal(first.get(t, ()), values, equal_nan=True):
