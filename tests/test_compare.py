@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+import scipy
 import tomlkit
 from commands import bad, call
 from factories import short_rod
@@ -259,7 +260,15 @@ def test_the_unit_of_a_column_does_not_change_the_evidence(biased):
 
 # --- settings of causes -------------------------------------------------------------------------
 
-SIZES = {"offset": 0.5, "gain": 0.1, "position": 0.004, "source": 1e-3, "loss": 1e-4, "flux": 1e-3}
+SIZES = {
+    "offset": 0.5,
+    "gain": 0.1,
+    "position": 0.004,
+    "source": 1e-3,
+    "loss": 1e-4,
+    "flux": 1e-3,
+    "transfer": 1e-4,
+}
 ROD = {
     "heat": [],
     "conduction": [
@@ -275,7 +284,8 @@ def causes() -> list[Cause]:
     sensors = [Cause(kind, "T_30", "", size=SIZES[kind]) for kind in ("offset", "gain", "position")]
     process = [Cause(kind, "", "", size=SIZES[kind]) for kind in ("source", "loss")]
     jump = Cause("jump", "alpha", "", setting='law.jumps=["alpha"]')
-    return [*sensors, *process, Cause("flux", "right", "", size=1e-3), jump]
+    ends = [Cause(kind, "right", "", size=SIZES[kind]) for kind in ("flux", "transfer")]
+    return [*sensors, *process, *ends, jump]
 
 
 def test_a_setting_of_a_sensor_writes_its_family_as_single_channels(tmp_path):
@@ -308,7 +318,8 @@ def test_every_cause_has_a_setting_that_makes_it_an_unknown(tmp_path, equation):
     prepared = cases.load(path, settings=parse(insulated)).prepare()
     verdict = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=tuple(causes()))])
     found = with_settings(prepared, verdict).findings[0].causes
-    expected = ["offset[T_30]", "gain[T_30]", "position[T_30]", "source", "loss", "flux_right"]
+    expected = ["offset[T_30]", "gain[T_30]", "position[T_30]", "source", "loss"]
+    expected += ["flux_right", "transfer_right"]
     for cause, label in zip(found, expected, strict=False):
         settings = [*insulated, *cause.setting.split("; ")]
         again = cases.load(path, settings=parse(settings)).prepare()
@@ -425,6 +436,88 @@ def test_every_proposed_variant_is_a_case(tmp_path, equation):
     for variant in found:
         settings = parse(own), parse(variant.settings)
         assert cases.load(path, settings=settings).prepare().identifier
+
+
+def exchanging(seed: int, rate: float, h: float) -> pd.DataFrame:
+    """Return readings of a rod with side loss that exchanges heat at its right end.
+
+    Finite volumes and the trapezoidal rule; left end driven, surroundings at `ambient`.
+    """
+    cells, step, count, parts = 120, 10.0, 240, 10
+    dx, alpha = 0.3 / cells, 2e-5
+    t = step * np.arange(count)
+    left = 20.0 + 25.0 * (1.0 - np.exp(-t / 100.0)) * (1.0 + 0.4 * np.sin(t / 110.0))
+    ambient = 20.0 + 1.5 * np.sin(t / 320.0)
+    main = np.full(cells, -2.0 * alpha / dx**2 - rate)
+    through = 1.0 / (1.0 / h + 0.5 * dx / alpha) / dx
+    main[0], main[-1] = -3.0 * alpha / dx**2 - rate, -alpha / dx**2 - rate - through
+    near = np.full(cells - 1, alpha / dx**2)
+    A = scipy.sparse.diags_array([near, main, near], offsets=[-1, 0, 1])
+    one, dt = scipy.sparse.eye_array(cells), step / parts
+    solver = scipy.sparse.linalg.splu(scipy.sparse.csc_array(one - 0.5 * dt * A))
+    u, shown = np.full(cells, 20.0), [np.full(cells, 20.0)]
+    for k in range((count - 1) * parts):
+        ends = (np.interp(dt * (k + 0.5), t, drive) for drive in (left, ambient))
+        wall, air = ends
+        b = np.full(cells, rate * air)
+        b[0] += 2.0 * alpha / dx**2 * wall
+        b[-1] += through * air
+        u = solver.solve((one + 0.5 * dt * A) @ u + dt * b)
+        if (k + 1) % parts == 0:
+            shown.append(u)
+    x, rng = dx * (np.arange(cells) + 0.5), np.random.default_rng(seed)
+    places = {"T_5": 0.05, "T_15": 0.15, "T_25": 0.25}
+    readings = {
+        name: np.array([np.interp(at, x, one) for one in shown]) + 0.05 * rng.standard_normal(count)
+        for name, at in places.items()
+    }
+    return pd.DataFrame({"t": t, "left": left, "ambient": ambient} | readings)
+
+
+EXCHANGING = """
+equation = "heat"
+initial = "20 degC"
+mesh = { from = 0, to = "30 cm", cells = 40 }
+data = { file = "rod.csv", time = "t", time_unit = "s" }
+[unknowns]
+alpha = { prior = "3e-5 m^2/s", std = "2e-5 m^2/s", transform = "log" }
+loss = { prior = "4e-4 1/s", std = "4e-4 1/s", transform = "log" }
+[channels]
+left = { column = "left", role = "boundary", at = "left" }
+ambient = { column = "ambient", role = "input" }
+T_5 = { column = "T_5", role = "sensor", at = "5 cm", noise = "0.05 K" }
+T_15 = { column = "T_15", role = "sensor", at = "15 cm", noise = "0.05 K" }
+T_25 = { column = "T_25", role = "sensor", at = "25 cm", noise = "0.05 K" }
+"""
+
+
+@pytest.mark.slow
+def test_an_exchange_that_the_case_lacks_is_named_and_found(tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(EXCHANGING)
+    exchanging(1, 3e-4, 2e-5).to_csv(tmp_path / "rod.csv", index=False)
+    base = run_variant(path, (), Variant("as stated"))
+    assert (base.error, base.level) == ("", "caution")
+    assert (base.causes[0].kind, base.causes[0].subject) == ("transfer", "right")
+    variants = {one.name: one for one in proposed(cases.load(path).prepare(), base)}
+    found = run_variant(path, (), variants["heat transfer at right"])
+    assert found.level == "trusted"
+    assert found.gained(base) > 1000.0
+    truth = {"alpha": 2e-5, "loss": 3e-4, "transfer_right": 2e-5}
+    assert all(one.low <= truth[name] <= one.high for name, one in found.estimates.items())
+
+
+def test_a_variant_without_an_unknown_lacks_what_is_read_for_it_alone(tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(EXCHANGING)
+    exchanging(1, 3e-4, 2e-5).iloc[:5].to_csv(tmp_path / "rod.csv", index=False)
+    with pytest.raises(CaseError, match=r"channels\.ambient: the equation does not read it with"):
+        cases.load(path, settings={"unknowns.loss": None})
+    variants = {
+        one.name: one for one in proposed(cases.load(path).prepare(), ended("as stated", 0.0, 1.0))
+    }
+    assert variants["no loss"].settings == ("unknowns.loss=", "channels.ambient=")
+    assert not run_variant(path, (), variants["no loss"]).error
 
 
 def test_a_setting_adds_an_unknown_only_as_a_whole(tmp_path):

@@ -13,7 +13,7 @@ import numpy as np
 from livepde import fem
 from livepde.cases.case_channels import unknowns_of
 from livepde.cases.case_content import CaseContent, inside, off_nodes, sides_of, subdomain
-from livepde.cases.read import did_you_mean
+from livepde.cases.read import did_you_mean, toml_key
 from livepde.cases.schema import BoundarySpec, ChannelSpec, EvolutionSpec, UnknownSpec
 from livepde.errors import CaseError, ModelError, NameClashError, SpaceError
 from livepde.fem.field_blocks import base_name
@@ -51,18 +51,31 @@ def model_of(case: CaseContent) -> Model:
 def _check_inputs(
     case: CaseContent, model: Model, given: set[str], constants: Iterable[str]
 ) -> None:
-    """Refuse inputs that the model reads and the case lacks, and constants that nothing reads."""
+    """Refuse inputs that the model reads and the case lacks, and inputs that nothing reads."""
     # Only the built model knows which optional inputs it reads with these unknowns.
     for name in model.inputs:
         if name not in given:
             known = case.equation.inputs.get(name)
             what = f"the {known.text}" if known else "the equation reads it"
             raise _without_input(case, name, what)
-    # A constant that nothing reads is refused, since it may be the one a user believes to act.
-    for name in constants:
-        if name not in model.inputs:
-            text = "the equation does not read it with these unknowns; leave it out."
-            raise case.error(f"inputs.{name}", text)
+    # What nothing reads is refused, since a user may believe that it acts.
+    for key in _unread(case, model, constants):
+        text = "the equation does not read it with these unknowns; leave it out."
+        raise case.error(key, text)
+
+
+def _unread(case: CaseContent, model: Model, constants: Iterable[str]) -> list[str]:
+    """Return the keys of the inputs that a model does not read."""
+    given = [(f"channels.{toml_key(name)}", name) for name in case.roles("input")]
+    given += [(f"inputs.{toml_key(name)}", name) for name in constants]
+    return [key for key, name in given if name not in model.inputs]
+
+
+def unread_without(case: CaseContent, unknown: str) -> list[str]:
+    """Return the keys of the inputs that the equation reads for an unknown alone."""
+    unknowns = {name: one for name, one in _unknowns(case).items() if name != unknown}
+    model = case.equation.build(case.mesh, unknowns, _dirichlet(case), **case.options)
+    return _unread(case, model, case.constants)
 
 
 def _without_input(case: CaseContent, name: str, what: str) -> CaseError:

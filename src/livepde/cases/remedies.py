@@ -26,7 +26,7 @@ WIDE = 2.0  # prior standard deviation of what is freed, over the size that was 
 KEYS = {kind: key for kind, (_, key) in ESTIMATED.items()}
 """Kind of error of a sensor -> its key in a case; all sensors share one prior of each."""
 # Errors with a size that a fit could find.
-SIZED = ("boundary", "channel", "drift", "flux", "lag", "loss", "source")
+SIZED = ("boundary", "channel", "drift", "flux", "lag", "loss", "source", "transfer")
 STATED = ("factor", "late")  # keys of a channel whose stated value a cause does not replace
 MISSED = 5.0  # times the noise that the first readings may miss a stated start
 JUMPED = "Jumps are allowed already: check the model and the data for another cause."
@@ -116,7 +116,8 @@ def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
         return ()
     remedies: dict[str, Callable[[Prepared, Cause], tuple[str, ...]]]
     remedies = {**dict.fromkeys(KEYS, _of_sensor), "exchange": _exchanged}
-    remedies |= {"source": _source, "loss": _loss, "flux": _flux, "boundary": _boundary}
+    remedies |= {"source": _source, "loss": _loss, "transfer": _transfer}
+    remedies |= {"flux": _flux, "boundary": _boundary}
     kind = cause.kind
     if kind == "offset" and cause.subject in case.roles("boundary"):
         kind = "boundary"
@@ -250,15 +251,31 @@ def _loss(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     case, name = prepared.case, prepared.case.equation.loss
     if not (_free(case, name) and cause.size > 0.0):
         return ()
-    size = float(f"{cause.size * _capacity(case):.2g}")
-    settings = [_adding(name, size, prior=size, transform="log")]
-    needed = {"ambient"} & case.equation.inputs.keys()
-    if needed - {*case.spec.channels, *case.spec.inputs}:
-        seen = _first_readings(prepared)
-        if not len(seen):
+    settings = [_rate(name, cause.size * _capacity(case))]
+    if "ambient" in case.equation.inputs:
+        surroundings = _surroundings(prepared)
+        if surroundings is None:
             return ()
-        settings.append(f"inputs.ambient={seen.mean():.6g}")
+        if surroundings != "ambient":
+            settings.append(f"inputs.ambient={surroundings}")
     return tuple(settings)
+
+
+def _rate(name: str, size: float) -> str:
+    """Return the setting that adds a positive unknown of a size."""
+    return _adding(name, size, prior=float(f"{size:.2g}"), transform="log")
+
+
+def _surroundings(prepared: Prepared) -> float | str | None:
+    """Return the temperature of the surroundings: "ambient" if stated, else the first readings'.
+
+    None without readings.
+    """
+    spec = prepared.case.spec
+    if "ambient" in spec.channels or "ambient" in spec.inputs:
+        return "ambient"
+    seen = _first_readings(prepared)
+    return float(f"{seen.mean():.6g}") if len(seen) else None
 
 
 def _boundary(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
@@ -271,15 +288,35 @@ def _boundary(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     return (channel_setting(cause.subject, "offset", toml_value(size)),) if size else ()
 
 
+def _end(case: Case, name: str, what: str) -> str:
+    """Return the name of an unknown that may pass through an end of an interval; empty if none."""
+    taken = {*case.spec.boundary, *(item.at for item in case.roles("boundary").values())}
+    if case.equation.fluxes is None or len(case.mesh.p) != 1 or name in taken:
+        return ""
+    label = f"{what}_{name}".replace("-", "_")
+    return "" if label in case.spec.unknowns or not label.isidentifier() else label
+
+
 def _flux(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     """Return the settings of an unknown flux through an end of an interval."""
     case, name = prepared.case, cause.subject
-    taken = {*case.spec.boundary, *(item.at for item in case.roles("boundary").values())}
-    if case.equation.fluxes is None or len(case.mesh.p) != 1 or name in taken:
-        return ()
-    label = f"flux_{name}".replace("-", "_")
-    if label in case.spec.unknowns or not label.isidentifier() or not cause.size:
+    label = _end(case, name, "flux")
+    if not (label and cause.size):
         return ()
     # What a source of this size brings into the whole interval.
     size = WIDE * abs(cause.size) * _capacity(case) * float(np.ptp(case.mesh.p[0]))
     return _adding(label, size), f"boundary.{toml_key(name)}.flux={toml_value(label)}"
+
+
+def _transfer(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
+    """Return the settings of an unknown heat transfer through an end of an interval."""
+    case, name = prepared.case, cause.subject
+    label, ambient = _end(case, name, "transfer"), _surroundings(prepared)
+    if not (label and cause.size > 0.0) or ambient is None:
+        return ()
+    if ambient in case.spec.inputs:  # a constant
+        ambient = case.spec.inputs["ambient"]
+    # What a loss of this size takes from the whole interval.
+    size = cause.size * _capacity(case) * float(np.ptp(case.mesh.p[0]))
+    condition = toml_value({"transfer": label, "ambient": ambient})
+    return _rate(label, size), f"boundary.{toml_key(name)}={condition}"

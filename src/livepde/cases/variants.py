@@ -14,6 +14,7 @@ import numpy as np
 from livepde.cases.case import Prepared, load
 from livepde.cases.case_channels import columns_of
 from livepde.cases.data import clock_of, delays
+from livepde.cases.process import unread_without
 from livepde.cases.read import parse, settings_in, toml_key, toml_value
 from livepde.cases.remedies import first_miss, freed, usual_shift, with_settings
 from livepde.dates import since_1970
@@ -48,6 +49,7 @@ NAMES = {  # kind of cause -> name of the variant
     "source": "source",
     "loss": "loss",
     "flux": "flux at {}",
+    "transfer": "heat transfer at {}",
     "boundary": "offset of {}",
     "initial": "uncertain start",
     "sensor": "without {}",
@@ -465,8 +467,9 @@ def _process(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     if offsets:
         yield Variant("offsets of the boundary values", tuple(offsets))
     for name in map(str, prepared.case.mesh.boundaries or {}):
-        flux = freed(prepared, Cause("flux", name, "", size=error / time))
-        yield Variant(f"flux at {name}", flux)
+        for kind, size in (("flux", error / time), ("transfer", 0.1 / time)):
+            settings = freed(prepared, Cause(kind, name, "", size=size))
+            yield Variant(NAMES[kind].format(name), settings)
 
 
 def _sensors(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
@@ -492,7 +495,8 @@ def _fewer(case: Case) -> Iterator[Variant]:
         if unknown.regions:
             yield Variant(f"one {name} everywhere", (f"{key}.regions=",))
         if name in optional - used - {"C"}:
-            yield Variant(f"no {name}", (f"{key}=",))
+            unread = (f"{own}=" for own in unread_without(case, name))
+            yield Variant(f"no {name}", (f"{key}=", *unread))
 
 
 def _named_amounts(case: Case) -> Iterator[str]:

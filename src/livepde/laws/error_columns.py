@@ -52,7 +52,7 @@ class Answer(NamedTuple):
     """A shape of error of the process, with columns that differ by their course in time."""
 
     # What it is: "source", "conductivity", "flow", "loss", "boundary", "late boundary", "flux",
-    # "channel", "contact", "initial", "unknown"; and its channel, boundary or unknown.
+    # "transfer", "channel", "contact", "initial", "unknown"; and its channel, boundary or unknown.
     kind: str
     subject: str = ""
     mode: float = 0.0  # number of its shape in space
@@ -187,6 +187,7 @@ class ErrorColumns:
     def _fluxes(self) -> Iterator[tuple[Answer, Course]]:
         for name, load in flux_loads(self.model).items():
             yield Answer("flux", name, load=load), ALWAYS
+            yield Answer("transfer", name, load=_exchanged(load, self._rest)), ALWAYS
 
     def _unknowns(self) -> Iterator[tuple[Answer, Course]]:
         reduction = self.samples.filter.reduction
@@ -228,10 +229,13 @@ class ErrorColumns:
             yield Answer("flow", "", axes * self._powers[number][0], load), hats(times)
             if number == 0:
                 yield Answer("steady flow", "xyz"[axis], load=load), ALWAYS
-        # Nothing is lost where the state is, in the mean, as it was at the start.
-        amount = np.asarray(model.mass @ model.state_space.interpolate(1.0))
-        rest = float(amount @ self.samples.start.u[0] / amount.sum())
-        yield Answer("loss", load=_lost(model.mass, rest)), SWITCHED
+        yield Answer("loss", load=_lost(model.mass, self._rest)), SWITCHED
+
+    @cached_property
+    def _rest(self) -> float:
+        """State that has nothing to lose: the mean at the start."""
+        amount = np.asarray(self.model.mass @ self.model.state_space.interpolate(1.0))
+        return float(amount @ self.samples.start.u[0] / amount.sum())
 
     def _flow(self, axis: int, power: int, shape: Callable[[Any], Any]) -> Any:
         return self.model.bilinear(lambda u, v, x: x[0] ** power * shape(x) * grad(u)[axis] * v)
@@ -376,6 +380,10 @@ def _by_state(stiffness: Any) -> Load:
 def _lost(mass: Any, rest: float) -> Load:
     size = abs(mass)
     return lambda now: beyond_rounding(-(mass @ (now.u - rest)), size @ np.abs(now.u))
+
+
+def _exchanged(shape: Array, rest: float) -> Load:
+    return lambda now: beyond_rounding(-shape * (now.u - rest), shape * np.abs(now.u))
 
 
 def _late(lift: Array, name: str) -> Load:

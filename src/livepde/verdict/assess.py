@@ -247,7 +247,10 @@ def _possible(
     """Return whether equation and sensor can have a cause of the size that was found."""
     size = float(evidence.size[window, number])
     amount = _amount(direction, size, at)
-    if direction.kind == "loss":  # one that is known is an unknown of the model, and has no cause
+    if direction.kind in (
+        "loss",
+        "transfer",
+    ):  # one that is known is an unknown of the model, and has no cause
         return size > 0.0
     if direction.kind in ("gain", "channel"):
         return 1.0 / FACTOR <= 1.0 + amount <= FACTOR
@@ -275,6 +278,7 @@ def _amount(direction: ScoreDirection, size: float, at: Position) -> float:
         "source": OFFSET * typical / (REACH * interval),
         "flux": OFFSET * typical / (REACH * interval),
         "loss": LOSS / (REACH * interval),
+        "transfer": LOSS / (REACH * interval),
         "boundary": -OFFSET * typical,
         "initial": OFFSET * typical,
         "channel": -SCALED,

@@ -60,7 +60,9 @@ Load: TypeAlias = Callable[[Now], Array]
 class Term(NamedTuple):
     """A term that a model may lack or have wrong, with an amplitude of one."""
 
-    kind: str  # "boundary", "source", "loss", "flux", "channel" (its gain), or "initial" state
+    # "boundary", "source", "loss", "flux", "transfer" (an exchange at a boundary), "channel" (its
+    # gain), or "initial" state
+    kind: str
     subject: str = ""  # boundary or channel; empty for the whole domain
     # load, lift: function that returns its load, and boundary values of its response, (n,); None
     # for zero
@@ -117,12 +119,13 @@ class Process:
         yield Term("initial")
 
     def _fluxes(self) -> Iterator[Term]:
-        """Iterate over a flux through each boundary where the model states no value."""
+        """Iterate over a flux and an exchange at each boundary where the model states no value."""
         # Each costs a solve with every answer of the process.
         for name, load in flux_loads(self.model, MOST_ENDS).items():
             # As much as the source of amplitude one brings into the whole domain.
             shape = load * (self._whole.sum() / load.sum())
             yield Term("flux", name, load=_constant(shape, self.level))
+            yield Term("transfer", name, load=_exchanged(shape))
 
     def start(self) -> Array:
         """Return the responses at the start, (terms, n): that to another initial state."""
@@ -162,6 +165,11 @@ def later(stage: ForwardStage, p: Array, now: Now, h: float, loads: Array, lifts
 def _constant(shape: Array, level: float) -> Load:
     """Return a load that is constant but for the usual interval between samples."""
     return lambda now: level / (REACH * now.unit) * shape
+
+
+def _exchanged(shape: Array) -> Load:
+    """Return the load of an exchange with surroundings where the state is at rest."""
+    return lambda now: -LOSS / (REACH * now.unit) * shape * (now.u - now.rest)
 
 
 def _gain(model: Model, name: str) -> Load:

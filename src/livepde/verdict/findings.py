@@ -70,8 +70,8 @@ class Cause:
     ----------
     kind, subject
         Kind of error ("offset", "lag", "position", "gain", "drift", "jump", "boundary", "source",
-        "loss", "flux", "initial", "unit", "exchange"), and the sensor, channel, boundary or
-        unknown that it concerns.
+        "loss", "flux", "transfer", "initial", "unit", "exchange"), and the sensor, channel,
+        boundary or unknown that it concerns.
     text
         The cause in words, with its size.
     share

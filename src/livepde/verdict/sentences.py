@@ -319,6 +319,10 @@ LIKELY: dict[str, Sentence] = {
         "a flux {side} the domain may be missing at boundary {name}",
         "Check the boundary condition at {name}.",
     ),
+    "transfer": Sentence(
+        "an exchange with the surroundings may be missing at boundary {name}",
+        "Add the exchange at {name}, or estimate it.",
+    ),
     "channel": Sentence("the scale of {name} may be {share} too {side}", CHECK_UNIT),
     "initial": Sentence(
         "the initial state may be {side} than configured",
