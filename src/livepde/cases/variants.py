@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -466,10 +467,10 @@ def _process(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     ]
     if offsets:
         yield Variant("offsets of the boundary values", tuple(offsets))
-    for name in map(str, prepared.case.mesh.boundaries or {}):
-        for kind, size in (("flux", error / time), ("transfer", 0.1 / time)):
-            settings = freed(prepared, Cause(kind, name, "", size=size))
-            yield Variant(NAMES[kind].format(name), settings)
+    terms = (("flux", error / time), ("transfer", 0.1 / time))
+    for name, (kind, size) in product(map(str, prepared.case.mesh.boundaries or {}), terms):
+        settings = freed(prepared, Cause(kind, name, "", size=size))
+        yield Variant(NAMES[kind].format(name), settings)
 
 
 def _sensors(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
@@ -488,21 +489,22 @@ def _fewer(case: Case) -> Iterator[Variant]:
     for key, word in (("offset", "offsets"), ("gain", "gains"), ("at_std", "uncertain positions")):
         stated = [n for n, one in case.roles("sensor").items() if getattr(one, key) is not None]
         yield Variant(f"no {word}", tuple(channel_setting(name, key, "") for name in stated))
-    used = set(_named_amounts(case))
-    optional = {name for name, known in case.equation.unknowns.items() if known.optional}
+    optional = _optional(case)
     for name, unknown in case.spec.unknowns.items():
         key = f"unknowns.{toml_key(name)}"
         if unknown.regions:
             yield Variant(f"one {name} everywhere", (f"{key}.regions=",))
-        if name in optional - used - {"C"}:
+        if name in optional:
             unread = (f"{own}=" for own in unread_without(case, name))
             yield Variant(f"no {name}", (f"{key}=", *unread))
 
 
-def _named_amounts(case: Case) -> Iterator[str]:
-    """Iterate over names in conditions on boundaries and in sources, and quantities there."""
+def _optional(case: Case) -> set[str]:
+    """Return the unknowns that the equation does not need, and no condition or source names."""
+    optional = {name for name, known in case.equation.unknowns.items() if known.optional}
     for item in (*case.spec.boundary.values(), *case.spec.sources.values()):
-        yield from (value for value in vars(item).values() if isinstance(value, str))
+        optional -= {value for value in vars(item).values() if isinstance(value, str)}
+    return optional - {"C"}
 
 
 def _layers(case: Case) -> Iterator[Variant]:
