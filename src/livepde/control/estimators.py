@@ -123,12 +123,8 @@ class Kalman:
 
         Early and late samples are predicted over their actual interval.
 
-        Raises
-        ------
-        SampleError
-            Wrong shape, text, infinity, or a sensor that does not exist.
-        TimeOrderError
-            t is not later than the sample before.
+        Raises `SampleError`: wrong shape, text, infinity, or a sensor that does not exist.
+        Raises `TimeOrderError`: t is not later than the sample before.
         """
         sensors, r, z = self.model.sensors.names, self.model.size, labelled(z)
         if isinstance(z, Mapping):

@@ -584,10 +584,7 @@ class Fleet:
     def load(self, path: str | os.PathLike[str]) -> None:
         """Continue from a saved state; the fleet must be built as the one that was saved.
 
-        Raises
-        ------
-        RunError
-            The file is damaged, or of another fleet.
+        Raises `RunError`: the file is damaged, or of another fleet.
         """
         self.restore(checkpoint.read(path), str(path))
 

@@ -469,10 +469,8 @@ class Run:
 def open_run(path: str | os.PathLike[str]) -> Run:
     """Open a run directory.
 
-    Raises
-    ------
-    RunError
-        There is no run, its record is damaged, or its report is a link to another file.
+    Raises `RunError`: there is no run, its record is damaged, or its report is a link to another
+    file.
     """
     folder = Path(path)
     for page in folder.glob("*"):

@@ -345,11 +345,8 @@ class MqttSource(_Peer, RowSource):
     def poll(self, wait: float) -> Sequence[Row]:
         """Return the messages that have come.
 
-        Raises
-        ------
-        DataError
-            Another client has taken the session; or nothing can come any more, because as many
-            messages as the broker sends ahead wait for later ones.
+        Raises `DataError`: another client has taken the session; or nothing can come any more,
+        because as many messages as the broker sends ahead wait for later ones.
         """
         rows = drained(self._rows, wait)
         if wait and not rows:
