@@ -53,10 +53,9 @@ class Thinned:
     """
 
     def __init__(self, between: Sequence[Between]) -> None:
-        kinds = np.array(between, dtype=str)
-        self.held: Mask = kinds != "line"
-        self._hold, self._next = kinds == "hold", kinds == "next"
-        self._means = {k: _Mean() for k in np.flatnonzero(self._next).tolist()}
+        self.held: Mask = np.array(between, dtype=str) != "line"
+        self._hold = [k for k, one in enumerate(between) if one == "hold"]
+        self._means = {k: _Mean() for k, one in enumerate(between) if one == "next"}
         self._last = np.full(len(between), math.nan)
         self._begun = False
 
@@ -66,8 +65,9 @@ class Thinned:
 
     def remember(self, row: Array) -> None:
         """Remember the values of a row before the start that hold until the next reading."""
-        known = self._hold & np.isfinite(row)
-        self._last[known] = row[known]
+        for k in self._hold:
+            if math.isfinite(row[k]):
+                self._last[k] = row[k]
 
     def take(self, t: float, row: Array, *, chosen: bool, whole: bool) -> Array | None:
         """Return what is left of a row, NaN where a column is missing; None if nothing.
@@ -75,24 +75,26 @@ class Thinned:
         `chosen`: whether `every` leaves the row.
         `whole`: whether the row has all channels that a sample needs.
         """
-        known = np.isfinite(row)
         for k, mean in self._means.items():
             mean.add(t, float(row[k]))
-        changed = (self._hold & known & (row != self._last)).any()
-        self.remember(row)
         kept = chosen and whole
-        states = chosen and (self._next & known).any()
         # Before the first row that is kept, values are remembered for it.
-        if not (kept or (self._begun and (changed or states))):
+        stays = kept or (self._begun and self._states(row, chosen))
+        self.remember(row)
+        if not stays:
             return None
-        found: Array = np.where(self.held | kept, row, math.nan)
+        found: Array = row.copy() if kept else np.where(self.held, row, math.nan)
         if not self._begun:
             found[self._hold] = self._last[self._hold]
             self._begun = True
-        found[self._next] = math.nan
-        for k in np.flatnonzero(self._next & known).tolist():
-            found[k] = self._means[k].taken()
+        for k, mean in self._means.items():
+            found[k] = mean.taken() if math.isfinite(row[k]) else math.nan
         return found
+
+    def _states(self, row: Array, chosen: bool) -> bool:
+        """Return whether a row changes an input that holds, or has the end of a mean."""
+        changed = any(math.isfinite(row[k]) and row[k] != self._last[k] for k in self._hold)
+        return changed or (chosen and any(math.isfinite(row[k]) for k in self._means))
 
 
 class _Mean:
