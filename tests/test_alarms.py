@@ -15,13 +15,14 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cases, runs
-from livepde.cases.new_case import NOISE, TRUE_ALPHA, write_template
+from livepde.cases.new_case import write_template
 from livepde.cli import app
 from livepde.diagnostics import identifiability
 from livepde.models import heat
 from livepde.runs import doubts, measures, tables
 
 JUMP, CHANGE, END = 2400.0, 1.3, 4400.0
+TRUE_ALPHA, NOISE = 9.7e-5, 0.05  # of the template's rod: aluminium, m^2/s; in degC
 
 
 def ends(t: float) -> dict[str, float]:

@@ -1165,7 +1165,7 @@ def test_units_of_many_cases_are_those_of_pint():
     """The table that spares its registry says what it would say."""
     from livepde import units
 
-    registry = units._registry()
+    registry = units.pint_registry()
     for (given, unit), (factor, offset) in units.USUAL.items():
         zero, one = (registry.Quantity(k, registry.parse_units(given)) for k in (0.0, 1.0))
         found = [quantity.to(unit).magnitude for quantity in (zero, one)]

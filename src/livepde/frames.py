@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 MEDIAN = "the median"
 FIRST_ORDER = "to first order: that of the latent value, times the slope of the transform"
 STATISTICS = ("value", "std", "low", "high")
+ALLOWED = ("model_low", "model_high", "effect")  # of an estimate that allows for model errors
 ERRORS = (("innovation", "sensor"), ("validation_error", "validation"))
 
 
@@ -58,24 +59,21 @@ def estimates(data: xr.Dataset) -> pd.DataFrame:
     """Return the last estimates of the numbers of a run, one row for each: see `Result.summary`."""
     import pandas as pd
 
-    errors = model_errors(data)
-    verdict = json.loads(data.attrs["verdict"]) if "verdict" in data.attrs else {}
-    allowed = {} if errors is None else {one.label: one for one in errors.unknowns}
+    errors, verdict = model_errors(data), json.loads(data.attrs.get("verdict", "{}"))
+    allowed = errors.unknowns if errors is not None else ()
+    ends_of = {one.label: (one.low, one.high, one.effect) for one in allowed}
     labels, rows = scalars(data) if data.sizes["time"] else [], []
     for label in labels:
         ends = interval_95(data, label)
         values = (data[label][-1], data[f"{label}_std"][-1], *(end[-1] for end in ends))
         row: dict[str, Any] = dict(zip(STATISTICS, map(float, values), strict=True))
-        one = allowed.get(label)
-        row["model_low"] = math.nan if one is None else one.low
-        row["model_high"] = math.nan if one is None else one.high
-        row["effect"] = math.nan if one is None else one.effect
+        row |= dict(zip(ALLOWED, ends_of.get(label, (math.nan,) * 3), strict=True))
         row |= {"unit": data[label].attrs.get("units", ""), "level": verdict.get("level", "")}
         if any("reference" in data[name].attrs for name in labels):
             row["reference"] = float(data[label].attrs.get("reference", math.nan))
             row["error"] = relative_error(data, label)
         rows.append(row)
-    columns = [*STATISTICS, "model_low", "model_high", "effect", "unit", "level"]
+    columns = [*STATISTICS, *ALLOWED, "unit", "level"]
     found = pd.DataFrame(rows, pd.Index(labels, name="unknown"), None if rows else columns)
     if errors is not None:
         found.attrs["misfit"] = errors.misfit
@@ -258,30 +256,11 @@ def layout_of(
 
     `ignored`: names of validation sensors that never count.
     """
-    numbers: dict[str, dict[str, Any]] = {}
-    for label in model.parameter_space.labels:
-        unknown = model.parameter_space.unknown_of(label)
-        unit: dict[str, Any] = {"units": unknown.unit}
-        plain = isinstance(unknown.prior, Normal)  # then mean and standard deviation
-        numbers[label] = {**unit, **_prior(unknown), **({} if plain else {"comment": MEDIAN})}
-        numbers[f"{label}_std"] = {**unit, **({} if plain else {"comment": FIRST_ORDER})}
-        numbers |= dict.fromkeys(interval_ends(label, unknown, 0.0, 0.0), unit)
-        numbers[f"{label}_left"] = {"long_name": "share of the prior standard deviation"}
-    comments: dict[str, str] = {}
-    for name, block in model.parameter_space.fields.items():
-        if not isinstance(block.field.prior, Normal):
-            comments |= {name: MEDIAN, f"{name}_std": FIRST_ORDER}
-    points = model.mesh.p[:, vertex_order(model)]
     components = model.state_space.fields.items()
-    places = {**observed.places, **({} if validation is None else validation.places)}
-    units = {
-        name: unit
-        for one in (observed, validation)
-        if one is not None
-        for name, unit in zip(one.names, one.units, strict=True)
-    }
-    stated = {unit for unit in units.values() if unit}
+    places, units = _of_sensors(observed, validation)
+    stated = {*units.values()} - {""}
     several = len(stated) > 1
+    points = model.mesh.p[:, vertex_order(model)]
     return Layout(
         time_unit=model.time_unit,
         sensor_unit="" if several else "".join(stated),
@@ -289,17 +268,50 @@ def layout_of(
         cells={kind: corners.tolist() for kind, corners in cells(model.mesh).items()},
         sensors=list(observed.names),
         validation=None if validation is None else list(validation.names),
-        numbers=numbers,
+        numbers=_numbers(model.parameter_space),
         units=_units(model),
         scalars=list(model.parameter_space.labels),
         fields=list(model.parameter_space.fields),
         state=[key for name, block in components for key in block.variables(name)],
         length_unit=model.length_unit,
-        places={name: at.tolist() for name, at in places.items()},
-        comments=comments,
+        places=places,
+        comments=_comments(model),
         attrs={"ignored": "\n".join(ignored)} if ignored else {},
         sensor_units=units if several else {},
     )
+
+
+def _numbers(space: FunctionSpace) -> dict[str, dict[str, Any]]:
+    """Return the attributes of each number of a record."""
+    numbers: dict[str, dict[str, Any]] = {}
+    for label in space.labels:
+        unknown = space.unknown_of(label)
+        unit: dict[str, Any] = {"units": unknown.unit}
+        plain = isinstance(unknown.prior, Normal)  # then mean and standard deviation
+        numbers[label] = {**unit, **_prior(unknown), **({} if plain else {"comment": MEDIAN})}
+        numbers[f"{label}_std"] = {**unit, **({} if plain else {"comment": FIRST_ORDER})}
+        numbers |= dict.fromkeys(interval_ends(label, unknown, 0.0, 0.0), unit)
+        numbers[f"{label}_left"] = {"long_name": "share of the prior standard deviation"}
+    return numbers
+
+
+def _of_sensors(*groups: Observed | None) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return sensor -> place, where it has one, and sensor -> unit."""
+    places: dict[str, Any] = {}
+    units: dict[str, str] = {}
+    for one in filter(None, groups):
+        places |= {name: at.tolist() for name, at in one.places.items()}
+        units |= dict(zip(one.names, one.units, strict=True))
+    return places, units
+
+
+def _comments(model: Model) -> dict[str, str]:
+    """Return comments on the unknown fields whose values are medians."""
+    comments: dict[str, str] = {}
+    for name, block in model.parameter_space.fields.items():
+        if not isinstance(block.field.prior, Normal):
+            comments |= {name: MEDIAN, f"{name}_std": FIRST_ORDER}
+    return comments
 
 
 def vertex_order(model: Model) -> Any:
@@ -336,9 +348,9 @@ def _prior(unknown: Any) -> dict[str, float]:
 def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:
     """Return the table of a run's dataset: last estimates, and errors of each channel."""
     rows: dict[str, dict[str, float]] = {}
-    for label in filter(None, data.attrs["scalars"].split("\n") if data.sizes["time"] else ()):
+    for label in scalars(data) if data.sizes["time"] else ():
         rows[label] = {"value": float(data[label][-1]), "std": float(data[f"{label}_std"][-1])}
-    for variable, dimension in (("innovation", "sensor"), ("validation_error", "validation")):
+    for variable, dimension in ERRORS:
         if variable not in data:
             continue
         columns = used_errors(data, variable, dimension).T

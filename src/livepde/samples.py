@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import repeat
+from itertools import chain, repeat
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -21,8 +21,6 @@ from livepde.observation import Observed
 from livepde.stepping import own_noise
 
 Readings: TypeAlias = ArrayLike | Mapping[str, Any]
-# Values of the validation sensors if there are none.
-NOTHING = np.zeros(0)
 
 
 @dataclass(frozen=True)
@@ -312,7 +310,7 @@ class Channels:
             measured, noise, validation, named = self._by_name(z, inputs)
         else:
             measured, noise = readings(z, self.observed)
-            validation, named = np.full(len(self.hidden), np.nan) if self.hidden else NOTHING, {}
+            validation, named = np.full(len(self.hidden), np.nan), {}
         if inputs:
             given = self._named(inputs)
             self._check_once(named, given)
@@ -349,7 +347,7 @@ class Channels:
         self, z: Mapping[str, Any], inputs: Mapping[str, float]
     ) -> tuple[Array, Array | None, Array, dict[str, float]]:
         """Return the values of `parse` for a mapping; it may contain inputs, too."""
-        if not (self._known.issuperset(z) and self._known.issuperset(inputs)):
+        if not self._known.issuperset(chain(z, inputs)):
             unknown = next(name for name in (*z, *inputs) if name not in self._known)
             raise SampleError(
                 f"unknown channel '{unknown}'; this identifier has {list(self.names)}."
@@ -365,8 +363,7 @@ class Channels:
             usual = type(value) is float and math.isfinite(value)
             values[name] = value if usual else number(value, f"channel '{name}'")
         noise = own_noise(_row(self.observed.names, stds)) if stds else None
-        validation = _row(self.hidden, values) if self.hidden else NOTHING
-        return _row(self.observed.names, values), noise, validation, values
+        return _row(self.observed.names, values), noise, _row(self.hidden, values), values
 
     def _pair(self, name: str, given: Sequence[Any]) -> tuple[Any, float]:
         """Return value and noise of a reading given as a pair."""

@@ -123,8 +123,9 @@ def conversion(given: str, unit: str, where: str) -> Affine:
     if (given, unit) in USUAL:
         return Affine(*USUAL[given, unit])
     check_unit(given, where)
-    pint = _pint()
-    registry = _registry()
+    registry = pint_registry()
+    import pint
+
     try:
         parsed = registry.parse_units(given)
         zero, one, two = (registry.Quantity(k, parsed).to(unit).magnitude for k in (0.0, 1.0, 2.0))
@@ -175,12 +176,14 @@ def in_si(unit: str) -> SI | None:
     >>> in_si("km/h").exponents, round(in_si("degC").offset, 2)
     ({'m': 1, 's': -1}, 273.15)
     """
-    registry = _registry()
+    registry = pint_registry()
+    import pint
+
     try:
         check_unit(unit, "a unit")
         parsed = registry.parse_units(unit)
         zero, one, two = (registry.Quantity(k, parsed).to_base_units() for k in (0.0, 1.0, 2.0))
-    except (_pint().PintError, CaseError, *NOT_A_UNIT):
+    except (pint.PintError, CaseError, *NOT_A_UNIT):
         return None
     if not math.isclose((two - one).magnitude, (one - zero).magnitude):
         return None
@@ -238,12 +241,9 @@ def _expected(unit: str, given: str) -> str:
     )
 
 
-def _pint() -> Any:
+@cache
+def pint_registry() -> Any:
+    """Return the registry of units, made when it is first asked for."""
     import pint
 
-    return pint
-
-
-@cache
-def _registry() -> Any:
-    return _pint().UnitRegistry()
+    return pint.UnitRegistry()

@@ -1,7 +1,5 @@
 """Case files: a whole identification in one TOML file, units and data checked."""
 
-from __future__ import annotations
-
 from livepde.cases.case import Case, Prepared, load
 from livepde.cases.live_case import LiveCase
 

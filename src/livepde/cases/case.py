@@ -384,7 +384,8 @@ class Case(CaseContent):
     @property
     def notes(self) -> list[str]:
         """Notes on allowed settings that may be mistakes."""
-        found = [*process_notes(self, self.model), *case_channels.sensor_notes(self)]
+        found = [*process_notes(self, self.model), *case_channels.flux_notes(self)]
+        found += case_channels.cell_notes(self)
         if isinstance(self.law, laws.GradientLaw) and isinstance(self.observation, Points):
             found.append(
                 "The gradient law is made for observed subdomains and averages; a few noisy point "

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -23,9 +23,6 @@ from livepde.samples import Sample, by_name, noise_channel
 from livepde.stepping import Between
 from livepde.streams import Column
 from livepde.units import conversion
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # The first sample interpolated, under two names; or as if it were exact, and the lines between.
 EXACT = "interpolate-exact"
@@ -69,12 +66,12 @@ def observation_of(case: CaseContent, *roles: str) -> observation.Observation | 
     levels = noise_of(case) if assimilated else None
     units = {case.unit(name) for name in names}
     outer: dict[str, Any] = {
-        "noise": levels and [levels[name] for name in names],
+        "noise": levels and list(map(levels.__getitem__, names)),
         # Sensors with several units have them from their parts.
         "unit": units.pop() if len(units) == 1 else "",
         "reconstruction": _reconstruction(case) if assimilated else observation.Pseudoinverse(),
     }
-    if assimilated and any(one.offset or one.gain or one.correlated for one in channels.values()):
+    if assimilated and any(one.is_calibrated for one in channels.values()):
         return _calibrated(case, _whole(case, kinds, {}), names, **outer)
     return _whole(case, kinds, outer)
 
@@ -160,6 +157,13 @@ def _part(
         return observation.LineIntegrals(lines, mean=True, **common)
     if kind == "follows":
         return observation.Moving(_followed(case, channels), **common)
+    return _points(case, channels, common)
+
+
+def _points(
+    case: CaseContent, channels: Mapping[str, schema.ChannelSpec], common: Mapping[str, Any]
+) -> observation.Points:
+    """Return the observation of sensors at points."""
     points = {name: _position(case, name, item) for name, item in channels.items()}
     constants = case.constants
     direct = {  # what a quantity sees beside the state
@@ -173,12 +177,10 @@ def _part(
     uncertain = {name: std for name, std in stds.items() if name in channels}
     # A family of point sensors of which one names a component has one for each.
     numbers = [item.component for item in channels.values()]
-    if any(number is not None for number in numbers):
+    if set(numbers) != {None}:
         if None in numbers:
-            unnamed = next(name for name, item in channels.items() if item.component is None)
-            raise case.missing(
-                f"channels.{unnamed}.component", "the component of the vector that it measures."
-            )
+            key = f"channels.{list(channels)[numbers.index(None)]}.component"
+            raise case.missing(key, "the component of the vector that it measures.")
         common = {**common, "component": numbers}
     return observation.Points(points, direct, uncertain or None, **common)
 
@@ -241,8 +243,8 @@ def _inside_mesh(case: CaseContent, at: Any, key: str) -> Any:
     return place[0] if len(place) == 1 else place
 
 
-def sensor_notes(case: CaseContent) -> Iterator[str]:
-    """Yield notes on fluxes at a boundary with a noisy value, and on sensors all in one cell."""
+def flux_notes(case: CaseContent) -> Iterator[str]:
+    """Yield notes on fluxes at a boundary with a noisy value."""
     noisy = {item.at: name for name, item in case.roles("boundary").items() if item.noise}
     for name, item in case.roles("sensor").items():
         if item.is_flux and item.at in noisy:
@@ -252,6 +254,10 @@ def sensor_notes(case: CaseContent) -> Iterator[str]:
                 f"'{item.at}'. Make {other} a sensor at that end, and the flux an unknown that "
                 f"moves: boundary.{item.at} = {{ flux = 'J' }} with unknowns.J.evolution."
             )
+
+
+def cell_notes(case: CaseContent) -> Iterator[str]:
+    """Yield a note on sensors all in one cell."""
     shown = case.roles(*schema.SENSORS).items()
     channels = {name: item for name, item in shown if not item.is_flux}
     if len(case.mesh.p) != 1 or not channels or any(item.at is None for item in channels.values()):
@@ -436,13 +442,17 @@ def split_families(
     if not isinstance(channels, dict) or set(names) <= channels.keys():
         return
     case = content()
-    for family in {case.families[name] for name in names if name in case.families}:
-        given = channels.pop(family)
-        common = {key: given[key] for key in given if key not in ("each", "positions")}
-        for label in (label for label, of in case.families.items() if of == family):
+    split = {case.families[name] for name in names if name in case.families}
+    for label, family in case.families.items():
+        if family in split:
             member = case.spec.channels[label]
             at = list(member.at) if isinstance(member.at, tuple) else member.at
-            channels[label] = {**common, "at": at, "column": member.column}
+            given = {**channels[family], "at": at, "column": member.column}
+            given.pop("each", None)
+            given.pop("positions", None)
+            channels[label] = given
+    for family in split:
+        del channels[family]
 
 
 def _evenly(
@@ -465,38 +475,40 @@ def _listed(
 ) -> dict[str, tuple[Any, str]]:
     """Return place and column of each sensor of a table of positions."""
     key, file = f"channels.{name}.positions", case.path.parent / str(channel.positions)
-    table = _positions_table(case, key, file)
-    axes = [axis for axis in "xyz" if axis in table.columns]
     found: dict[str, tuple[Any, str]] = {}
     # Row 1 of the file is its header.
-    blank = [k for k, row in enumerate(table[axes].to_numpy(), 2) if any(map(is_blank, row))]
-    if blank:
-        raise CaseError("\n".join(f"{file}, row {k}: replace '?' by a value." for k in blank))
-    for row, label in enumerate(table["name"], 2):
+    for row, (label, *cells) in enumerate(_positions_table(case, key, file), 2):
         if not label or label in found:
             what = f"the name '{label}' occurs twice" if label else "the name is missing"
             raise case.error(key, f"{file}, row {row}: {what}.")
-        where = f"{key}: {file}, row {row}"
-        place = tuple(_coordinate(case, table[axis][row - 2], where) for axis in axes)
+        place = tuple(_coordinate(case, cell, f"{key}: {file}, row {row}") for cell in cells)
         column = str(channel.column or "{}").replace("{}", label)
         found[label] = (place if len(place) > 1 else place[0], column)
     return found
 
 
-def _positions_table(case: CaseContent, key: str, file: Path) -> pd.DataFrame:
-    """Return a table with the columns name, x (and y, z), as text; empty where a cell is."""
+def _positions_table(case: CaseContent, key: str, file: Path) -> Iterable[Sequence[str]]:
+    """Return name, x (and y, z) of each row of a table, as text; empty where a cell is."""
     import pandas as pd  # slow to load, and most cases have no such table
 
     try:
         table = pd.read_csv(file, dtype=str, nrows=MEMBERS + 1, skipinitialspace=True).fillna("")
     except (OSError, ValueError) as error:
         raise case.error(key, f"{file} cannot be read as a CSV table: {error}.") from None
-    if "name" not in table.columns or table.columns.intersection(["x", "y", "z"]).empty:
+    axes = [axis for axis in "xyz" if axis in table.columns]
+    if "name" not in table.columns or not axes:
         got = ", ".join(map(str, table.columns[:8]))
         raise case.error(key, f"{file}: got the columns {got}; expected name, x (and y, z).")
     if len(table) > MEMBERS:
         raise case.error(key, f"{file} has more than {MEMBERS} sensors.")
-    return table
+    rows = enumerate(table[axes].to_numpy(), 2)
+    blank = [
+        f"{file}, row {k}: replace '?' by a value." for k, row in rows if any(map(is_blank, row))
+    ]
+    if blank:
+        raise CaseError("\n".join(blank))
+    named: Iterable[Sequence[str]] = table[["name", *axes]].to_numpy()
+    return named
 
 
 def _coordinate(case: CaseContent, cell: str, where: str) -> float:

@@ -106,19 +106,11 @@ def _instant(case: CaseContent, value: Any, key: str) -> Any:
 def read_data(case: CaseContent, source: str | Iterable[str] | None) -> DataTable | JsonLines:
     """Return the data: of the case's file, another file, or lines of JSON as they come."""
     spec, columns, clock = case.spec.data, columns_of(case), clock_of(case)
-    if source is None and isinstance(spec.file, tuple):
-        tables = _of_files(case, spec.file, columns)
-    else:
-        check_hours(case, clock, spec.file if source is None else source)
-        if not isinstance(source, str | None):
-            refuse_late(case)
-            return JsonLines(source, columns, clock, every=spec.every, missing=spec.missing)
-        if source is None and case.reader is not None:
-            tables = [_from_reader(case, case.reader, columns, clock)]
-        else:
-            path = data_file(case) if source is None else Path(source)
-            tables = [_read(path, columns, clock, spec)]
-    tables = _on_time(case, columns, tables)
+    if not isinstance(source, str | None):
+        check_hours(case, clock, source)
+        refuse_late(case)
+        return JsonLines(source, columns, clock, every=spec.every, missing=spec.missing)
+    tables = _on_time(case, columns, _tables(case, source, columns, clock))
     if len(tables) == 1:
         return _until_stop(case, clock, tables[0])
     from livepde.streams.join import join_tables
@@ -131,6 +123,20 @@ def read_data(case: CaseContent, source: str | Iterable[str] | None) -> DataTabl
     sensors, where = case.roles(*SENSORS), case.where("data.file")
     joined = join_tables(tables, clock.second, sensors, needed, where, between, together=together)
     return _until_stop(case, clock, joined)
+
+
+def _tables(
+    case: CaseContent, source: str | None, columns: Mapping[str, Column], clock: Clock
+) -> list[DataTable]:
+    """Return the tables of a file, of the case's reader, or of its own file or files."""
+    spec = case.spec.data
+    if source is None and isinstance(spec.file, tuple):
+        return _of_files(case, spec.file, columns)
+    check_hours(case, clock, spec.file if source is None else source)
+    if source is None and case.reader is not None:
+        return [_from_reader(case, case.reader, columns, clock)]
+    path = data_file(case) if source is None else Path(source)
+    return [_read(path, columns, clock, spec)]
 
 
 def _until_stop(case: CaseContent, clock: Clock, table: DataTable) -> DataTable:

@@ -104,6 +104,8 @@ class LiveCase:
         self.running: Live | None = None
         self.silent = False
         self.why = ""
+        self._reason = "no sample arrived"  # why the run has not begun
+        self._heard = 0.0  # when something came from the source last
         # An invalid case is refused here, before anything is connected.
         self._policy, self._limits = policy_of(case), limits_of(case)
         self._passwords = passwords_of(case, data is None, allow_env)
@@ -204,46 +206,58 @@ class LiveCase:
     ) -> tuple[Prepared, Sequence[Ready]] | None:
         """Return the case with its first sample and the samples from it on; None if stopped."""
         LOG.info("waiting for the first sample")
-        why = logged = "no sample arrived"
-        heard = time.monotonic()
+        self._heard = time.monotonic()
         found: list[Ready] = []
-        holds = [n for n, item in self.case.spec.channels.items() if item.between == "hold"]
         held: dict[str, float] = {}  # what holds from samples in which the run cannot begin
         while not stopping.is_set() and (found or not self._feed.done):
-            new = list(self._feed.poll(LOOK))
-            heard = self._listened(heard)
-            remarks, known = self._feed.remarks(new), set(irregular)
-            found += new
-            for remark in [*remarks, *self._without_wild(found)]:
-                gather(irregular, remark)
-            # If the first row looks wild, more rows have to show it.
-            while found and (
-                self._feed.done
-                or len(found) > FEWEST_FOLLOWING
-                or not suspect_start(self.case, found[0].values)
-            ):
-                values = dict.fromkeys(self.case.columns, math.nan) | found[0].values
-                held |= {n: values[n] for n in holds if not math.isnan(values[n])}
-                values |= held
-                found[0] = replace(found[0], values=found[0].values | held)
-                try:
-                    return self._prepared(Sample(t=found[0].t, z=values)), found
-                except DataError as error:
-                    why = str(error).removesuffix(".")
-                self.why = f"the run cannot start yet: {why}"
-                if why != logged:
-                    logged = why
-                    LOG.warning("cannot start yet: %s", why)
-                self._feed.acknowledge(found.pop(0))
+            news = self._polled(found, irregular)
+            while found and self._is_sure(found):
+                prepared = self._started(found, held)
+                if prepared is not None:
+                    return prepared, found
             # The remarks of the poll in which the run begins are left to the run.
-            for remark in remarks:
-                if (remark.kind, remark.channel) not in known:
-                    LOG.warning("%s: %s", remark.kind, remark.message)
+            for remark in news:
+                LOG.warning("%s: %s", remark.kind, remark.message)
         if stopping.is_set():
             return None
         first = next(iter(irregular.values()), None)
         wrong = f" ({first.kind}: {first.message})" if first is not None else ""
-        raise DataError(f"{self.case.path}: {why}{wrong}.")
+        raise DataError(f"{self.case.path}: {self._reason}{wrong}.")
+
+    def _polled(self, found: list[Ready], irregular: dict[tuple[str, str], Remark]) -> list[Remark]:
+        """Add samples and remarks of the source, and return remarks of kinds that are new."""
+        new = list(self._feed.poll(LOOK))
+        self._listen()
+        remarks, known = self._feed.remarks(new), set(irregular)
+        found += new
+        for remark in [*remarks, *self._without_wild(found)]:
+            gather(irregular, remark)
+        return [remark for remark in remarks if (remark.kind, remark.channel) not in known]
+
+    def _is_sure(self, found: list[Ready]) -> bool:
+        """Return whether no more rows have to show whether the first one is wild."""
+        many = self._feed.done or len(found) > FEWEST_FOLLOWING
+        return many or not suspect_start(self.case, found[0].values)
+
+    def _started(self, found: list[Ready], held: dict[str, float]) -> Prepared | None:
+        """Return the case with the first sample; if it cannot begin with it, drop that and log why.
+
+        `held`: the last values of channels that hold until the next reading.
+        """
+        values = dict.fromkeys(self.case.columns, math.nan) | found[0].values
+        for name, channel in self.case.spec.channels.items():
+            if channel.between == "hold" and not math.isnan(values[name]):
+                held[name] = values[name]
+        found[0] = replace(found[0], values=found[0].values | held)
+        try:
+            return self._prepared(Sample(t=found[0].t, z=values | held))
+        except DataError as error:
+            before, self._reason = self._reason, str(error).removesuffix(".")
+        self.why = f"the run cannot start yet: {self._reason}"
+        if self._reason != before:
+            LOG.warning("cannot start yet: %s", self._reason)
+        self._feed.acknowledge(found.pop(0))
+        return None
 
     def _without_wild(self, found: list[Ready]) -> list[Remark]:
         """Blank wild values of the first rows, and return remarks on them."""
@@ -257,17 +271,16 @@ class LiveCase:
             found[k] = replace(found[k], values=values | {name: math.nan})
         return remarks
 
-    def _listened(self, heard: float) -> float:
-        """Note whether the source is silent, and return when something came from it last."""
+    def _listen(self) -> None:
+        """Note whether the source is silent, and when something came from it last."""
         silence = math.inf if self._limits[-1] is None else self._limits[-1]
+        now = time.monotonic()
         if self._feed.heard():
-            self.silent, self.why = False, ""
-            return time.monotonic()
-        if not self.silent and time.monotonic() - heard > silence:
+            self.silent, self.why, self._heard = False, "", now
+        elif not self.silent and now - self._heard > silence:
             self.silent = True
             self.why = f"no data from the source for more than {silence:g} s"
             LOG.warning("silent: %s", self.why)
-        return heard
 
     def _fed(self, data: Data) -> Feed:
         case, named = self.case, data if isinstance(data, str) else None
@@ -287,16 +300,15 @@ class LiveCase:
         """Return whether all rows are read at once, not followed one by one."""
         case, spec = self.case, self.case.spec.data
         file, reader = (spec.file, case.reader) if data is None else (named, None)
-        if not isinstance(file, tuple):
-            check_hours(case, self.case.clock, file)
+        if isinstance(file, tuple):
+            return True
+        check_hours(case, self.case.clock, file)
         if spec.every > 1 and not (file or reader):
             text = f"got {spec.every}; a live source uses all rows: leave it out."
             raise case.error("data.every", text)
-        if isinstance(file, tuple) or str(file).endswith(".parquet") or reader is not None:
+        if reader is not None or str(file).endswith(".parquet"):
             return True
-        # These options are of files: lines that are sent have neither titles nor a second column.
-        above = not spec.follow and (spec.skip > 0 or len(spec.times) > 1)
-        return bool(file) and (spec.every > 1 or above)
+        return bool(file) and (spec.every > 1 or spec.is_of_file)
 
     def _new_intake(self) -> tuple[Intake, str]:
         """Return an intake of rows that follow those of the journal, and the source's position."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from statistics import mode
 
@@ -104,12 +104,9 @@ def measured(
     written = how_written(table, skip=skip)
     kinds = _kinds(table, written, time_format)
     time = _times(table, written, kinds)
-    found = ""
-    if kinds[time[0]] == "date":
-        found = _format(table, written, time, time_format)
-    numbers = [name for name, kind in kinds.items() if kind == "number" and name not in time]
-    counted = tuple(name for name in numbers if _counts_rows(name, written))
-    columns = {n: Column((n,), decimal=written.decimal) for n in numbers if n not in counted}
+    dated = kinds[time[0]] == "date"
+    found = _format(table, written, time, time_format) if dated else ""
+    columns, counted, texts = _sorted_out(kinds, time, written)
     if not columns:
         raise SampleError(f"{table}: no column but the times, '{time[0]}', contains numbers.")
     samples = read_csv(
@@ -120,11 +117,23 @@ def measured(
         encoding=written.encoding,
         skip=written.skip,
     )
-    unit = time_unit
-    if unit:  # dates are read as seconds since the first one
-        unit = "s" if samples.origin else unit_in(time[0], unit, IN_BRACKETS, AT_THE_END) or BLANK
-    texts = tuple(name for name in kinds if name not in (*time, *numbers))
+    unit = time_unit and _unit_of_times(samples, time[0], time_unit)
     return Measured(table, written, time, found, unit, samples, counted, texts)
+
+
+def _sorted_out(
+    kinds: Mapping[str, str], time: tuple[str, ...], written: Written
+) -> tuple[dict[str, Column], tuple[str, ...], tuple[str, ...]]:
+    """Return the columns of measurements, those of row numbers, and those without numbers."""
+    numbers = [name for name, kind in kinds.items() if kind == "number" and name not in time]
+    counted = tuple(name for name in numbers if _counts_rows(name, written))
+    columns = {n: Column((n,), decimal=written.decimal) for n in numbers if n not in counted}
+    return columns, counted, tuple(name for name in kinds if name not in (*time, *numbers))
+
+
+def _unit_of_times(samples: DataTable, name: str, unit: str) -> str:
+    """Return the unit of a column of times; dates are read as seconds since the first one."""
+    return "s" if samples.origin else unit_in(name, unit, IN_BRACKETS, AT_THE_END) or BLANK
 
 
 def _kinds(table: Path, written: Written, form: str) -> dict[str, str]:
@@ -164,10 +173,10 @@ def _kind(cell: str, decimal: str, form: str) -> str:
 
 def _times(table: Path, written: Written, kinds: Mapping[str, str]) -> tuple[str, ...]:
     """Return the column of times: dates, or numbers that increase; or days and times of day."""
-    dates, hours, numbers = (
-        [name for name, found in kinds.items() if found == kind]
-        for kind in ("date", "hour", "number")
-    )
+    of_kind: defaultdict[str, list[str]] = defaultdict(list)
+    for name, kind in kinds.items():
+        of_kind[kind].append(name)
+    dates, hours, numbers = of_kind["date"], of_kind["hour"], of_kind["number"]
     complete = [name for name in dates if ":" in "".join(_cells(name, written))]
     if dates and hours and not complete:
         return dates[0], hours[0]
@@ -188,11 +197,8 @@ def _times(table: Path, written: Written, kinds: Mapping[str, str]) -> tuple[str
 def _most_like_times(numbers: Sequence[str], written: Written) -> list[str]:
     """Return columns of numbers that may be times, those with the surest signs first."""
     timed = [name for name in numbers if unit_in(name, "s", IN_BRACKETS, AT_THE_END)]
-    rising = []
-    for name in numbers:
-        pairs = pairwise(_values(name, written))
-        if all(a is not None and b is not None and a < b for a, b in pairs):
-            rising.append(name)
+    values = {name: _values(name, written) for name in numbers}
+    rising = [name for name, found in values.items() if (found[:-1] < found[1:]).all()]
     both = [name for name in timed if name in rising]
     # Row numbers increase, too: they are times only if nothing else is.
     others = [name for name in rising if not _counts_rows(name, written)]
@@ -229,13 +235,15 @@ def _cells(name: str, written: Written) -> list[str]:
     return [cell for cell in cells if cell.lower() not in MISSING]
 
 
-def _values(name: str, written: Written) -> list[float | None]:
+def _values(name: str, written: Written) -> Array:
+    """Return the first numbers of a column, NaN where a cell is none."""
     k = written.header.index(name)
-    return [number_of(row[k], written.decimal) for row in written.rows if k < len(row)]
+    cells = (number_of(row[k], written.decimal) for row in written.rows if k < len(row))
+    return np.array(list(cells), dtype=float)
 
 
 def _counts_rows(name: str, written: Written) -> bool:
     """Return whether a column numbers the rows, by its name and its values."""
     values = _values(name, written)
-    counts = all(a is not None and b == a + 1 for a, b in pairwise(values))
+    counts = bool((values[1:] == values[:-1] + 1).all())
     return bool(ROW_NUMBER.fullmatch(name.strip())) and len(values) > 1 and counts

@@ -20,10 +20,8 @@ from livepde.cases.measured import Measured, measured
 from livepde.cases.read import BLANK, beside, toml_line
 from livepde.cases.schema import CaseSpec, DataSpec
 from livepde.errors import RunError
-from livepde.fem import Channel, Normal, interval
 from livepde.linalg import Array
-from livepde.models import EQUATIONS, Equation, Variable, heat
-from livepde.stepping import Advance, Alexander2, simulate
+from livepde.models import EQUATIONS, Equation, Variable
 from livepde.streams.oddities import sentinels, switches
 from livepde.units import IN_BRACKETS, unit_in
 
@@ -85,9 +83,7 @@ VALUES = """\
 # have a flux or an exchange in [boundary], such as left = {{ flux = "1 {flux}" }}."""
 ENDS = """\
 # A measured value at a boundary: role = "boundary", at = its name. Other boundaries are closed."""
-TRUE_ALPHA = 9.7e-5  # aluminium; m^2/s
-NOISE = 0.05
-ROD = Path(__file__).with_name("rod.toml")  # the case of the data that are made up
+ROD = Path(__file__).with_name("rod.toml")  # the case of the made-up data beside it
 
 
 @dataclass(frozen=True)
@@ -187,16 +183,19 @@ def _data(table: Measured, folder: Path) -> dict[str, Any]:
     """Return the format of the files as keys of [data], without defaults."""
     # Format keys of the first file hold for all; others state only what differs.
     first, *others = (_written(one, folder) for one in table.tables)
-    usual = DataSpec.model_fields
-    found = {
-        key: value for key, value in first.items() if key == "time" or value != usual[key].default
-    }
+    usual = {key: field.default for key, field in DataSpec.model_fields.items() if key != "time"}
+    found = _unlike(first, usual)
     if others:
-        own = [{key: v for key, v in other.items() if v != first.get(key)} for other in others]
+        own = [_unlike(other, first) for other in others]
         found["file"] = [first["file"], *(o if len(o) > 1 else o["file"] for o in own)]
     if missing := _missing(table):
         found["missing"] = missing
     return found
+
+
+def _unlike(given: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys whose values are not the usual ones."""
+    return {key: value for key, value in given.items() if value != usual.get(key)}
 
 
 def _missing(table: Measured) -> list[float]:
@@ -293,21 +292,11 @@ def _channels(equation: Equation, found: list[FoundChannel]) -> Iterator[str]:
 def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
     """Return the channels of a table, and at the end the inputs that it lacks."""
     columns = table.columns
-    # Keys are names of columns without units; where two would be the same, the full name is one.
-    keys = [re.sub(r"\W+", "_", IN_BRACKETS.sub("", name)).strip("_") for name in columns]
     found, inputs = [], dict(equation.inputs)
-    for key, (name, values) in zip(keys, columns.items(), strict=True):
+    for label, (name, values) in zip(_labels(columns), columns.items(), strict=True):
         if entry := _input_of(name, inputs):
-            unit = _stated(name, inputs.pop(entry).unit)
-            given = {"role": "input", "column": name, **({"unit": unit} if unit else {})}
-            comment = _range(values)
-            samples = next(one.samples for one in table.tables if name in one.samples.names)
-            if switches(samples.t, values):
-                given["between"] = "hold"
-                comment += ", constant stretches with jumps"
-            found.append(FoundChannel(entry, given, (name,), comment))
+            found.append(_input(table, entry, name, inputs.pop(entry).unit))
         else:
-            label = key if key and keys.count(key) == 1 else name
             found.append(_sensor(equation, label, name, values))
     there = {item.name for item in found if not item.is_sensor}
     chosen = equation.alternatives.get(_alternative(equation, there), ())
@@ -317,6 +306,25 @@ def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
         if not variable.optional or name in chosen
     ]
     return [*_in_families(equation, found), *lacking]
+
+
+def _labels(columns: Iterable[str]) -> list[str]:
+    """Return names of columns without units; where two would be the same, the full names."""
+    keys = {name: re.sub(r"\W+", "_", IN_BRACKETS.sub("", name)).strip("_") for name in columns}
+    all_keys = ["", "", *keys.values()]  # an empty key is never the only one
+    return [key if all_keys.count(key) == 1 else name for name, key in keys.items()]
+
+
+def _input(table: Measured, entry: str, name: str, model_unit: str) -> FoundChannel:
+    """Return an input with the unit that the name of its column states."""
+    unit, values = _stated(name, model_unit), table.columns[name]
+    given = {"role": "input", "column": name, **({"unit": unit} if unit else {})}
+    comment = _range(values)
+    samples = next(one.samples for one in table.tables if name in one.samples.names)
+    if switches(samples.t, values):
+        given["between"] = "hold"
+        comment += ", constant stretches with jumps"
+    return FoundChannel(entry, given, (name,), comment)
 
 
 def _input_of(column: str, inputs: Mapping[str, Variable]) -> str:
@@ -357,13 +365,19 @@ def _sensor(equation: Equation, key: str, name: str, values: Array) -> FoundChan
     if equation.components:
         given["of"] = equation.components[0]
         told.append(f"of {' or '.join(equation.components)}")
-    stated, unit = IN_BRACKETS.search(name), ""
-    if stated and not PLACE.fullmatch(stated[1].strip()):
-        unit = unit_in(name, equation.state.unit, IN_BRACKETS) or f"{BLANK} {stated[1]}"
-    elif not stated and (suffix := SUFFIX.search(name)) and suffix["unit"] not in NO_UNITS:
-        unit = unit_in(name, equation.state.unit, SUFFIX)  # T_in_degF
+    unit = _unit_of_sensor(name, equation.state.unit)
     given |= {"unit": unit} if unit not in ("", equation.state.unit) else {}
     return FoundChannel(key, given, (name,), ", ".join(told))
+
+
+def _unit_of_sensor(name: str, unit: str) -> str:
+    """Return the unit that the name of a sensor's column states; empty if it states none."""
+    stated, suffix = IN_BRACKETS.search(name), SUFFIX.search(name)
+    if stated and not PLACE.fullmatch(stated[1].strip()):
+        return unit_in(name, unit, IN_BRACKETS) or f"{BLANK} {stated[1]}"
+    if not stated and suffix and suffix["unit"] not in NO_UNITS:
+        return unit_in(name, unit, SUFFIX)  # T_in_degF
+    return ""
 
 
 def _in_families(equation: Equation, found: list[FoundChannel]) -> list[FoundChannel]:
@@ -416,9 +430,9 @@ def write_template(
     The case is for a table of measurements, or else for made-up data that are written beside it.
     """
     if table is None:
-        check_free(folder, ["rod.csv", "case.toml"])  # before the simulation, which takes a while
         text = HEAD.format(case=folder / "case.toml") + ROD.read_text(encoding="utf-8")
-        write_files(folder, {"rod.csv": _measurements(), "case.toml": text})
+        made = ROD.with_suffix(".csv").read_text(encoding="utf-8")
+        write_files(folder, {"rod.csv": made, "case.toml": text})
         return folder / "case.toml", folder / "rod.csv"
     check_free(folder, ["case.toml"])
     found = measured(table, equation.time_unit)
@@ -456,29 +470,3 @@ def write_files(folder: Path, files: Mapping[str, str]) -> None:
             (folder / name).write_text(text, encoding="utf-8")
     except OSError as error:
         raise RunError(f"{folder}: cannot be written: {error.strerror or error}.") from error
-
-
-@cache
-def _measurements() -> str:
-    """Return noisy temperatures of a rod, simulated on a finer mesh than the case uses."""
-    times = np.arange(0.0, 3601.0, 20.0)
-
-    def ends(t: float) -> dict[str, float]:
-        left = 20.0 + 15.0 * np.sin(2 * np.pi * t / 1200.0) + 10.0 * (t / 3600.0)
-        return {"T_left": left, "T_right": 20.0 + 1.0 * np.sin(2 * np.pi * t / 3600.0)}
-
-    values = {"left": Channel("T_left"), "right": Channel("T_right")}
-    model = heat(interval(0.0, 0.4, 80), Normal(TRUE_ALPHA), values)
-    at = {"T_10": 20, "T_20": 40, "T_30": 60}  # vertices
-    rng = np.random.default_rng(1)
-    lines = ["time_s,T_left,T_10,T_20,T_30,T_right"]
-    block, q = model.state_block, model.initial_parameter({"alpha": TRUE_ALPHA})
-    control = Advance(Alexander2(), 5.0)
-    for t, u in simulate(model, q, 20.0, times.tolist(), control, ends):
-        profile = block.at_vertices @ u
-        inner = [profile[k] + NOISE * rng.standard_normal() for k in at.values()]
-        cells = [f"{value:.3f}" for value in (ends(t)["T_left"], *inner, ends(t)["T_right"])]
-        if t in (600.0, 620.0):
-            cells[1] = ""  # a sensor may fail for a while: an empty cell is a missing sample
-        lines.append(",".join([f"{t:g}", *cells]))
-    return "\n".join(lines) + "\n"

@@ -127,8 +127,8 @@ def _told(prepared: Prepared, linear: SensitivityLaw, samples: Iterable[Sample])
     count, estimate = 0, None
     for sample in samples:
         estimate = identifier.step(sample.t, sample.z, sample.inputs)
-        if sample.t >= prepared.assimilate_from:
-            count += bool(np.isfinite(estimate.innovation).any())
+        seen = np.isfinite(estimate.innovation).any()
+        count += int(seen & (sample.t >= prepared.assimilate_from))
         if count >= MOST_SAMPLES:
             break
     belief = identifier._latent_belief()

@@ -283,16 +283,20 @@ def _regions(case: CaseContent, regions: Mapping[str, Any], key: str) -> dict[st
     return found
 
 
+def _wall_layers(case: CaseContent, model: Model) -> dict[str, float]:
+    """Return label of a conductivity that is a number -> thickness; empty if there is no wall."""
+    name, space = case.equation.conductivity, model.parameter_space
+    unit = case.equation.unknowns[name].unit if name else ""
+    if unit != "W/(m K)" or len(case.mesh.p) != 1:
+        return {}
+    lengths = np.ptp(case.mesh.p[0][case.mesh.t], axis=0) @ in_cells(space, case.mesh, name)
+    rows = space.labels.items()
+    return {label: float(lengths[k]) for label, k in rows if base_name(label) == name}
+
+
 def wall_attributes(case: CaseContent, model: Model) -> dict[str, Any]:
     """Return the attributes of a dataset by which the resistance of a wall, if any, is reported."""
-    name, given = case.equation.conductivity, case.spec.output.surface_resistances
-    unit = case.equation.unknowns[name].unit if name else ""
-    layers: dict[str, float] = {}
-    if unit == "W/(m K)" and len(case.mesh.p) == 1:
-        space = model.parameter_space
-        lengths = np.ptp(case.mesh.p[0][case.mesh.t], axis=0) @ in_cells(space, case.mesh, name)
-        numbers = [label for label in space.labels if base_name(label) == name]
-        layers = {label: float(lengths[space.labels[label]]) for label in numbers}
+    layers, given = _wall_layers(case, model), case.spec.output.surface_resistances
     if given is None:
         return {LAYERS: json.dumps(layers)} if layers else {}
     key = "output.surface_resistances"
@@ -339,8 +343,8 @@ def _undriven(case: CaseContent, model: Model) -> bool:
     changes nor depends on the unknowns if A'(q), B and F vanish there. Left out are periodic
     states, which carry waves, and own equations, which need not be defined for any state.
     """
-    fields = [block.field for block in model.state_space.fields.values()]
-    held = any(field.boundary_values or field.periodic for field in fields)
+    blocks = model.state_space.fields.values()
+    held = any(block.field.boundary_values or block.field.periodic for block in blocks)
     own = ":" in case.spec.equation
     if own or held or model.channels or model.form_initial is not None:
         return False
@@ -366,48 +370,75 @@ def conditioned(case: CaseContent) -> CaseContent:
         return case
     units = equation.fluxes
     if units is None:
-        keys = [f"boundary.{name}" for name in given] + [f"sources.{n}" for n in spec.sources]
-        if not keys:
-            key = f"channels.{next(iter(shifted))}.offset"
-            text = f"the offset of a boundary value of '{equation.name}' cannot be an unknown; "
-            raise case.error(key, text + "leave it out, or correct the column with `data.reader`.")
-        text = f"the equation '{equation.name}' takes no fluxes and no sources of a case; "
-        known = [name for name, one in EQUATIONS.items() if one.fluxes is not None]
-        raise case.error(keys[0], f"{text}{', '.join(known)} do.")
+        raise _without_conditions(case, given, shifted)
     names = _ConditionNames(case)
-    boundary = {name: _passing(names, units, name, item) for name, item in given.items()}
-    for name, channel in shifted.items():
-        key, at = f"channels.{name}.at", str(channel.at)
-        if at in spec.boundary or at in boundary:
-            raise case.error(key, f"the boundary '{at}' has a condition already; keep one.")
-        boundary[at] = _near(names, name)
+    boundary = _boundary(names, units, given)
     sources = {
         name: (names.amount(item.value, units.source, f"sources.{name}.value"), item.over)
         for name, item in spec.sources.items()
     }
-    base = equation.build
+    unknowns = {**equation.unknowns, **names.unknowns}
+    inputs = {**equation.inputs, **names.inputs}
+    build = _Conditioned(case, names.unknowns, boundary, sources, per)
+    changed = replace(equation, unknowns=unknowns, inputs=inputs, build=build)
+    return replace(case, equation=changed)
 
-    def build(
-        mesh: Any, unknowns: Mapping[str, Any], dirichlet: Mapping[str, Any], **options: Any
+
+@dataclass(frozen=True, eq=False)
+class _Conditioned:
+    """The model of a case's equation with its fluxes and sources."""
+
+    case: CaseContent  # before its equation has them
+    unknowns: Mapping[str, Variable]  # that they name
+    boundary: Mapping[str, list[Flux | Exchange]]
+    sources: Mapping[str, tuple[Amount, Any]]
+    per: str | None
+
+    def __call__(
+        self, mesh: Any, unknowns: Mapping[str, Any], dirichlet: Mapping[str, Any], **options: Any
     ) -> Model:
-        # The equation gets its own unknowns; those that fluxes and sources name are added
-        # afterwards.
-        own = {name: item for name, item in unknowns.items() if name not in names.unknowns}
-        more = {name: item for name, item in unknowns.items() if name in names.unknowns}
-        for name in boundary:
+        case = self.case
+        # The equation gets its own unknowns; those of fluxes and sources are added afterwards.
+        more = {name: item for name, item in unknowns.items() if name in self.unknowns}
+        own = {name: item for name, item in unknowns.items() if name not in more}
+        for name in self.boundary:
             case.require(name, mesh.boundaries or {}, "boundary", f"no boundary '{name}'")
         placed = {
             name: Source(amount, None if over is None else _place(case, mesh, over, name))
-            for name, (amount, over) in sources.items()
+            for name, (amount, over) in self.sources.items()
         }
-        model = base(mesh, own, dirichlet, **options)
+        model = case.equation.build(mesh, own, dirichlet, **options)
         with case.located("boundary", ModelError):
-            return with_conditions(model, boundary, placed, more, per)
+            return with_conditions(model, self.boundary, placed, more, self.per)
 
-    unknowns = {**equation.unknowns, **names.unknowns}
-    inputs = {**equation.inputs, **names.inputs}
-    changed = replace(equation, unknowns=unknowns, inputs=inputs, build=build)
-    return replace(case, equation=changed)
+
+def _boundary(
+    names: _ConditionNames, units: Fluxes, given: Mapping[str, BoundarySpec]
+) -> dict[str, list[Flux | Exchange]]:
+    """Return the conditions of boundaries with a flux, or with an unknown offset of the value."""
+    case = names.case
+    found = {name: _passing(names, units, name, item) for name, item in given.items()}
+    for name, channel in _shifted(case).items():
+        key, at = f"channels.{name}.at", str(channel.at)
+        if at in case.spec.boundary or at in found:
+            raise case.error(key, f"the boundary '{at}' has a condition already; keep one.")
+        found[at] = _near(names, name)
+    return found
+
+
+def _without_conditions(
+    case: CaseContent, given: Iterable[str], shifted: Iterable[str]
+) -> CaseError:
+    """Return an error about conditions of a case whose equation takes none."""
+    name = case.equation.name
+    keys = [*(f"boundary.{n}" for n in given), *(f"sources.{n}" for n in case.spec.sources)]
+    if not keys:
+        key = f"channels.{next(iter(shifted))}.offset"
+        text = f"the offset of a boundary value of '{name}' cannot be an unknown; leave it out, or "
+        return case.error(key, f"{text}correct the column with `data.reader`.")
+    known = [other for other, one in EQUATIONS.items() if one.fluxes is not None]
+    text = f"the equation '{name}' takes no fluxes and no sources of a case; "
+    return case.error(keys[0], f"{text}{', '.join(known)} do.")
 
 
 def _shifted(case: CaseContent) -> dict[str, ChannelSpec]:

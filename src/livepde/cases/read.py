@@ -246,7 +246,7 @@ def _path(loc: tuple[int | str, ...], raw: Any, missing: bool) -> list[str]:
             path[-1] += f"[{part}]"
         elif missing and k == len(loc) - 1:
             path.append(str(part))
-    return path or [str(part) for part in loc[:1]]
+    return path or list(map(str, loc[:1]))
 
 
 def _keys(path: Iterable[str], raw: Mapping[str, Any]) -> list[str]:
@@ -317,19 +317,7 @@ def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) 
     for key, given in settings.items():
         adds = isinstance(given, Mapping) and len(key_path(key, where)) == 2
         for path, value in _leaves(key_path(key, where), given):
-            here = changed
-            for k, part in enumerate(path[:-1]):
-                if k == 1 and path[0] in NAMED and part not in here and not adds:
-                    raise CaseError(
-                        f"{where}: {'.'.join(path)}: the case has no '{path[0]}.{part}'; "
-                        f"{did_you_mean(part, here).removesuffix('.')} (to add it, set all of it: "
-                        f"{path[0]}.{part}={{ ... }})"
-                    )
-                if not isinstance(here.get(part), dict):
-                    # initial = "interpolate" is short for initial.from = "interpolate".
-                    whole = here is changed and part == "initial" and part in here
-                    here[part] = {"from": here[part]} if whole else {}
-                here = here[part]
+            here = _table_of(changed, path, where, adds=adds)
             if value is not None:
                 here[path[-1]] = value
             elif here.pop(path[-1], None) is None:
@@ -338,6 +326,27 @@ def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) 
                     f"{did_you_mean(path[-1], here)}"
                 )
     return changed
+
+
+def _table_of(
+    document: dict[str, Any], path: tuple[str, ...], where: str, *, adds: bool
+) -> dict[str, Any]:
+    """Return the table of a key in a document, made where it is missing."""
+    if path[0] == "initial" and not isinstance(document.get("initial", {}), dict):
+        # initial = "interpolate" is short for initial.from = "interpolate".
+        document["initial"] = {"from": document["initial"]}
+    here = document
+    for k, part in enumerate(path[:-1]):
+        if k == 1 and path[0] in NAMED and part not in here and not adds:
+            raise CaseError(
+                f"{where}: {'.'.join(path)}: the case has no '{path[0]}.{part}'; "
+                f"{did_you_mean(part, here).removesuffix('.')} (to add it, set all of it: "
+                f"{path[0]}.{part}={{ ... }})"
+            )
+        if not isinstance(here.get(part), dict):
+            here[part] = {}
+        here = here[part]
+    return here
 
 
 def settings_in(text: str) -> tuple[str, ...]:
@@ -405,7 +414,7 @@ def _check_document(document: Mapping[str, Any], where: str) -> None:
             raise CaseError(f"{where}: {key[:LONG_KEY]}: {text}.")
         if max(map(len, key.split("."))) > LONG_KEY:
             raise CaseError(f"{where}: {key[:LONG_KEY]}...: a name has at most {LONG_KEY} letters.")
-        if key.startswith(FREE) or isinstance(value, bool):
+        if key.startswith(FREE):
             continue
         name = key.rpartition(".")[2]
         if isinstance(value, int) and abs(value) > COUNTS.get(name, OTHER):

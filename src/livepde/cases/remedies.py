@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -85,14 +85,15 @@ def start_missed(prepared: Prepared, verdict: Verdict) -> list[Finding]:
 
 def _with_remedy(case: Case, cause: Cause, settings: tuple[str, ...]) -> Cause:
     """Return a cause whose remedy has the setting, for an error of a sensor or of the start."""
-    if cause.kind == "initial" and settings and settings != settings_in(cause.setting):
+    stated = settings_in(cause.setting)
+    if cause.kind == "initial" and settings not in ((), stated):
         return replace(cause, remedy=f"Specify its uncertainty: `{settings[0]}`.")
     if cause.kind == "jump" and _may_jump(case, cause.subject):
         return replace(cause, remedy=JUMPED)
     if cause.kind not in KEYS or cause.subject not in case.roles("sensor"):
         return cause
     table = case.families.get(cause.subject, cause.subject)  # a family has one table
-    if settings == settings_in(cause.setting) and table == cause.subject:
+    if settings == stated and table == cause.subject:
         return cause  # the remedy has the value, and its unit
     if not settings:
         return replace(cause, remedy=LIKELY[cause.kind].remedy.format(name=cause.subject))
@@ -113,24 +114,17 @@ def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
         return ()
     if cause.kind == "jump" and _may_jump(case, cause.subject):
         return ()
-    process = {
-        "source": _source,
-        "loss": _loss,
-        "flux": _flux,
-        "transfer": _transfer,
-        "boundary": _boundary,
-    }
-    if cause.kind == "offset" and cause.subject in case.roles("boundary"):
-        return _boundary(prepared, cause)
-    if cause.kind in process:
-        return process[cause.kind](prepared, cause)
-    if cause.kind in KEYS:
-        return _of_sensor(prepared, cause)
-    if cause.kind == "exchange":
-        return _exchanged(case, cause)
-    if cause.kind == "initial" and (settings := _initial(prepared)):
-        return settings
-    return _stated(case, cause)
+    remedies: dict[str, Callable[[Prepared, Cause], tuple[str, ...]]]
+    remedies = {**dict.fromkeys(KEYS, _of_sensor), "exchange": _exchanged}
+    remedies |= {"source": _source, "loss": _loss, "transfer": _transfer}
+    remedies |= {"flux": _flux, "boundary": _boundary}
+    kind = cause.kind
+    if kind == "offset" and cause.subject in case.roles("boundary"):
+        kind = "boundary"
+    if kind in remedies:
+        return remedies[kind](prepared, cause)
+    started = _initial(prepared) if kind == "initial" else ()
+    return started or _stated(case, cause)
 
 
 def _adding(name: str, std: float, **keys: float | str) -> str:
@@ -146,24 +140,28 @@ def _of_sensor(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     channel = channels.get(cause.subject)
     if channel is None:
         return _stated(case, cause)
-    if getattr(channel, key) is not None:
+    if getattr(channel, key) is not None or (key == "at_std" and not channel.is_point):
         return ()
-    if key == "at_std" and not channel.is_point:
-        return ()
-    others, size = (getattr(item, key) for item in channels.values()), cause.size
-    stated = next((value for value in others if value is not None), None)
+    others = (getattr(item, key) for item in channels.values())
+    given = next((value for value in others if value is not None), None)
+    if given is None:
+        given = _usual_std(prepared, cause)
+    if given is None:
+        return settings_in(cause.setting)
+    return (channel_setting(cause.subject, key, toml_value(given)),)
+
+
+def _usual_std(prepared: Prepared, cause: Cause) -> float | str | None:
+    """Return a prior standard deviation for an error of a sensor; None if its size is unknown."""
+    who, key, size = prepared.identifier.observed, KEYS[cause.kind], cause.size
     if key == "at_std" and not math.isfinite(size):
         size = usual_shift(prepared, cause.subject)
-    if stated is None and not math.isfinite(size):
-        return settings_in(cause.setting)
-    given = stated
-    if stated is None:
-        who = prepared.identifier.observed
-        own = who.units[who.names.index(cause.subject)].replace("degC", "K")
-        unit = {"offset": own, "at_std": case.equation.length_unit}.get(key, "")
-        value = f"{WIDE * abs(size):.2g}"
-        given = f"{value} {unit}" if unit else float(value)
-    return (channel_setting(cause.subject, key, toml_value(given)),)
+    if not math.isfinite(size):
+        return None
+    own = who.units[who.names.index(cause.subject)].replace("degC", "K")
+    unit = {"offset": own, "at_std": prepared.case.equation.length_unit}.get(key, "")
+    value = f"{WIDE * abs(size):.2g}"
+    return f"{value} {unit}" if unit else float(value)
 
 
 def usual_shift(prepared: Prepared, name: str) -> float:
@@ -183,8 +181,9 @@ def _stated(case: Case, cause: Cause) -> tuple[str, ...]:
     return () if taken else settings
 
 
-def _exchanged(case: Case, cause: Cause) -> tuple[str, ...]:
+def _exchanged(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     """Return the settings by which each of two channels reads the column of the other."""
+    case = prepared.case
     names = list(tomllib.loads("\n".join(settings_in(cause.setting))).get("channels", {}))
     channels = [case.spec.channels.get(name) for name in reversed(names)]
     columns = [None if channel is None else channel.column for channel in channels]

@@ -202,7 +202,11 @@ class DataSpec(Spec):
             raise ValueError(f"{sources[0]} and {sources[1]} are two sources: keep one")
         if self.follow and not isinstance(self.file, str):
             raise ValueError("follow requires a single file that grows")
-        if self.live and not self.follow and (self.skip or not isinstance(self.time, str)):
+        return self
+
+    @model_validator(mode="after")
+    def _live_source(self) -> DataSpec:
+        if self.live and self.is_of_file:
             raise ValueError("skip and a time in two columns are only valid with a file")
         if self.live and self.every > 1:
             raise ValueError("every requires complete data, not a live source")
@@ -217,6 +221,11 @@ class DataSpec(Spec):
     def times(self) -> tuple[str, ...]:
         """The columns of times: one, or days and times of day."""
         return (self.time,) if isinstance(self.time, str) else self.time
+
+    @property
+    def is_of_file(self) -> bool:
+        """Whether keys state what only a complete file has: titles, or two columns of times."""
+        return not self.follow and (self.skip > 0 or len(self.times) > 1)
 
     @property
     def live(self) -> bool:
@@ -352,6 +361,11 @@ class ChannelSpec(Spec):
         return self.quantity == FLUX
 
     @property
+    def is_calibrated(self) -> bool:
+        """Whether an error of the channel is an unknown."""
+        return (self.offset, self.gain, self.correlated) != (None, None, None)
+
+    @property
     def drives(self) -> bool:
         """Whether the channel drives the model: a boundary value or another input."""
         return self.role in ("boundary", "input")
@@ -373,30 +387,37 @@ class ChannelSpec(Spec):
             raise ValueError("expected column = name, or columns = [names] that are averaged")
         return self
 
-    @model_validator(mode="after")
-    def _one_place(self) -> ChannelSpec:
+    @property
+    def _placed(self) -> int:
+        """Number of keys that state where the channel measures."""
         fixed = (self.at, self.over, self.along, self.each, self.positions)
         quantity = None if self.is_flux else self.quantity
-        placed = sum(place is not None for place in (*fixed, self.follows, quantity))
-        if self.is_flux and self.role not in SENSORS:
+        return sum(place is not None for place in (*fixed, self.follows, quantity))
+
+    @model_validator(mode="after")
+    def _place_of_flux(self) -> ChannelSpec:
+        if not self.is_flux:
+            return self
+        if self.role not in SENSORS:
             raise ValueError(
                 'quantity = "flux" requires a sensor; a flux that drives the model is an input '
                 "that boundary.NAME.flux names"
             )
-        if self.role in ("input", "position") and placed:
+        if self.at is None or self._placed != 1:
+            raise ValueError(
+                'quantity = "flux" needs at = the name of an end, as "left", or a position'
+            )
+        if own := {"offset", "correlated", "at_std", "of", "component"} & self.model_fields_set:
+            raise ValueError(f'{own.pop()} is not possible with quantity = "flux": leave it out')
+        return self
+
+    @model_validator(mode="after")
+    def _one_place(self) -> ChannelSpec:
+        if self.role in ("input", "position") and self._placed:
             raise ValueError(f"a channel of role {self.role} has no place: leave it out")
         if self.role == "boundary" and not isinstance(self.at, str):
             raise ValueError('a boundary channel needs at = the name of a boundary, as "left"')
-        if self.is_flux:
-            if self.at is None or placed != 1:
-                raise ValueError(
-                    'quantity = "flux" needs at = the name of an end, as "left", or a position'
-                )
-            if own := {"offset", "correlated", "at_std", "of", "component"} & self.model_fields_set:
-                raise ValueError(
-                    f'{own.pop()} is not possible with quantity = "flux": leave it out'
-                )
-        if self.role in SENSORS and placed != 1:
+        if self.role in SENSORS and self._placed != 1:
             raise ValueError(
                 "expected one of: at = position, over = [from, to], along = [start, end], "
                 "follows = channel, each = [from, to, count], positions = file, quantity = name"
@@ -414,7 +435,7 @@ class ChannelSpec(Spec):
         return self
 
     @model_validator(mode="after")
-    def _options_of_role(self) -> ChannelSpec:
+    def _options_of_sensors(self) -> ChannelSpec:
         sensor = self.role in SENSORS
         own = {"offset", "gain", "correlated", "at_std"} & self.model_fields_set
         # A sensor that is ignored for a while keeps its keys.
@@ -426,6 +447,10 @@ class ChannelSpec(Spec):
             raise ValueError(f"of requires a sensor, but the role is {self.role}")
         if self.component is not None and not (sensor and self.is_point):
             raise ValueError("component requires a sensor at a position")
+        return self
+
+    @model_validator(mode="after")
+    def _options_of_inputs(self) -> ChannelSpec:
         if not self.drives and (self.missing == "interpolate" or self.spikes is not None):
             raise ValueError(
                 'missing = "interpolate" and spikes require a boundary or input channel; '
@@ -439,7 +464,11 @@ class ChannelSpec(Spec):
             raise ValueError(
                 'a value with between = "hold" is never missing: leave out the key missing'
             )
-        if self.noise_column is not None and not sensor:
+        return self
+
+    @model_validator(mode="after")
+    def _options_of_noise(self) -> ChannelSpec:
+        if self.noise_column is not None and self.role not in SENSORS:
             raise ValueError("noise_column requires a sensor: leave it out")
         if self.role == "position" and self.noise is not None:
             raise ValueError("noise of a channel of role position is not possible: leave it out")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import pairwise, product
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,10 +24,10 @@ from livepde.plots.style import modes_told
 from livepde.records import interval_95, scalars, used_errors
 from livepde.result import Result
 from livepde.runs import sampling_findings, verdict
-from livepde.runs.summary import channel_errors, rmse
+from livepde.runs.summary import ChannelErrors, channel_errors, rmse
 from livepde.samples import Sample
 from livepde.streams import DataTable
-from livepde.verdict import Cause, Verdict, channel_setting
+from livepde.verdict import Cause, ModelErrors, Verdict, channel_setting
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -261,15 +262,7 @@ def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun
     raw = prepared.raw
     sampled = sampling_findings(data, None if raw is None else lambda: (raw.t, raw.values))
     found = with_settings(prepared, verdict(data).with_findings(sampled))
-    errors, estimates = found.errors, {}
-    allowed = {one.label: one for one in errors.unknowns} if errors is not None else {}
-    for label in labels:
-        low, high = (float(end[-1]) for end in interval_95(data, label))
-        if label in allowed:
-            low, high = allowed[label].low, allowed[label].high
-        value, std = float(data[label][-1]), float(data[f"{label}_std"][-1])
-        unit = str(data[label].attrs.get("units", ""))
-        estimates[label] = LastEstimate(value, std, low, high, unit)
+    errors = found.errors
     modes = [modes_told(data, name)[1] for name in fields if f"{name}_modes" in data]
     used = data["time"].values >= prepared.assimilate_from
     seen = np.isfinite(data["innovation"].transpose("time", "sensor").values[used]).sum(axis=0)
@@ -284,11 +277,30 @@ def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun
         log_evidence=evidence + sum(volumes),
         readings=readings,
         misfits=_misfits(data) if errors is None else dict(errors.sensors),
-        errors={n: rmse(one.later) for n, one in channels.items() if one.role == "assimilated"},
-        validation={n: rmse(one.later) for n, one in channels.items() if one.role == "validation"},
-        estimates=estimates,
+        errors=_later_errors(channels, "assimilated"),
+        validation=_later_errors(channels, "validation"),
+        estimates=_last_estimates(data, errors),
         unknowns=len(labels) + sum(modes),
     )
+
+
+def _later_errors(channels: Mapping[str, ChannelErrors], role: str) -> dict[str, float]:
+    """Return the root mean square errors of the channels of a role in the second half."""
+    return {name: rmse(one.later) for name, one in channels.items() if one.role == role}
+
+
+def _last_estimates(data: xr.Dataset, errors: ModelErrors | None) -> dict[str, LastEstimate]:
+    """Return the last estimate of each number, with an interval that allows for model errors."""
+    found = {}
+    allowed = {one.label: one for one in errors.unknowns} if errors is not None else {}
+    for label in scalars(data):
+        low, high = (float(end[-1]) for end in interval_95(data, label))
+        if label in allowed:
+            low, high = allowed[label].low, allowed[label].high
+        value, std = float(data[label][-1]), float(data[f"{label}_std"][-1])
+        unit = str(data[label].attrs.get("units", ""))
+        found[label] = LastEstimate(value, std, low, high, unit)
+    return found
 
 
 def _misfits(data: xr.Dataset) -> dict[str, float]:
@@ -309,30 +321,33 @@ def recommended(base: VariantRun, others: Sequence[VariantRun]) -> VariantRun:
     Among variants of similar evidence it is the one with the fewest unknowns, and a usable one goes
     first. It is the case itself if none has strong evidence against it.
     """
-    fair = [one for one in others if not _worse(one, base)]
-    useful = [one for one in fair if one.level in USABLE and one.gained(base) > GAINED]
-    fair = useful or fair
-    best = max((one.gained(base) for one in fair if not math.isnan(one.gained(base))), default=0.0)
-    if not best > GAINED:
+    strong = [
+        (gained, one)
+        for one in others
+        if (gained := one.gained(base)) > GAINED and not _worse_sensors(one, base)
+    ]
+    if not strong:
         return base
-    near = [one for one in fair if one.gained(base) > max(best - GAINED, GAINED)]
-    return min(near, key=lambda one: (one.unknowns, -one.gained(base)))
+    usable = [(gained, one) for gained, one in strong if one.level in USABLE] or strong
+    best, _ = max(usable, key=itemgetter(0))
+    near = [(one.unknowns, -gained, one) for gained, one in usable if gained > best - GAINED]
+    return min(near, key=itemgetter(0, 1))[-1]
 
 
-def _worse(one: VariantRun, base: VariantRun) -> bool:
-    """Return whether a run predicts one of the validation sensors worse than another run does."""
-    return any(_worse_at(one, name, error) for name, error in base.validation.items())
-
-
-def _worse_at(one: VariantRun, name: str, error: float) -> bool:
-    """Return whether a run predicts a validation sensor worse than by this error, or not."""
-    limit = error * (1.0 + WORSE)
-    return math.isfinite(error) and not one.validation.get(name, math.nan) <= limit
+def _worse_sensors(one: VariantRun, base: VariantRun) -> list[str]:
+    """Return both errors of the validation sensors that a run predicts worse, or not at all."""
+    return [
+        f"{name} {own:.3g} instead of {error:.3g}"
+        for name, error in base.validation.items()
+        if math.isfinite(error)
+        and not (own := one.validation.get(name, math.nan)) <= error * (1.0 + WORSE)
+    ]
 
 
 def conclusions(base: VariantRun, others: Sequence[VariantRun]) -> list[str]:
     """Return sentences on the recommendation, and on what other variants disagree about."""
-    best, remarks = recommended(base, others), _remarks(base, others)
+    best = recommended(base, others)
+    remarks = _remarks(base, [one for one in others if not one.error])
     text = _recommendation(base, best)
     if math.isnan(base.log_evidence):
         text = (
@@ -340,8 +355,8 @@ def conclusions(base: VariantRun, others: Sequence[VariantRun]) -> list[str]:
             "The case is kept unchanged."
         )
         remarks = iter(())
-    failed = [f"'{one.variant.name}'" for one in others if one.error]
-    why = [f"Not compared, because they failed: {', '.join(failed)}."] if failed else []
+    failed = _names_of(one for one in others if one.error)
+    why = [f"Not compared, because they failed: {failed}."] if failed else []
     return [text, *why, *remarks, *_disagreements(best, [base, *others])]
 
 
@@ -367,23 +382,21 @@ def _recommendation(base: VariantRun, best: VariantRun) -> str:
 def _remarks(base: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
     """Iterate over variants with better evidence and worse predictions, and refuted ones."""
     for one in others:
-        if one.gained(base) > GAINED and _worse(one, base):
-            errors = (
-                f"{name} {one.validation.get(name, math.nan):.3g} instead of {error:.3g}"
-                for name, error in base.validation.items()
-                if _worse_at(one, name, error)
-            )
+        if one.gained(base) > GAINED and (worse := _worse_sensors(one, base)):
+            errors = ", ".join(worse)
             yield (
                 f"'{one.variant.name}' fits the assimilated sensors better and predicts validation "
-                f"ones worse ({', '.join(errors)}): it is not recommended."
+                f"ones worse ({errors}): it is not recommended."
             )
-    refuted = [f"'{one.variant.name}'" for one in others if one.gained(base) < -GAINED]
-    if refuted:
-        yield f"The data contradict {', '.join(refuted)}: lower evidence than the case."
-    apart = [one for one in others if not one.error and math.isnan(one.gained(base))]
-    if apart:
-        names = ", ".join(f"'{one.variant.name}'" for one in apart)
+    if refuted := _names_of(one for one in others if one.gained(base) < -GAINED):
+        yield f"The data contradict {refuted}: lower evidence than the case."
+    if names := _names_of(one for one in others if math.isnan(one.gained(base))):
         yield f"The evidence of {names} is missing or counts other readings: it is not compared."
+
+
+def _names_of(runs: Iterable[VariantRun]) -> str:
+    """Return the names of variants in quotes; empty without any."""
+    return ", ".join(f"'{one.variant.name}'" for one in runs)
 
 
 def _disagreements(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
@@ -454,14 +467,17 @@ def _process(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     if source and law.kind == "sensitivity" and not law.jumps:
         yield Variant("source that jumps", (*source, 'law.jumps=["source"]'))
     yield Variant("loss", freed(prepared, Cause("loss", "", "", size=0.1 / time)))
-    values = [Cause("boundary", name, "", size=error) for name in prepared.case.roles("boundary")]
-    offsets = [setting for cause in values for setting in freed(prepared, cause)]
+    offsets = [
+        setting
+        for name in prepared.case.roles("boundary")
+        for setting in freed(prepared, Cause("boundary", name, "", size=error))
+    ]
     if offsets:
         yield Variant("offsets of the boundary values", tuple(offsets))
-    for name in map(str, prepared.case.mesh.boundaries or {}):
-        for kind, size in (("flux", error / time), ("transfer", 0.1 / time)):
-            settings = freed(prepared, Cause(kind, name, "", size=size))
-            yield Variant(NAMES[kind].format(name), settings)
+    terms = (("flux", error / time), ("transfer", 0.1 / time))
+    for name, (kind, size) in product(map(str, prepared.case.mesh.boundaries or {}), terms):
+        settings = freed(prepared, Cause(kind, name, "", size=size))
+        yield Variant(NAMES[kind].format(name), settings)
 
 
 def _sensors(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
@@ -480,20 +496,22 @@ def _fewer(case: Case) -> Iterator[Variant]:
     for key, word in (("offset", "offsets"), ("gain", "gains"), ("at_std", "uncertain positions")):
         stated = [n for n, one in case.roles("sensor").items() if getattr(one, key) is not None]
         yield Variant(f"no {word}", tuple(channel_setting(name, key, "") for name in stated))
-    used = {
-        value
-        for item in (*case.spec.boundary.values(), *case.spec.sources.values())
-        for value in vars(item).values()
-        if isinstance(value, str)
-    }
+    optional = _optional(case)
     for name, unknown in case.spec.unknowns.items():
         key = f"unknowns.{toml_key(name)}"
         if unknown.regions:
             yield Variant(f"one {name} everywhere", (f"{key}.regions=",))
-        known = case.equation.unknowns.get(name)
-        if known is not None and known.optional and name not in used and name != "C":
+        if name in optional:
             unread = (f"{own}=" for own in unread_without(case, name))
             yield Variant(f"no {name}", (f"{key}=", *unread))
+
+
+def _optional(case: Case) -> set[str]:
+    """Return the unknowns that the equation does not need, and no condition or source names."""
+    optional = {name for name, known in case.equation.unknowns.items() if known.optional}
+    for item in (*case.spec.boundary.values(), *case.spec.sources.values()):
+        optional -= {value for value in vars(item).values() if isinstance(value, str)}
+    return optional - {"C"}
 
 
 def _layers(case: Case) -> Iterator[Variant]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -69,9 +70,9 @@ def init(
     console = terminal()
     if not data:
         given = {"--equation": equation, "--time-format": time_format, "--set": settings}
-        given |= {"--skip": None if skip is None else "given"}
-        for option in (name for name, value in given.items() if value):
-            raise ConfigurationError(f"{option} requires --data FILE.csv.")
+        for option, value in {**given, "--skip": skip}.items():
+            if value not in (None, "", []):
+                raise ConfigurationError(f"{option} requires --data FILE.csv.")
         case, table = new_case.write_template(folder)
         console.print(f"Wrote {case} and {table}. Next:")
     else:
@@ -83,11 +84,10 @@ def init(
         new_case.check_free(folder, ["case.toml"])
         found = named(equation or "heat", EQUATIONS, "equation")
         case = folder / "case.toml"
-        read, *others = (
+        first, *others = (
             measured(file, found.time_unit, time_format=time_format, skip=skip) for file in data
         )
-        for other in others:
-            read = read.joined(other)
+        read = reduce(Measured.joined, others, first)
         files = new_case.files_for(read, folder, found)
         _show_read(console, read, found)
         files["case.toml"] = filled(files["case.toml"], parse(settings or []), f"{case}")

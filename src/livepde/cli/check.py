@@ -14,7 +14,7 @@ from rich.markup import escape
 from livepde.cases import Case, Prepared
 from livepde.cases.data import policy_of, source_text
 from livepde.cases.preview import MOST_SAMPLES, advise, predicted, preview
-from livepde.cli.options import CaseArgument, CodeOption, DataOption, SetOption, load_case
+from livepde.cli.options import CaseArgument, CodeOption, DataOption, SetOption, load_case, option
 from livepde.cli.printing import CHECK_FAILED, extent, print_table, terminal
 from livepde.runs import Table, sampling_findings
 from livepde.samples import by_name
@@ -35,7 +35,7 @@ def check(
     allow_code: CodeOption = False,
     settings: SetOption = None,
     advised: Annotated[
-        bool, typer.Option("--advise", help="Recommend a position for one more point sensor.")
+        bool, option("Recommend a position for one more point sensor.", "--advise")
     ] = False,
 ) -> None:
     """Check a case and its data, and which unknowns its sensors can identify.
@@ -223,7 +223,7 @@ def _show_wiring(console: Console, case: Case) -> None:
                 f"{policy.longest(habit):g} {unit}".rstrip(),
                 policy.keeps(name),
                 "skip" if column.needed else spec.gaps if spec.drives else "continue",
-                spec.between if spec.drives and not column.noise_of else "",
+                spec.between if spec.drives else "",  # only sensors have a column of noise
             )
         )
     columns = ("channel", "role", "column", "valid", "wait", "repeated", "missing", "between")

@@ -80,9 +80,7 @@ def compare(
             metavar="FILE.toml",
         ),
     ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="With --write: replace an existing file.")
-    ] = False,
+    force: Annotated[bool, option("With --write: replace an existing file.", "--force")] = False,
     figure: Annotated[
         Path | None, option("Draw the intervals of all variants to a figure.", metavar="FILE.png")
     ] = None,
@@ -98,21 +96,15 @@ def compare(
     By hand:  livepde compare mycase/case.toml --variant "offset: channels.T_10.offset='0.2 K'"
     Of a run: livepde compare runs/mycase --write mycase/better.toml
     """
-    given = [variant_of(text) for text in variants or ()]
-    named, settings = case, settings or []
-    if named.is_dir():
-        opened = runs.open(named)
-        case, settings = opened.case_file(), [*opened.settings, *settings]
-        data = data or opened.data_file
+    given = list(map(variant_of, variants or ()))
+    named = case
+    case, settings, data = _case_of(named, settings or [], data)
     loaded = load_case(case, allow_code, settings)
     if loaded.goes_on(data) or data == "-":
         raise ConfigurationError(
             "compare requires complete data. Add --data FILE with recorded rows."
         )
-    if write is not None:
-        _check_target(write, case, force)
-    if figure is not None:
-        _check_figure(figure)
+    _check_targets(write, figure, case, force)
     with of_a_run(named != case):
         prepared = loaded.prepare(data)
     run = partial(_run, case, settings, data=data, allow_code=allow_code)
@@ -124,22 +116,10 @@ def compare(
     found += _all(run, chosen, jobs, as_json)
     best = recommended(base, found)
     notes = conclusions(base, found)
-    if write is not None and best is base:
-        notes.append(f"{write} is not written: the case itself is recommended.")
-    elif write is not None:
-        text = read_text(case)
-        for each in (settings, best.variant.settings):
-            document = tomlkit.parse(text)
-            with_members(document, parse(each), case, allow_code)
-            text = filled(tomlkit.dumps(document), parse(each), str(case))
-        write_bytes(write, text.encode())
-        of = "" if data is None else f" --data {data}"  # the case may name other data
-        notes.append(f"Wrote {write}: livepde run {write}{of}")
-    if figure is not None and base.estimates:
-        _draw([base, *found], best, figure)
-        notes.append(f"Wrote {figure}.")
-    elif figure is not None:
-        notes.append(f"{figure} is not written: no unknown of the case is a number.")
+    if write is not None:
+        notes.append(_written(write, case, settings, best.variant, data, allow_code))
+    if figure is not None:
+        notes.append(_drawn([base, *found], best, figure))
     present(
         _tables(base, found, best),
         [],
@@ -150,6 +130,37 @@ def compare(
         recommended=best.variant.name,
         variants=[one.to_dict() for one in (base, *found)],
     )
+
+
+def _case_of(
+    case: Path, settings: list[str], data: str | None
+) -> tuple[Path, list[str], str | None]:
+    """Return case file, settings and data: those that are named, or of the run that is."""
+    if not case.is_dir():
+        return case, settings, data
+    run = runs.open(case)
+    return run.case_file(), [*run.settings, *settings], data or run.data_file
+
+
+def _written(
+    target: Path,
+    case: Path,
+    settings: Sequence[str],
+    best: Variant,
+    data: str | None,
+    allow_code: bool,
+) -> str:
+    """Write the recommended variant of a case, if it is another one; return a sentence on it."""
+    if not best.settings:
+        return f"{target} is not written: the case itself is recommended."
+    text = read_text(case)
+    for each in (settings, best.settings):
+        document = tomlkit.parse(text)
+        with_members(document, parse(each), case, allow_code)
+        text = filled(tomlkit.dumps(document), parse(each), str(case))
+    write_bytes(target, text.encode())
+    of = "" if data is None else f" --data {data}"  # the case may name other data
+    return f"Wrote {target}: livepde run {target}{of}"
 
 
 def _all(
@@ -188,13 +199,10 @@ def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> 
         gained = one.gained(base)
         return math.isnan(gained), -gained if math.isfinite(gained) else 0.0
 
-    def named(one: VariantRun) -> str:
-        return one.variant.name + (" *" if one is best else "")
-
     ended = sorted((one for one in (base, *found) if not one.error), key=rank)
     rows = [
         (
-            named(one),
+            _marked(one, best),
             one.level,
             shown(one.gained(base), "+.1f"),
             shown(one.misfit, ".2g"),
@@ -205,16 +213,7 @@ def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> 
     ]
     columns = ("variant", "verdict", "evidence", "/ noise", "validation", "unknowns")
     tables = [Table("Variants (* recommended)", columns, rows)]
-    labels = dict.fromkeys(label for one in (base, *ended) for label in one.estimates)
-    each: list[tuple[str, ...]] = []
-    for label in labels:
-        for one in ended:
-            if (known := one.estimates.get(label)) is not None:
-                unknown = f"{label} in {known.unit}" if known.unit else label
-                value, ends = digits(known.value, known.std)[0], (known.low, known.high)
-                mark = "apart" if label in one.apart(base) else ""
-                each.append((unknown, named(one), value, interval(*ends, known.std), mark))
-    if each:
+    if each := _estimates(base, ended, best):
         tables.append(Table("Estimates", ("unknown", "variant", "value", "95 %", ""), each))
     failed = [(one.variant.name, one.error) for one in found if one.error]
     if failed:
@@ -223,16 +222,39 @@ def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> 
     return [*tables, Table("Settings of the variants", ("variant", "settings"), changed)]
 
 
-def _draw(runs: Sequence[VariantRun], best: VariantRun, target: Path) -> None:
-    """Draw the intervals of each unknown, those of the case first."""
+def _marked(one: VariantRun, best: VariantRun) -> str:
+    """Return the name of a variant, with a mark if it is recommended."""
+    return one.variant.name + (" *" if one is best else "")
+
+
+def _estimates(
+    base: VariantRun, ended: Sequence[VariantRun], best: VariantRun
+) -> list[tuple[str, ...]]:
+    """Return a row for each unknown and variant."""
+    rows: list[tuple[str, ...]] = []
+    for label in dict.fromkeys(label for one in (base, *ended) for label in one.estimates):
+        for one in ended:
+            if (known := one.estimates.get(label)) is not None:
+                unknown = f"{label} in {known.unit}" if known.unit else label
+                value, ends = digits(known.value, known.std)[0], (known.low, known.high)
+                mark = "apart" if label in one.apart(base) else ""
+                row = unknown, _marked(one, best), value, interval(*ends, known.std), mark
+                rows.append(row)
+    return rows
+
+
+def _drawn(runs: Sequence[VariantRun], best: VariantRun, target: Path) -> str:
+    """Draw the intervals of each unknown, those of the case first; return a sentence on it."""
     from livepde.plots import figure, intervals
 
+    if not runs[0].estimates:
+        return f"{target} is not written: no unknown of the case is a number."
     labels = list(runs[0].estimates)
     wide = min(len(labels), WIDE)
     drawn, axes = figure(-(-len(labels) // wide), wide, "Variants (* recommended)")
     for label, ax in zip(labels, axes, strict=False):
         of = {
-            f"{one.variant.name}{' *' if one is best else ''} ({one.level})": one.estimates[label]
+            f"{_marked(one, best)} ({one.level})": one.estimates[label]
             for one in runs
             if label in one.estimates
         }
@@ -242,10 +264,18 @@ def _draw(runs: Sequence[VariantRun], best: VariantRun, target: Path) -> None:
     for ax in axes[len(labels) :]:
         ax.set_visible(False)
     drawn.savefig(target)
+    return f"Wrote {target}."
+
+
+def _check_targets(case_target: Path | None, figure: Path | None, case: Path, force: bool) -> None:
+    """Refuse files that would be wrong where they are to be written, before anything runs."""
+    if case_target is not None:
+        _check_target(case_target, case, force)
+    if figure is not None:
+        _check_figure(figure)
 
 
 def _check_target(target: Path, case: Path, force: bool) -> None:
-    """Refuse a file for the better case that would be wrong there, before anything runs."""
     if target.exists() and not force:
         raise ConfigurationError(f"{target} exists: add --force to replace it.")
     if target.resolve() == case.resolve():
@@ -257,7 +287,6 @@ def _check_target(target: Path, case: Path, force: bool) -> None:
 
 
 def _check_figure(target: Path) -> None:
-    """Refuse a figure that cannot be written, before anything runs."""
     known = figure_class()().canvas.get_supported_filetypes()
     if target.suffix.removeprefix(".").lower() not in known:
         raise ConfigurationError(f"--figure {target}: name a file that ends in .png, .pdf or .svg.")

@@ -16,7 +16,7 @@ from rich.markup import escape
 
 from livepde import __version__
 from livepde.cli.options import JsonOption, OutOption, names_in, option
-from livepde.cli.printing import CHECK_FAILED, can_draw, named, present, show, terminal
+from livepde.cli.printing import can_draw, exit_if_failed, named, present, show, terminal
 from livepde.runs import Outcome, RunWriter, free_path
 
 # The facts are those of CITATION.cff, as a test checks; the year is that of the release.
@@ -90,8 +90,8 @@ def run_experiment(
         _finish(writer, outcome, terminal(err=True))
     shown = outcome.tables, outcome.checks, outcome.notes
     present(*shown, as_json=as_json, command=" ".join(command))
-    if as_json and not outcome.ok:
-        raise typer.Exit(CHECK_FAILED)
+    if as_json:
+        exit_if_failed(outcome.checks)
 
 
 def _finish(writer: RunWriter, outcome: Outcome, console: Console) -> Iterable[str]:

@@ -15,7 +15,7 @@ from rich.markup import escape
 
 from livepde import runs
 from livepde.cli import options
-from livepde.cli.printing import CHECK_FAILED, can_draw, figures_of, present, terminal
+from livepde.cli.printing import can_draw, exit_if_failed, figures_of, present, terminal
 from livepde.dates import dated
 from livepde.errors import ConfigurationError, RunError
 from livepde.runs.directory import attempted, drawn_into, markdown, write_text
@@ -32,10 +32,10 @@ def report(
     folder: options.RunArgument,
     theory: Annotated[
         bool,
-        typer.Option(
-            "--theory",
-            help="Evaluate the paper's theory for the run: constants, excitation, conditions, T*. "
+        options.option(
+            "Evaluate the paper's theory for the run: constants, excitation, conditions, T*. "
             "Processes the samples again and writes theory.md.",
+            "--theory",
         ),
     ] = False,
     data: Annotated[
@@ -79,8 +79,8 @@ def report(
         run=str(folder),
         status=opened.status,
     )
-    if as_json and not all(item.ok for item in checks):
-        raise typer.Exit(CHECK_FAILED)
+    if as_json:
+        exit_if_failed(checks)
 
 
 def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: bool) -> None:
@@ -121,21 +121,14 @@ def export(
     Example:  livepde export runs/mycase mycase.nc mycase.csv mycase.html
     ParaView: livepde export runs/mycase mycase.xdmf
     """
-    from livepde.runs.exported import FORMATS, NEEDS, need, refuse_file
+    from livepde.runs.exported import FORMATS, check_target, need, refuse_file
     from livepde.runs.exported import export as write
 
     opened = runs.open(folder)
-    known = [*FORMATS, REPORT]
     for target in targets:  # all of them, before one is written
-        ending = target.suffix.lower()
-        if ending not in known:
-            raise ConfigurationError(
-                f"{target}: there is no format '{target.suffix}'; expected one of "
-                f"{', '.join(known)}."
-            )
-        if ending == REPORT:
+        check_target(target, [*FORMATS, REPORT])
+        if target.suffix.lower() == REPORT:
             need(target, ["plotly", "jinja2"], "dashboard")
-        need(target, NEEDS.get(ending, []))
         refuse_file(target, force)
     moment = None if at is None else _moment(at, opened.dataset)
     for target in targets:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
@@ -23,7 +23,7 @@ from livepde.cli.options import CaseArgument, CodeOption, JsonOption, SetOption,
 from livepde.cli.printing import CHECK_FAILED, INTERRUPTED, present
 from livepde.cli.run import concluded, run_batch, writer_of
 from livepde.errors import ConfigurationError, DataError, LivepdeError, RunError
-from livepde.records import STATUS_CODES
+from livepde.records import STATUS_CODES, scalars
 from livepde.runs import JOURNAL, Check, Driven, Run, RunWriter, Table
 from livepde.streams import DataTable
 
@@ -89,13 +89,12 @@ def fleet(
         ),
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Resume the runs in --out, and start the missing ones.")
+        bool, option("Resume the runs in --out, and start the missing ones.", "--resume")
     ] = False,
     separately: Annotated[
         bool,
-        typer.Option(
-            "--separately",
-            help="Run each member separately, with results identical to 'livepde run'.",
+        option(
+            "Run each member separately, with results identical to 'livepde run'.", "--separately"
         ),
     ] = False,
     as_json: JsonOption = False,
@@ -110,10 +109,7 @@ def fleet(
 
     Example:  livepde fleet rod/case.toml --members rods.csv --out rods --jobs 4
     """
-    if resume and out is None:
-        raise ConfigurationError("--resume requires --out: the folder of the runs to resume.")
-    if jobs == 0:
-        raise ConfigurationError("--jobs 0: give at least 1, or -1 for one on each processor.")
+    _refuse(resume, out, jobs)
     rows = _read(members)
     name = load_case(case, allow_code, settings).name
     folder = out or runs.free_path(Path("runs") / name)
@@ -124,13 +120,21 @@ def fleet(
     wrong = [item for item in ended if item.status == "failed" or item.failed]
     notes = [*_how(ended), *told, *_complaints(ended)]
     lines = [f"[bold]Run directories: {escape(str(folder))}[/]"]
-    cells = [tuple(row) for row in summary.itertuples(index=False)]
+    cells = list(summary.itertuples(index=False, name=None))
     tables = [Table(f"{len(cells)} runs", list(map(str, summary.columns)), cells)]
     present(tables, [], notes, as_json=as_json, lines=lines, run=str(folder), failed=len(wrong))
-    if any(item.status == "interrupted" for item in ended):
+    if _interrupted(ended):
         raise typer.Exit(INTERRUPTED)
     if wrong:
         raise typer.Exit(CHECK_FAILED)
+
+
+def _refuse(resume: bool, out: Path | None, jobs: int) -> None:
+    """Refuse options that do not fit together."""
+    if resume and out is None:
+        raise ConfigurationError("--resume requires --out: the folder of the runs to resume.")
+    if jobs == 0:
+        raise ConfigurationError("--jobs 0: give at least 1, or -1 for one on each processor.")
 
 
 def _read(path: Path) -> list[Member]:
@@ -226,13 +230,17 @@ class FleetRunner:
         """Run members as `livepde run` would, as blocks where they can."""
         members = {row.name: row for row in rows}
         ready, ended = self._prepared(rows)
-        begun = {name: GOES_ON for name in ready if (self._target(name) / JOURNAL).exists()}
-        new = {name: one for name, one in ready.items() if name not in begun}
+        new, begun = dict[str, Prepared](), dict[str, str]()
+        for name, one in ready.items():
+            if (self._target(name) / JOURNAL).exists():
+                begun[name] = GOES_ON
+            else:
+                new[name] = one
         together, apart = ([], dict.fromkeys(new, ASKED)) if self.separately else blocks(new)
         for block in together:
-            ended |= self._together(block, members) if not _interrupted(ended) else {}
+            ended |= self._together(block, members) if not _interrupted(ended.values()) else {}
         for name, why in (apart | begun).items():
-            if not _interrupted(ended):
+            if not _interrupted(ended.values()):
                 ended[name] = replace(self._alone(members[name], ready[name]), apart=why)
         return _in_order(rows, ended)
 
@@ -339,9 +347,9 @@ class FleetRunner:
         return _outcome_of(name, driven, dataset, checks)
 
 
-def _interrupted(ended: Mapping[str, MemberOutcome]) -> bool:
+def _interrupted(ended: Iterable[MemberOutcome]) -> bool:
     """Return whether Ctrl-C has ended a run, and with it all."""
-    return any(item.status == "interrupted" for item in ended.values())
+    return any(item.status == "interrupted" for item in ended)
 
 
 def _outcome_of(
@@ -349,7 +357,7 @@ def _outcome_of(
 ) -> MemberOutcome:
     unknowns = {
         label: (float(dataset[label][-1]), float(dataset[f"{label}_std"][-1]))
-        for label in filter(None, dataset.attrs["scalars"].split("\n"))
+        for label in scalars(dataset)
         if dataset.sizes["time"]
     }
     failed = tuple(check.name for check in checks if not check.ok)
@@ -425,17 +433,11 @@ def in_parts(
     A part whose worker died is run again; `run` has to resume from its run directories. `told`
     receives a sentence for each loss of a worker.
     """
-    try:
+    with ExitStack() as stack:
+        _configure(backend, stack)
         from joblib import Parallel, delayed, effective_n_jobs
         from joblib.parallel import get_active_backend
-    except ImportError as error:
-        raise ConfigurationError(
-            "--jobs requires joblib: pip install 'livepde[fleet]'. Without --jobs, members run one "
-            "after the other."
-        ) from error
-    with ExitStack() as stack:
-        if backend is not None:
-            _configure(backend, stack)
+
         jobs = min(effective_n_jobs(jobs), len(rows))
         count = max(jobs, -(-len(rows) // LARGEST))
         parts = {k: rows[k::count] for k in range(count)}
@@ -470,10 +472,17 @@ def _attempt(
         return k, run(part)
 
 
-def _configure(backend: Backend, stack: ExitStack) -> None:
-    """Configure the backend of joblib until the stack is closed."""
-    from joblib import parallel_config
-
+def _configure(backend: Backend | None, stack: ExitStack) -> None:
+    """Configure the backend of joblib, if one is named, until the stack is closed."""
+    try:
+        from joblib import parallel_config
+    except ImportError as error:
+        raise ConfigurationError(
+            "--jobs requires joblib: pip install 'livepde[fleet]'. Without --jobs, members run one "
+            "after the other."
+        ) from error
+    if backend is None:
+        return
     if backend is Backend.ray:
         try:
             from ray.util.joblib import register_ray

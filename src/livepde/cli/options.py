@@ -27,14 +27,12 @@ def argument(text: str, **more: Any) -> Any:
 
 
 JsonOption = Annotated[
-    bool, typer.Option("--json", help="Print one JSON object. If a check fails, exit with code 1.")
+    bool, option("Print one JSON object. If a check fails, exit with code 1.", "--json")
 ]
 OutOption = Annotated[Path | None, option("Run directory to create. Default: a new one in runs/.")]
 CodeOption = Annotated[
     bool,
-    typer.Option(
-        "--allow-code", help="Load the Python code (equation or reader) that the case names."
-    ),
+    option("Load the Python code (equation or reader) that the case names.", "--allow-code"),
 ]
 EnvOption = Annotated[
     list[str] | None,
@@ -55,7 +53,7 @@ SetOption = Annotated[
     ),
 ]
 RunArgument = Annotated[Path, argument("A run directory.", metavar="RUN")]
-ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite existing files.")]
+ForceOption = Annotated[bool, option("Overwrite existing files.", "--force")]
 DataOption = Annotated[
     str | None, option("Use this data instead of the case's (.csv, .jsonl, .parquet).")
 ]

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
@@ -88,6 +89,12 @@ def present(
     content["tables"] = [item.to_dict() for item in shown]
     content["notes"] = list(notes)
     sys.stdout.write(json.dumps(plain(content), ensure_ascii=False) + "\n")
+
+
+def exit_if_failed(checks: Iterable[Check]) -> None:
+    """End the command with the exit code of failed checks, if one failed."""
+    if not all(item.ok for item in checks):
+        raise typer.Exit(CHECK_FAILED)
 
 
 def show(

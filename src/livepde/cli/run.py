@@ -65,19 +65,19 @@ def run(
     out: options.OutOption = None,
     resume: Annotated[
         bool,
-        typer.Option(
-            "--resume",
-            help="Resume the run in --out, with the same results as without the interruption. If "
+        options.option(
+            "Resume the run in --out, with the same results as without the interruption. If "
             "there is no run, start one. Standard input is then read as with --realtime, and rows "
             "that were sent before are only counted.",
+            "--resume",
         ),
     ] = False,
     realtime: Annotated[
         bool,
-        typer.Option(
-            "--realtime",
-            help="Run online: late, malformed and missing rows are counted and do not end the run. "
+        options.option(
+            "Run online: late, malformed and missing rows are counted and do not end the run. "
             "A complete file is replayed. This is the default if the source is live.",
+            "--realtime",
         ),
     ] = False,
     speed: Annotated[
@@ -108,9 +108,7 @@ def run(
     ] = "",
     estimates: Annotated[
         bool,
-        typer.Option(
-            "--estimates", help="Print each estimate to standard output as a line of JSON."
-        ),
+        options.option("Print each estimate to standard output as a line of JSON.", "--estimates"),
     ] = False,
     log: Annotated[LogKind, typer.Option(help="Format of the log of a live run.")] = LogKind.text,
     as_json: options.JsonOption = False,
@@ -127,45 +125,46 @@ def run(
     Service:  livepde run mycase/case.toml --realtime --out runs/mycase --resume --listen 9100
     """
     loaded = options.load_case(case, allow_code, settings)
-    source = sys.stdin if data == "-" else data
     own = loaded.goes_on(data)
-    goes_on = own or source is sys.stdin
-    # What is sent to a run that is gone on with begins anywhere: times count from the first start.
-    live = own or realtime or (resume and source is sys.stdin)
-    allowed = tuple(allow_env or ())
-    how = LiveOptions(source, goes_on, speed, listen, watch, token, estimates, allowed)
+    how = LiveOptions(
+        data, own, realtime, resume, speed, listen, watch, token, estimates, allow_env
+    )
     folder = _run_directory(loaded, out, resume)
-    _refuse(how, live, as_json)
+    _refuse(how, as_json)
     write = partial(writer_of, loaded, folder, settings or (), resume, ["livepde", *sys.argv[1:]])
     with ExitStack() as stack:
-        if live:
+        if how.live:
             configure_logging(log.value)
             writer, taken = run_live(loaded, how, folder, write, stack)
         else:
-            writer, taken = run_batch(loaded.prepare(source), folder, write, stack, quiet=as_json)
+            prepared = loaded.prepare(how.source)
+            writer, taken = run_batch(prepared, folder, write, stack, quiet=as_json)
         prepared, driven = taken
         # A service that is stopped has seconds: `livepde report` draws its figures.
-        draw = not (live and driven.status == "interrupted")
+        draw = not (how.live and driven.status == "interrupted")
         found = concluded(prepared, prepared.identifier, driven, writer, draw=draw)
     if driven.error is not None:
         raise driven.error
     if not estimates:  # which are all that standard output is for then
-        where = escape(str(folder))
-        printing.present(
-            found.tables,
-            found.checks,
-            found.notes,
-            as_json=as_json,
-            title=f"[bold]{escape(loaded.title)}[/]  {len(driven.result)} samples",
-            lines=[f"[bold]Run directory: {where}[/]", f"To view it: livepde watch {where}"],
-            dataset=found.dataset,
-            run=str(folder),
-            status=driven.status,
-        )
-    if driven.status == "interrupted" and not live:  # a live run usually ends by a signal
+        _show(loaded.title, folder, driven, found, as_json)
+    if driven.status == "interrupted" and not how.live:  # a live run usually ends by a signal
         raise typer.Exit(printing.INTERRUPTED)
-    if as_json and not all(item.ok for item in found.checks):
-        raise typer.Exit(printing.CHECK_FAILED)
+    printing.exit_if_failed(found.checks if as_json else ())
+
+
+def _show(title: str, folder: Path, driven: Driven, found: Conclusion, as_json: bool) -> None:
+    where = escape(str(folder))
+    printing.present(
+        found.tables,
+        found.checks,
+        found.notes,
+        as_json=as_json,
+        title=f"[bold]{escape(title)}[/]  {len(driven.result)} samples",
+        lines=[f"[bold]Run directory: {where}[/]", f"To view it: livepde watch {where}"],
+        dataset=found.dataset,
+        run=str(folder),
+        status=driven.status,
+    )
 
 
 def _run_directory(loaded: Case, out: Path | None, resume: bool) -> Path:
@@ -179,7 +178,7 @@ def _run_directory(loaded: Case, out: Path | None, resume: bool) -> Path:
     return out
 
 
-def _refuse(how: LiveOptions, live: bool, as_json: bool) -> None:
+def _refuse(how: LiveOptions, as_json: bool) -> None:
     """Refuse options that exclude each other, before anything is read."""
     beside_only = {
         "--speed": how.speed is not None,
@@ -188,7 +187,7 @@ def _refuse(how: LiveOptions, live: bool, as_json: bool) -> None:
         "--estimates": how.estimates,
     }
     for name, given in beside_only.items():
-        if given and not live:
+        if given and not how.live:
             raise ConfigurationError(f"{name} requires --realtime.")
     if as_json and how.estimates:
         raise ConfigurationError("--json and --estimates both print to standard output. Keep one.")
@@ -276,14 +275,15 @@ def concluded(
     expected = loaded.expected
     checks = attempted("The checks", lambda: runs.checks_of(expected, dataset), nothing, notes)
     notes[:0] = [*loaded.notes, *found.sentences]
-    if len(driven.result) and isinstance(loaded.law, SensitivityLaw):
-        notes += attempted(
-            "Identifiability", lambda: identifiability(identifier).sentences, nothing, notes
-        )
-    if len(driven.result) and loaded.spec.output.smoothed:
-        smooth = partial(_with_smoothed, prepared, driven, dataset)
-        dataset, told = attempted("The smoother", smooth, (dataset, nothing), notes)
-        notes += told
+    if len(driven.result):
+        if isinstance(loaded.law, SensitivityLaw):
+            notes += attempted(
+                "Identifiability", lambda: identifiability(identifier).sentences, nothing, notes
+            )
+        if loaded.spec.output.smoothed:
+            smooth = partial(_with_smoothed, prepared, driven, dataset)
+            dataset, told = attempted("The smoother", smooth, (dataset, nothing), notes)
+            notes += told
     if driven.status == "interrupted":
         notes.append(f"Interrupted after {len(driven.result)} samples.")
     if driven.error is not None:
@@ -337,14 +337,32 @@ def _with_smoothed(
 class LiveOptions:
     """Options of a live run, as given to the command."""
 
-    data: str | Iterable[str] | None  # instead of the case's own source
-    goes_on: bool  # whether the source continues by itself, at its own pace
+    data: str | None  # instead of the case's own source
+    own: bool  # whether the source of the case, or a file in its place, continues by itself
+    realtime: bool
+    resume: bool
     speed: float | None
     listen: str | None
     page: str | None
     token: str
     estimates: bool
-    allow_env: tuple[str, ...]
+    allow_env: Sequence[str] | None
+
+    @property
+    def source(self) -> str | Iterable[str] | None:
+        """The data, or lines of standard input."""
+        return sys.stdin if self.data == "-" else self.data
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether the source continues at its own pace."""
+        return self.own or self.data == "-"
+
+    @property
+    def live(self) -> bool:
+        """Whether to run online."""
+        # What is sent to a run that is resumed begins anywhere: times count from the first start.
+        return self.own or self.realtime or (self.resume and self.data == "-")
 
     @property
     def pace(self) -> float:
@@ -363,7 +381,9 @@ def run_live(
     among it the journal, from which the result reads.
     """
     wiring = stack.enter_context(
-        LiveCase(case, how.data, path=folder / JOURNAL, pace=how.pace, allow_env=how.allow_env)
+        LiveCase(
+            case, how.source, path=folder / JOURNAL, pace=how.pace, allow_env=how.allow_env or ()
+        )
     )
     health, stopping = partial(_health, wiring), threading.Event()
     sinks = _observers(case, how, stack, health)
@@ -372,7 +392,7 @@ def run_live(
     for library in ("xarray", "pint"):
         import_module(library)
     if how.page is not None:
-        _show(how.page, how.token, folder, stack)
+        _serve_page(how.page, how.token, folder, stack)
     with runs.stopped_by_signals(stopping, lambda: True):
         try:
             live = wiring.live(sinks, stopping)
@@ -400,7 +420,7 @@ def _health(wiring: LiveCase) -> Mapping[str, Any]:
     }
 
 
-class _Heartbeat:
+class _Heartbeat(Sink):
     """A sink that logs the progress of a run at intervals."""
 
     def __init__(self) -> None:
@@ -414,9 +434,6 @@ class _Heartbeat:
         numbers = estimate.parameters.items()
         shown = ", ".join(f"{label} = {value:.6g} +- {std:.2g}" for label, (value, std) in numbers)
         LOG.info("t = %g: %s", estimate.t, shown or estimate.status.code)
-
-    def close(self) -> None:
-        """Do nothing: there are no resources to release."""
 
 
 def _observers(
@@ -440,7 +457,7 @@ def _observers(
     return sinks
 
 
-def _show(page: str, token: str, folder: Path, stack: ExitStack) -> None:
+def _serve_page(page: str, token: str, folder: Path, stack: ExitStack) -> None:
     """Serve the page from a separate process: drawing must not delay steps."""
     watch = [sys.executable, "-m", "livepde", "watch", str(folder), "--address", page]
     secret = {"LIVEPDE_TOKEN": token} if token else {}

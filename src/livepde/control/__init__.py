@@ -1,7 +1,5 @@
 """Control with an identified model: reduced models, trust in estimates, controllers, loops."""
 
-from __future__ import annotations
-
 from livepde.control.controllers import LQ, MPC, Controller, Decision, Goal, Known, Plan
 from livepde.control.estimators import Estimator, Kalman, Learned, Trust
 from livepde.control.loop import Action, Loop

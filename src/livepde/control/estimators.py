@@ -70,12 +70,12 @@ class Kalman:
                 raise ConfigurationError(
                     f"Kalman: there is no channel '{name}'; the model has {list(model.channels)}."
                 )
-            if not (np.isfinite(size) and size >= 0.0):
+            if not 0.0 <= size < np.inf:
                 raise ConfigurationError(
                     f"Kalman: the standard deviation of '{name}' must be a number, at least 0; "
                     f"got {size}."
                 )
-        if not (np.isfinite(period) and period > 0.0):
+        if not 0.0 < period < np.inf:
             raise ConfigurationError(f"Kalman: period must be a positive number; got {period}.")
         self.model = model
         self.period = period
@@ -84,7 +84,7 @@ class Kalman:
         self._walk = np.array(list(offset.values()))
         self._noise = np.asarray(model.sensors.noise)
         self._t = np.nan
-        self.set(q or {})
+        self.set(q)
         x = model.start if x is None else np.asarray(x, dtype=float)
         if x.shape != (model.size,):
             raise ConfigurationError(
@@ -98,7 +98,7 @@ class Kalman:
         """Unknown numbers of the model, shape (m,)."""
         return self._q
 
-    def set(self, q: Mapping[str, float]) -> None:
+    def set(self, q: Mapping[str, float] | None) -> None:
         """Change the unknown numbers; those that are not named are set to the prior."""
         self._q = self.model.given(q)
         self._usual = self._over(self.period)
@@ -123,12 +123,8 @@ class Kalman:
 
         Early and late samples are predicted over their actual interval.
 
-        Raises
-        ------
-        SampleError
-            Wrong shape, text, infinity, a date, or a sensor that does not exist.
-        TimeOrderError
-            t is not later than the sample before.
+        Raises `SampleError`: wrong shape, text, infinity, a date, or a sensor that does not exist.
+        Raises `TimeOrderError`: t is not later than the sample before.
         """
         t = number(t, "time t")
         if not math.isfinite(t):

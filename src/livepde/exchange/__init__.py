@@ -1,7 +1,5 @@
 """Embedding in other programs: co-simulation units (FMI) and online learners."""
 
-from __future__ import annotations
-
 from livepde.exchange.fmu_export import export_fmu
 from livepde.exchange.regressor import OnlineRegressor, river_regressor
 

@@ -42,10 +42,7 @@ class OnlineRegressor:
     def learn_one(self, x: Mapping[str, Any], y: Any) -> None:
         """Learn from one sample; `estimate.status` shows whether the step succeeded.
 
-        Raises
-        ------
-        DataError
-            The sample is invalid, as for `Identifier.step`.
+        Raises `DataError`: the sample is invalid, as for `Identifier.step`.
         """
         t, inputs = self._features(x)
         targets = dict(y or {}) if isinstance(y, Mapping | None) else {self._only(): y}
@@ -56,10 +53,7 @@ class OnlineRegressor:
 
         The prediction is None if the step to that time fails.
 
-        Raises
-        ------
-        DataError
-            The features are invalid, as for `Identifier.forecast`.
+        Raises `DataError`: the features are invalid, as for `Identifier.forecast`.
         """
         t, inputs = self._features(x)
         found = self.current.forecast(t, inputs)
@@ -86,10 +80,7 @@ def river_regressor(identifier: Identifier, time: str = "t") -> Any:
 
     With several sensors it is a multi-target regressor.
 
-    Raises
-    ------
-    ConfigurationError
-        River is not installed.
+    Raises `ConfigurationError`: River is not installed.
     """
     try:
         from river import base

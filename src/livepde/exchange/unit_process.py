@@ -181,10 +181,8 @@ def of_case(case: Case, origin: datetime | None = None) -> UnitProcess:
 
     `origin`: the date of t = 0, if the times of the case's data are dates.
 
-    Raises
-    ------
-    CaseError
-        A channel is late, or has a column of noise: an input of the unit has neither.
+    Raises `CaseError`: a channel is late, or has a column of noise: an input of the unit has
+    neither.
     """
     refuse_late(case)
     ports = {}

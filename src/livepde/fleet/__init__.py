@@ -1,7 +1,5 @@
 """Many identifications of one model at once."""
 
-from __future__ import annotations
-
 from livepde.fleet.estimate import FleetEstimate, FleetRecords, FleetResult
 from livepde.fleet.fleet import Fleet
 from livepde.fleet.shard import Shard, ShardEstimates

@@ -210,10 +210,9 @@ class FleetResult:
             }
         )
         for label in layout.scalars:
-            pairs = [row.parameters[label] for row in rows]
+            pairs = self._table([np.transpose(row.parameters[label]) for row in rows], 2)
             for k, name in enumerate((label, f"{label}_std")):
-                values = self._table([pair[k] for pair in pairs])
-                data[name] = (both, values, dict(layout.numbers[name]))
+                data[name] = (both, pairs[..., k], dict(layout.numbers[name]))
         unit = {"units": layout.sensor_unit}
         innovations = self._series("innovation", len(layout.sensors))
         data["innovation"] = ((*both, "sensor"), innovations, unit)
@@ -223,13 +222,17 @@ class FleetResult:
         data["status"] = (both, self._series("status"), dict(STATUS_FLAGS))
         steps = self._series("steps")
         data["steps"] = (both, steps.astype(np.int32), {"long_name": "substeps taken"})
-        nothing = np.full(len(self.members), np.nan)  # of a law at samples without a number
-        for name in dict.fromkeys(chain.from_iterable(row.diagnostics for row in rows)):
-            values = self._table([row.diagnostics.get(name, nothing) for row in rows])
+        for name, values in self._diagnostics():
             # A diagnostic may have the name of an unknown, which comes first.
             data[f"{NOTE}{name}" if name in data else name] = (both, values)
         data.attrs["scalars"] = "\n".join(layout.scalars)
         return data
+
+    def _diagnostics(self) -> Iterator[tuple[str, Array]]:
+        """Iterate over the diagnostics of the law by name, NaN at samples without one."""
+        nothing = np.full(len(self.members), np.nan)
+        for name in dict.fromkeys(chain.from_iterable(row.diagnostics for row in self._rows)):
+            yield name, self._table([row.diagnostics.get(name, nothing) for row in self._rows])
 
     def _series(self, name: str, *more: int) -> Array:
         return self._table([getattr(row, name) for row in self._rows], *more)

@@ -117,17 +117,12 @@ class Fleet:
         self.law = law
         self.problem = self._one.problem
         # Laws evaluate this description on other meshes: it has to be that of all members.
-        if any(u0 is not u0s[0] for u0 in u0s):
+        if len({*map(id, u0s)}) > 1:
             self.problem = replace(self.problem, initial=None)
         self._work = law.prepare(self.problem)
-        self._q0 = [model.initial_parameter(q) for q in q0s]
+        self._q0 = list(map(model.initial_parameter, q0s))
         self._u0 = [model.initial_values(0.0 if u is None else u) for u in u0s]
-        # Boundary values at t0 that u0 states, shape (members, channels), NaN where it does not.
-        self._stated = np.full((len(self.members), len(self.inputs)), np.nan)
-        for k, u in enumerate(u0s):
-            if k == 0 or u is not u0s[k - 1]:
-                stated = model.boundary_readings(u)
-            self._stated[k] = [stated.get(name, np.nan) for name in self.inputs]
+        self._stated = self._stated_at_start(u0s)
         self.note = law.stepped_alone(self._work)
         self._errors = [initial_errors(model, one) for one in off]
         self._engine = self._stepper(made_of, u0s)
@@ -146,6 +141,15 @@ class Fleet:
         self._starts: dict[int, Identifier] = {}
         if not self.inputs:
             self._begin(self._inputs)
+
+    def _stated_at_start(self, u0s: Sequence[Any]) -> Array:
+        """Return the inputs at t0 that u0 states, shape (members, channels), NaN elsewhere."""
+        found = np.full((len(self.members), len(self.inputs)), np.nan)
+        for k, u in enumerate(u0s):
+            if k == 0 or u is not u0s[k - 1]:
+                stated = self.model.boundary_readings(u)
+            found[k] = [stated.get(name, np.nan) for name in self.inputs]
+        return found
 
     def _stepper(self, made_of: list[Mapping[str, Any]], u0s: list[Any]) -> FleetEngine:
         """Return the engine that steps members as blocks if the law can, else one by one."""
@@ -260,11 +264,7 @@ class Fleet:
         self._one._check_weighs(noise)
         # The times of members differ after a failed step: a sample has to be later than all.
         last = float(self._t.max())
-        if t < last or (t == last and self._samples):
-            raise errors.TimeOrderError(
-                f"the sample at t = {t!r} is not later than the last one at t = {last!r}: "
-                "sort the stream, and drop repeated samples."
-            )
+        self._refuse_earlier(t, last)
         values, held = self._filled(named)
         none = np.zeros(len(self))
         missing = np.array([held.get(name, none) for name in self.inputs], dtype=float)
@@ -289,6 +289,13 @@ class Fleet:
         self._samples += 1
         self._keep(t, used, values, missing, report.statuses)
         return self._estimate(span, measured, validation, report, held)
+
+    def _refuse_earlier(self, t: float, last: float) -> None:
+        if t < last or (t == last and self._samples):
+            raise errors.TimeOrderError(
+                f"the sample at t = {t!r} is not later than the last one at t = {last!r}: "
+                "sort the stream, and drop repeated samples."
+            )
 
     def _keep(
         self, t: float, used: Array, values: Array, missing: Array, statuses: Sequence[Status]
@@ -578,10 +585,7 @@ class Fleet:
     def load(self, path: str | os.PathLike[str]) -> None:
         """Continue from a saved state; the fleet must be built as the one that was saved.
 
-        Raises
-        ------
-        RunError
-            The file is damaged, or of another fleet.
+        Raises `RunError`: the file is damaged, or of another fleet.
         """
         self.restore(checkpoint.read(path), str(path))
 

@@ -115,10 +115,7 @@ class ShardEstimates:
         Each scalar unknown has a column of its name and one with "_std", each sensor one called
         "innovation NAME". Where an unknown is a field, `q` and `q_std` are columns of lists.
 
-        Raises
-        ------
-        ConfigurationError
-            pyarrow is not installed.
+        Raises `ConfigurationError`: pyarrow is not installed.
         """
         with optional("parquet", "Arrow tables need pyarrow"):
             import pyarrow as pa
@@ -354,10 +351,7 @@ class Shard:
     def dump(self) -> bytes:
         """Return offset and states of all members as one buffer with a checksum.
 
-        Raises
-        ------
-        RunError
-            A step was broken off by an exception.
+        Raises `RunError`: a step was broken off by an exception.
         """
         self._refuse_torn()
         header = {**self._fleet.header, "shard": FORMAT}
@@ -371,10 +365,7 @@ class Shard:
 
         The shard must be built as the one that was dumped.
 
-        Raises
-        ------
-        RunError
-            The content is damaged, or of another shard; nothing was changed.
+        Raises `RunError`: the content is damaged, or of another shard; nothing was changed.
         """
         header, leaves = checkpoint.unpacked(content, "the dump")
         if header.get("shard") != FORMAT:

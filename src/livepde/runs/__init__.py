@@ -1,7 +1,5 @@
 """Runs: the loop that executes them, their outcomes, journals and run directories."""
 
-from __future__ import annotations
-
 from livepde.diagnostics.check_report import Check, Table
 from livepde.runs.backlog import Backlog, Retention, Sink
 from livepde.runs.directory import (

@@ -443,6 +443,9 @@ class Run:
                 f"{self.path} was run with another case or other settings. Resume it with these, "
                 "or choose another folder."
             )
+        self._refuse_other_data(command)
+
+    def _refuse_other_data(self, command: Sequence[str]) -> None:
         files = self.data_file, _data_of(command)
         if files[0] != files[1]:
             before, other = (f"--data {d}" if d else "the data of its case" for d in files)
@@ -466,26 +469,14 @@ class Run:
 def open_run(path: str | os.PathLike[str]) -> Run:
     """Open a run directory.
 
-    Raises
-    ------
-    RunError
-        There is no run, its record is damaged, or its report is a link to another file.
+    Raises `RunError`: there is no run, its record is damaged, or its report is a link to another
+    file.
     """
     folder = Path(path)
     for page in folder.glob("*"):
         if page.suffix in WRITTEN_LATER and page.is_symlink():
             raise RunError(f"{page} is a link: data written to it would go elsewhere.")
-    try:
-        with (folder / RECORD).open("rb") as file:
-            text = file.read(LONGEST + 1)
-        if len(text) > LONGEST:
-            raise RunError(f"{folder / RECORD} is longer than {LONGEST} bytes.")
-        record = json.loads(text)
-    except (FileNotFoundError, NotADirectoryError):
-        why = f"no {RECORD}" if folder.is_dir() or not folder.exists() else "it is a file"
-        raise RunError(f"{folder} contains no run ({why}); {_nearest(folder)}") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise RunError(f"{folder / RECORD} is damaged: {error}.") from error
+    record = _stored_record(folder)
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         raise RunError(f"{folder / RECORD} is not a record of this version of livepde.")
     if record.pop(OWN, "") != _digest(record):
@@ -494,6 +485,21 @@ def open_run(path: str | os.PathLike[str]) -> Run:
             "restore it from a copy, or run the case again into another folder."
         )
     return Run(folder, record)
+
+
+def _stored_record(folder: Path) -> Any:
+    """Return the content of the record of a run."""
+    try:
+        with (folder / RECORD).open("rb") as file:
+            text = file.read(LONGEST + 1)
+        if len(text) > LONGEST:
+            raise RunError(f"{folder / RECORD} is longer than {LONGEST} bytes.")
+        return json.loads(text)
+    except (FileNotFoundError, NotADirectoryError):
+        why = f"no {RECORD}" if folder.is_dir() or not folder.exists() else "it is a file"
+        raise RunError(f"{folder} contains no run ({why}); {_nearest(folder)}") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise RunError(f"{folder / RECORD} is damaged: {error}.") from error
 
 
 def drawn_into(folder: Path, figures: Mapping[str, FigureFactory], notes: list[str]) -> list[str]:

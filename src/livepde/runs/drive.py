@@ -47,10 +47,7 @@ class Driven:
 def stopped_by_signals(stopping: threading.Event, busy: Callable[[], bool]) -> Iterator[None]:
     """Let Ctrl-C and SIGTERM set an event; when idle, or the second time, raise at once.
 
-    Raises
-    ------
-    KeyboardInterrupt
-        While no step is computed, or at the second signal.
+    Raises `KeyboardInterrupt`: while no step is computed, or at the second signal.
     """
     # Python allows handlers of signals in the main thread only.
     if threading.current_thread() is not threading.main_thread():

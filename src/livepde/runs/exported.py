@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from tokenize import TokenError
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -24,6 +23,7 @@ from livepde.dates import instants, since
 from livepde.errors import ConfigurationError, RunError
 from livepde.records import STATUS_CODES, field_names, interval_95, scalars
 from livepde.runs.directory import Run, plain, write_dataset
+from livepde.units import NOT_A_UNIT, pint_registry
 
 CONVENTIONS = "CF-1.11"
 BESIDE = {  # end of a name -> what such a variable says of the one without it
@@ -59,7 +59,6 @@ SYMBOLS = {  # of pint -> of UDUNITS, where they differ
     "deg": "degree",
 }
 SCALES = ("degC", "degF")  # their zero is not zero
-NOT_A_UNIT = (AssertionError, AttributeError, SyntaxError, TokenError, TypeError, ValueError)
 Writer: TypeAlias = Callable[[Run, Path, float | None], object]
 NEEDS = {
     ".parquet": ["pyarrow"],
@@ -100,8 +99,9 @@ def udunits(unit: str) -> str | None:
     """
     from pint.util import to_units_container
 
+    registry = pint_registry()
     try:
-        found = to_units_container(_registry().parse_units(unit))
+        found = to_units_container(registry.parse_units(unit))
     except NOT_A_UNIT:
         return None
     parts = {name: float(str(power)) for name, power in found.items()}
@@ -110,17 +110,10 @@ def udunits(unit: str) -> str | None:
     words = []
     # Positive powers come first: m2 s-1.
     for name, power in sorted(parts.items(), key=lambda part: part[1] < 0.0):
-        symbol = _registry().get_symbol(name)
+        symbol = registry.get_symbol(name)
         symbol = SYMBOLS.get(symbol, symbol.replace("µ", "u"))
         words.append(symbol if power == 1 else f"{symbol}{int(power)}")
     return " ".join(words) or "1"
-
-
-@cache
-def _registry() -> Any:
-    import pint
-
-    return pint.UnitRegistry()
 
 
 def cf(
@@ -145,7 +138,7 @@ def cf(
         only those of the times: the others are of sea and air.
     """
     found = bounded(data)
-    names = free_names(str(name) for name in found.variables)
+    names = free_names(map(str, found.variables))
     clock = str(data["time"].attrs.get("units", ""))
     # Without a date, times are no time coordinate of CF, which counts from one: only the unit.
     counted = since(clock, data.attrs.get("origin"))
@@ -154,9 +147,7 @@ def cf(
         about = {"standard_name": "time", "axis": "T", **counted, "units_metadata": NO_LEAPS}
     for name in names:
         _describe(found, name, about)
-        beside = [names[other] for end in BESIDE if (other := f"{name}{end}") in found]
-        if beside:
-            found[name].attrs["ancillary_variables"] = " ".join(beside)
+        _relate(found, name, names)
     state = str(data.attrs.get("state", "")).split()
     lists = {"scalars": scalars(data), "fields": field_names(data), "state": state}
     found.attrs = plain(data.attrs) | {
@@ -207,6 +198,13 @@ def _unit_attrs(name: str, own: str) -> dict[str, str]:
     # A difference of 5 degC is 5 K, but a temperature of 5 degC is 278.15 K.
     kind = "difference" if name.endswith("_std") or name in DIFFERENCES else "on_scale"
     return {"units": unit, "units_metadata": f"temperature: {kind}"}
+
+
+def _relate(data: xr.Dataset, name: str, names: Mapping[str, str]) -> None:
+    """Name the variables beside a variable, such as its standard deviation, in its attributes."""
+    beside = [names[other] for end in BESIDE if (other := f"{name}{end}") in data]
+    if beside:
+        data[name].attrs["ancillary_variables"] = " ".join(beside)
 
 
 def _describe(data: xr.Dataset, name: str, clock: Mapping[str, str]) -> None:
@@ -296,12 +294,8 @@ def export(run: Run, target: Path, *, at: float | None = None, force: bool = Fal
     ConfigurationError
         There is no such format, or it needs a package that is not installed.
     """
+    check_target(target, FORMATS)
     ending = target.suffix.lower()
-    if ending not in FORMATS:
-        raise ConfigurationError(
-            f"{target}: there is no format '{target.suffix}'; expected one of {', '.join(FORMATS)}."
-        )
-    need(target, NEEDS.get(ending, []))
     if at is not None and ending not in AT_ONE_TIME:
         raise ConfigurationError(
             f"{target}: contains all times; a time is only chosen for {' and '.join(AT_ONE_TIME)}."
@@ -309,6 +303,16 @@ def export(run: Run, target: Path, *, at: float | None = None, force: bool = Fal
     if not run.dataset.sizes["time"]:
         raise RunError(f"{run.path} contains no estimates yet, so there is nothing to export.")
     into_place(target, lambda path: FORMATS[ending](run, path, at), force=force)
+
+
+def check_target(target: Path, known: Collection[str]) -> None:
+    """Raise `ConfigurationError` if a format is unknown, or needs a package that is missing."""
+    ending = target.suffix.lower()
+    if ending not in known:
+        raise ConfigurationError(
+            f"{target}: there is no format '{target.suffix}'; expected one of {', '.join(known)}."
+        )
+    need(target, NEEDS.get(ending, []))
 
 
 def need(target: Path, packages: Iterable[str], extra: str = "formats") -> None:

@@ -616,13 +616,13 @@ class Live:
             else:
                 self.result.add(estimate)
         except DataError as error:
-            if not self.strict:
-                self._tell("refused", str(error))
-                self._refused += 1
-                self._refusal = str(error)
-            self._withdraw()
             if self.strict:
+                self._withdraw()
                 raise
+            self._tell("refused", str(error))
+            self._refused += 1
+            self._refusal = str(error)
+            self._withdraw()
         except RunError:  # of the journal
             raise
         except Interrupted:
@@ -666,7 +666,7 @@ class Live:
         self._withdraw()
 
     def _hand_on(self, estimate: Estimate, again: bool) -> None:
-        """Hand an estimate to the sinks; judge it and keep a checkpoint at intervals."""
+        """Hand an estimate to the sinks, and judge it at intervals."""
         if self.sinks and not again:
             self._untold.append(estimate)
         if estimate.status.taken:
@@ -682,6 +682,10 @@ class Live:
         # A run of finished data ends with a verdict: it is looked at seldom before.
         if not others and (self.waits or is_due(look)):
             self._judge(estimate)
+        self._checkpoint(estimate)
+
+    def _checkpoint(self, estimate: Estimate) -> None:
+        """Keep a checkpoint at intervals, and thin the journal."""
         by_count = self._steps % CHECKPOINT == 0
         if by_count or self._seconds - self._kept_at >= max(APART, self._cost / COST):
             self._record()

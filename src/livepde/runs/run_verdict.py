@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -89,16 +90,16 @@ def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
 
     Notes: where more than 2 % of the values were held, the verdict of the estimate has a caution.
     """
-    found, driving = [], [*channels]
-    # What is left out at the start matters for sensors, too: the initial state may be made of it.
-    others = [name for kind, name in journal.counts if kind in OF_SENSORS]
-    for name in dict.fromkeys([*driving, *others]):
-        counts = {
-            kind: n
-            for (kind, channel), n in journal.counts.items()
-            if channel == name and (kind in OF_SENSORS or name in driving)
-        }
-        parts = [f"{counts[kind]} {text}" for kind, text in INPUT_KINDS.items() if counts.get(kind)]
+    found, driving = [], dict.fromkeys(channels)
+    counted: defaultdict[str, Counter[str]] = defaultdict(Counter)
+    for (kind, name), count in journal.counts.items():
+        # What is left out at the start matters for sensors, too: the initial state may be made of
+        # it.
+        if kind in OF_SENSORS or name in driving:
+            counted[name][kind] = count
+    for name in {**driving, **dict.fromkeys(counted)}:
+        counts = counted[name]
+        parts = [f"{counts[kind]} {text}" for kind, text in INPUT_KINDS.items() if counts[kind]]
         if not parts:
             continue
         held = (counts.get("missing", 0) + counts.get("ended", 0)) / max(len(journal), 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,7 +14,7 @@ import numpy as np
 from livepde.dates import when
 from livepde.diagnostics.check_report import Bound, Check, Sense, Table
 from livepde.diagnostics.information_gain import TRADED, InformationGain
-from livepde.frames import estimates, model_errors, relative_error
+from livepde.frames import ERRORS, estimates, model_errors, relative_error
 from livepde.plots.style import modes_told, note, prior_left
 from livepde.records import NORMAL_95, field_names, refused_readings, scalars, used_errors
 from livepde.runs.journal import Journal
@@ -42,7 +43,6 @@ STATES = {
     "moves": "changes with time",
 }
 """How well the data determine a number, as `determination` returns it -> words."""
-CHANNELS = (("innovation", "sensor", ROLES[0]), ("validation_error", "validation", ROLES[1]))
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def channel_errors(data: xr.Dataset) -> dict[str, ChannelErrors]:
     kept = data["time"].values >= start
     found, refused = {}, refused_readings(data)
     ignored = str(data.attrs.get("ignored", "")).split("\n")
-    for variable, dimension, role in CHANNELS:
+    for (variable, dimension), role in zip(ERRORS, ROLES, strict=True):
         if variable not in data:
             continue
         columns = used_errors(data, variable, dimension)[kept].T
@@ -289,9 +289,8 @@ def _estimates(data: xr.Dataset, labels: Sequence[str]) -> Table:
     rows: list[tuple[Any, ...]] = []
     for label, row in known.iterrows():
         value, deviation = digits(row["value"], row["std"])
-        plain, allowed = (
-            interval(row[f"{kind}low"], row[f"{kind}high"], row["std"]) for kind in ("", "model_")
-        )
+        plain = interval(row["low"], row["high"], row["std"])
+        allowed = interval(row["model_low"], row["model_high"], row["std"])
         # The wider interval comes first. The plain one tells the standard deviation, too.
         # Relative to zero an error says nothing.
         zero = row["model_low"] <= 0.0 <= row["model_high"]
@@ -360,14 +359,7 @@ def _channels(data: xr.Dataset) -> Table:
     refuses = any(item.refused for item in channels.values())
     errors = model_errors(data)
     fits = {} if errors is None else errors.sensors
-    fitted = [name for name in channels if name in fits]
-    units = {
-        str(name): str(unit)
-        for dimension in ("sensor", "validation")
-        if f"{dimension}_unit" in data.coords
-        for name, unit in zip(data[dimension].values, data[f"{dimension}_unit"].values, strict=True)
-    }
-    common = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
+    fitted, units = not fits.keys().isdisjoint(channels), _channel_units(data)
     rows = [
         (
             name,
@@ -378,7 +370,7 @@ def _channels(data: xr.Dataset) -> Table:
             len(own),
             *([refused] if refuses else []),
             *([shown(fits.get(name, math.nan), ".2g")] if fitted else []),
-            units.get(name, common),
+            units[name],
         )
         for name, (role, own, later, refused) in channels.items()
     ]
@@ -386,6 +378,17 @@ def _channels(data: xr.Dataset) -> Table:
     more += ["/ noise"] if fitted else []
     columns = ("channel", "role", "RMSE", "2nd half", "mean", "samples", *more, "unit")
     return Table("Measured minus predicted, one step ahead", columns, rows)
+
+
+def _channel_units(data: xr.Dataset) -> defaultdict[str, str]:
+    """Return the unit of each channel: its own, or that of all innovations."""
+    common = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
+    found: defaultdict[str, str] = defaultdict(lambda: common)
+    for _, dimension in ERRORS:
+        if f"{dimension}_unit" in data.coords:
+            units = data[f"{dimension}_unit"].values
+            found.update(zip(map(str, data[dimension].values), map(str, units), strict=True))
+    return found
 
 
 def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:

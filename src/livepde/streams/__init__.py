@@ -1,7 +1,5 @@
 """Sources of samples: files, brokers, joined tables, twin experiments."""
 
-from __future__ import annotations
-
 from livepde.streams.clock import Clock
 from livepde.streams.csvfile import read_csv
 from livepde.streams.gaps import FillGaps

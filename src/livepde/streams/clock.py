@@ -239,9 +239,13 @@ def date_formats(cells: Sequence[str]) -> list[str]:
     if "" in steps:
         return [""]
     steps = {form: step for form, step in steps.items() if (step >= 0).all()} or steps
-    # Steps are even if the longest is barely longer than their median.
-    even = [n for n, s in steps.items() if len(s) > 1 and 0 < s.max() <= 1.5 * np.median(s)]
+    even = [form for form, step in steps.items() if _are_even(step)]
     return even if len(even) == 1 else list(steps)
+
+
+def _are_even(steps: Array) -> bool:
+    """Return whether the longest of several steps is barely longer than their median."""
+    return len(steps) > 1 and bool(0 < steps.max() <= 1.5 * np.median(steps))
 
 
 def _stamps(cells: Sequence[str], form: str) -> Array:

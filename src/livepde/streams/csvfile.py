@@ -253,13 +253,12 @@ def how_written(path: str | Path, encoding: str = "", skip: int | None = None) -
     whole = text if len(text) < LOOK else text.rpartition("\n")[0]
     # Not `splitlines`, which also splits at form feeds and at separators of Unicode in a cell.
     lines = [line.rstrip("\n") for line in io.StringIO(whole, newline=None)]
-    separator = _separator(lines[skip or 0 :])
+    separator = _separator(lines[skip:])
     if skip is None:
         skip = _titles(lines, separator)
     found = rows_of(lines[skip:], separator)
     header, *rows = [*below_title(filter(None, found), list)] or [[]]
-    cells = [cell for row in rows for cell in row]
-    decimal = "," if any(map(has_decimal_comma, cells)) else "."
+    decimal = "," if any(map(has_decimal_comma, chain.from_iterable(rows))) else "."
     formats = _time_formats(header, rows, decimal)
     return Written(separator, decimal, encoding, skip, formats, header, rows)
 
@@ -285,7 +284,7 @@ def _separator(lines: Sequence[str]) -> str:
         if max(multimode(line.count(mark) for line in lines if line.strip()), default=0):
             return mark
     rows = [line.split() for line in lines if line.strip() and not line.startswith("#")]
-    numbers = [len(row) for row in rows if _all_numbers(row)]
+    numbers = list(map(len, filter(_all_numbers, rows)))
     return BLANK if 2 * len(numbers) > len(rows) and min(numbers) > 1 else ","
 
 
@@ -298,7 +297,7 @@ def _titles(lines: Sequence[str], separator: str) -> int:
     rows = [next(rows_of([line], separator), []) for line in lines]
     widths = list(map(_width, rows))
     # A title has fewer cells than most lines; of equally frequent widths the smaller one counts.
-    usual = min(multimode(found for found in widths if found), default=0)
+    usual = min(multimode(filter(None, widths)), default=0)
     start = next((k for k, found in enumerate(widths) if found >= usual), 0)
     names = rows[start] if rows else []
     titled = all(found <= 1 for found in widths[:start])
@@ -354,7 +353,7 @@ def unlike(cells: list[str], header: list[str], separator: str) -> bool:
 
 def _cells(
     path: Path, needed: list[str], separator: str, encoding: str, clock: Clock, skip: int
-) -> tuple[list[int], dict[str, list[str]]]:
+) -> tuple[list[int], dict[str, tuple[str, ...]]]:
     """Return the numbers of the rows that are not blank, and the text in the needed columns.
 
     Refuses a name that stands twice, more fields than names, and a quote that does not end.
@@ -368,8 +367,7 @@ def _cells(
         _check_header(path, header, separator, encoding, clock, skip)
         _check_names(path, header, needed)
         places = [header.index(name) for name in needed]
-        rows: list[int] = []
-        columns: list[list[str]] = [[] for _ in needed]
+        rows, found = list[int](), list[list[str]]()
         for number, row in numbered:
             if row[0].startswith("#"):  # a comment
                 continue
@@ -384,9 +382,8 @@ def _cells(
             texts = [row[place] for place in places]
             if any(texts):
                 rows.append(number)
-                for column, text in zip(columns, texts, strict=True):
-                    column.append(text)
-    return rows, dict(zip(needed, columns, strict=True))
+                found.append(texts)
+    return rows, dict(zip(needed, zip(*found, strict=True), strict=bool(found)))
 
 
 def _check_names(path: Path, header: list[str], needed: list[str]) -> None:

@@ -248,8 +248,7 @@ def fill_table(
         if name not in fills:
             column[gaps], gaps = math.nan, np.zeros_like(gaps)
         values[:, k] = column
-        known = np.flatnonzero(np.isfinite(column))
-        after = len(column) - 1 - int(known[-1]) if len(known) else 0
+        after = int(np.isfinite(column)[::-1].argmax())  # the last known value, from the end
         ended = after if after > LONG else 0
         left = np.isnan(column).sum() - ended
         bridges = 0

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from livepde.samples import is_dataset, is_frame, noise_channel
 from livepde.streams import table as tables
 from livepde.streams.clock import CALLED_TIME, Clock
 from livepde.streams.csvfile import how_written, read_csv
-from livepde.units import conversion, other_time_unit
+from livepde.units import Affine, conversion, other_time_unit
 
 INDEX = "__index_level_0__"  # how pandas names an index without a name in a Parquet file
 TEMPERATURE = re.compile(r"T\b")  # not a time, though `CALLED_TIME` has no regard for capitals
@@ -102,6 +103,11 @@ class Reading:
         doubt = "" if unit else other_time_unit(time, self.unit)
         return Clock(time, factor, second=second, doubt=doubt, **written)
 
+    @cached_property
+    def _names(self) -> dict[str, str]:
+        """Channel -> its column, which an optional one may lack."""
+        return {name: self.columns.get(name, name) for name in (*self.channels, *self.optional)}
+
     def _columns(
         self,
         where: str,
@@ -115,53 +121,55 @@ class Reading:
         `names`: columns of the data.
         `units`: column -> its unit, of data that state one.
         """
-        found = {}
-        for name in (*self.channels, *self.optional):
-            column = self.columns.get(name, name)
+        noise_of = dict(zip(map(noise_channel, self.channels), self.channels, strict=True))
+        found: dict[str, tables.Column] = {}
+        for name, column in self._names.items():
             if column not in names:
                 if name in self.optional and name not in self.columns:
                     continue
-                hint = tables.hint(column, list(names))
-                raise SampleError(
-                    f"{where}: there is no column '{column}'{hint} If it has another name, give "
-                    f"columns={{'{name}': ...}}."
-                )
+                raise self._missing(where, name, column, names)
             unit, own = self.units.get(name, units.get(column, "")), self.sensor_units.get(name)
-            rule = conversion(unit or own, own, f"units of '{name}'") if own else None
-            found[name] = tables.Column((column,), decimal=decimal)
-            if rule is not None:
-                found[name] = replace(found[name], factor=rule.factor, offset=rule.offset)
-        for name in self.channels:  # of a reading that has its own
-            if (noise := noise_channel(name)) in found:
-                factor, names_of = found[name].factor, found[noise].names
-                found[noise] = tables.Column(names_of, factor, decimal=decimal, noise_of=name)
-        used = {time, *(column.names[0] for column in found.values())}
-        if self.strict and (more := [name for name in names if name not in used]):
+            rule = conversion(unit or own, own, f"units of '{name}'") if own else Affine()
+            scale = rule.factor, rule.offset
+            if of := noise_of.get(name, ""):  # the noise of each reading of a channel
+                scale = found[of].factor, 0.0
+            found[name] = tables.Column((column,), *scale, decimal=decimal, noise_of=of)
+        if self.strict:
+            self._refuse_more(where, names, {time, *(one.names[0] for one in found.values())})
+        return found
+
+    def _refuse_more(self, where: str, names: Sequence[str], used: set[str]) -> None:
+        """Refuse a column that is no channel."""
+        for name in (name for name in names if name not in used):
             raise SampleError(
-                f"{where}: column '{more[0]}' is not a channel of this identifier, which has "
+                f"{where}: column '{name}' is not a channel of this identifier, which has "
                 f"{list(self.channels)}: remove it, or leave out strict."
             )
-        return found
+
+    def _missing(self, where: str, name: str, column: str, names: Sequence[str]) -> SampleError:
+        """Return an error about a channel without its column."""
+        hint = tables.hint(column, list(names))
+        return SampleError(
+            f"{where}: there is no column '{column}'{hint} If it has another name, give "
+            f"columns={{'{name}': ...}}."
+        )
 
     def _time(self, where: str, names: Sequence[str]) -> str:
         """Return the column of times."""
         if self.time is not None:
             tables.check_columns(where, [self.time], list(names))
             return self.time
-        taken = {self.columns.get(name, name) for name in (*self.channels, *self.optional)}
-        free = [name for name in names if name not in taken]
+        free = [name for name in names if name not in self._names.values()]
         called = list(filter(_is_time, free))
         if len(called) == 1:
             return called[0]
-        if not called and INDEX in free:
-            return INDEX
-        if not called and names and names[0] == "":  # an index that pandas has written
-            return ""
-        what = f"{' and '.join(map(repr, called))} may be the column" if called else "no column is"
-        raise SampleError(
-            f"{where}: {what} {'of times' if called else 'called time'}; specify it, as in "
-            f"time={(called or free or ['t'])[0]!r}."
-        )
+        if not called and (INDEX in free or names[:1] == [""]):  # an index that pandas has written
+            return INDEX if INDEX in free else ""
+        what = "no column is called time"
+        if called:
+            what = f"{' and '.join(map(repr, called))} may be the column of times"
+        time = [*called, *free, "t"][0]
+        raise SampleError(f"{where}: {what}; specify it, as in time={time!r}.")
 
     def _frame(self, data: Any) -> tables.DataTable:
         """Return the samples of a pandas table."""
@@ -193,8 +201,7 @@ class Reading:
 
     def _dataset(self, data: Any) -> tables.DataTable:
         """Return the samples of an xarray dataset, whose variables may state their units."""
-        wanted = {self.columns.get(name, name) for name in (*self.channels, *self.optional)}
-        dims = {dim for name in data.data_vars if name in wanted for dim in data[name].dims}
+        dims = set(data[list(data.data_vars.keys() & self._names.values())].dims)
         if len(dims) > 1:
             raise SampleError(
                 f"data: the channels have the dimensions {sorted(map(str, dims))}; expected one, "

@@ -176,9 +176,8 @@ class _Content:
             # Nothing was read before, so nothing shows that.
             if not self.offset and self._written() != before:
                 break
-            if used and self.follows is not None:
-                found += self._missed(chunk, *self.follows)
-                self.follows = None
+            if used:
+                found += self._missed(chunk)
             read = chunk[:used]
             self.offset += used
             self.head += read[: HEAD - len(self.head)]
@@ -188,11 +187,13 @@ class _Content:
                 break
         return found
 
-    def _missed(self, chunk: bytes, last: bytes, offset: int) -> list[Line]:
+    def _missed(self, chunk: bytes) -> list[Line]:
         """Return a report if rows may be missing between a file and what it was before.
 
         Where the last line is still there, as in a window of rows that moves on, none is missing.
         """
+        last, offset = self.follows or (b"", 0)
+        self.follows = None
         if not last or last in chunk:
             return []
         text = (

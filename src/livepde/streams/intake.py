@@ -35,6 +35,11 @@ class Habit:
     screened: bool = False  # a spike is refused, if two later values come while the sample waits
     between: Between = "line"  # how the channel behaves between two readings
 
+    @property
+    def bridged(self) -> bool:
+        """Whether values of samples may be others than those of rows."""
+        return self.interpolated or self.screened
+
 
 @dataclass(frozen=True)
 class Policy:
@@ -325,12 +330,14 @@ class Intake:
         times = sorted({one.t for one in self._ahead})
         steps = [b - a for a, b in pairwise(times)]
         usual, own = self._times.usual(self._ahead[-1].values), usual_of(steps)
-        reach = self._reach(own if math.isnan(usual) else max(usual, own))
+        span = AGREE * usual
+        if math.isnan(usual):
+            usual, span = own, 0.0
+        reach = self._reach(max(usual, own))
         # The last rows of them, without a step that would be far ahead itself.
         breaks = [k for k, step in enumerate(steps, start=1) if step > reach]
         runs = [times[k:stop] for k, stop in pairwise([0, *breaks, len(times)])]
         last = runs[-1] if self._begun else max(runs, key=len)
-        span = 0.0 if math.isnan(usual) else AGREE * usual
         return last if len(last) >= FEWEST and last[-1] - last[0] >= span else []
 
     def _use_ahead(self, found: IntakeOutcome) -> None:
@@ -362,10 +369,8 @@ class Intake:
         if any(_same(values, known) for known in (*waiting, *(one for _, one in remembered))):
             return True
         # The journal has other values than the rows where gaps and spikes were bridged.
-        habits = {name: self.policy.habit(name) for name in values}
-        bridged = {name for name, one in habits.items() if one.interpolated or one.screened}
-        firm = {name: value for name, value in values.items() if name not in bridged} or values
-        return any(_same(firm, known) for _, known in journaled)
+        firm = {n: value for n, value in values.items() if not self.policy.habit(n).bridged}
+        return any(_same(firm or values, known) for _, known in journaled)
 
     def _known(self, t: float) -> tuple[list[Known], list[Known]]:
         """Return the accepted samples of a moment: as they came, and in the journal."""
@@ -516,20 +521,14 @@ class Intake:
 
     def _complete(self, sample: Ready, found: IntakeOutcome) -> None:
         """Release a sample, or leave it out if a channel is missing that it needs."""
-        t, came = sample.t, dict(sample.values)
-        for channel in self.columns:
-            self._bridge(channel, sample, found)
-            if channel in self._before and math.isnan(sample.values.get(channel, NAN)):
-                sample.values[channel] = self._before[channel]
-        for channel in without_noise(self.columns, sample.values):
-            text = f"t = {t:g}: the noise of the reading is not positive"
-            found.remark("invalid", channel, text, sample.tokens[-1])
-        lacking = [c for c in self.columns if self._lacks(c, sample.values)]
-        for channel in lacking:
-            text = f"no value for t = {t:g}"
-            text += "; the noise of the sensor is used" if self.columns[channel].noise_of else ""
-            found.remark("missing", channel, text, sample.tokens[-1])
-        needed = [channel for channel in lacking if self.columns[channel].needed]
+        t, came, needed = sample.t, dict(sample.values), list[str]()
+        self._fill(sample, found)
+        for channel, column in self.columns.items():
+            if self._lacks(channel, sample.values):
+                text = f"no value for t = {t:g}"
+                text += "; the noise of the sensor is used" if column.noise_of else ""
+                found.remark("missing", channel, text, sample.tokens[-1])
+                needed += [channel] * column.needed
         if needed:
             text = f"the sample at t = {t:g} was skipped"
             found.remark("skipped", needed[0], text, sample.tokens[-1])
@@ -543,6 +542,16 @@ class Intake:
         self._recent.append((t, sample.values))
         self._remember(t, came)
         found.ready.append(sample)
+
+    def _fill(self, sample: Ready, found: IntakeOutcome) -> None:
+        """Interpolate gaps of a sample, refuse its spikes and readings with a wrong noise."""
+        for channel in self.columns:
+            self._bridge(channel, sample, found)
+            if channel in self._before and math.isnan(sample.values.get(channel, NAN)):
+                sample.values[channel] = self._before[channel]
+        for channel in without_noise(self.columns, sample.values):
+            text = f"t = {sample.t:g}: the noise of the reading is not positive"
+            found.remark("invalid", channel, text, sample.tokens[-1])
 
     def _remember(self, t: float, came: dict[str, float]) -> None:
         """Remember an accepted sample, at least until the journal has it."""
@@ -590,8 +599,7 @@ class Intake:
         """Interpolate a gap of a sample, or refuse a spike, where later values are known."""
         t, habit = sample.t, self.policy.habit(channel)
         # A sample that does not wait is released before any later value has come.
-        waited = self.policy.longest(habit) > 0.0
-        if not (waited and (habit.interpolated or habit.screened)):
+        if not (habit.bridged and self.policy.longest(habit) > 0.0):
             return
         later = self._later(t, channel)
         past = [(s, v[channel]) for s, v in self._recent if math.isfinite(v.get(channel, NAN))]

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import compress
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -44,60 +46,62 @@ def join_tables(
     Raises `DataError`: some times are dates and some numbers; or the tables have no time in common.
     """
     times, first = _on_one_clock(tables, second, where)
-    starts, ends = np.transpose([(t[0], t[-1]) for t in times])
-    behaviour = between or {}
-    _check_overlap(tables, starts, ends, behaviour, where)
-    driving = [together or not {*table.names} <= {*sensors} for table in tables]
-    start = starts[driving].max() if any(driving) else starts.min()
-    width = SAME * (ends.max() - starts.min()) or 1.0
+    between = between or {}
+    start, width = _common_start(tables, times, sensors, between, where, together=together)
     t, joined = _outer_join(tables, times, width)
     names, values = list(joined.columns), joined.to_numpy(copy=True)
-    sensed = joined.columns.isin(list(sensors))
-    known = np.isfinite(values)
+    sensed, known = joined.columns.isin(list(sensors)), np.isfinite(values)
     usable = (t >= start - width) & known[:, sensed].any(axis=1)
     if not usable.any():
         raise DataError(
             f"{where}: no sensor has a value where all files have one; check the times."
         )
     begin = int(usable.argmax())
+    kinds: Any = np.array([between.get(name, "line") for name in names])
     # A run needs each input at its start, where a slower logger may have no row.
     for k in np.flatnonzero(~sensed & ~known[begin] & known.any(axis=0)):
-        at, own = known[:, k], behaviour.get(names[k], "line")
-        values[begin, k] = _opening(t[begin], t[at], values[at, k], own)
+        at = known[:, k]
+        values[begin, k] = _opening(t[begin], t[at], values[at, k], kinds[k])
     inputs = values[begin:, [names.index(name) for name in needed]]
     kept = np.isfinite(inputs).all(axis=1)
     if not kept.any():
         raise DataError(f"{where}: no row has all channels that it needs.")
     # A row that is left out keeps the means that it states, and what changes of inputs that hold.
-    held = np.array([behaviour.get(name, "line") != "line" for name in names], dtype=bool)
-    means = np.array([behaviour.get(name) == "next" for name in names], dtype=bool)
+    held = kinds != "line"
     last = joined.ffill().shift().to_numpy()
-    new = known & (means | (joined.to_numpy() != last))
+    new = known & ((kinds == "next") | (joined.to_numpy() != last))
     states = new[begin:, held].any(axis=1) & (np.cumsum(kept) > 0) & ~kept
     values[begin:][np.ix_(states, ~held)] = np.nan
     kept |= states
-    t, values = t[begin:][kept], values[begin:][kept]
+    t, values, origin = t[begin:][kept], values[begin:][kept], None
     remarks = _counted("skipped", needed, np.isnan(inputs))
     remarks += _counted(EARLY, joined.columns[sensed], known[:begin, sensed])
     remarks = sum((Counter(table.remarks) for table in tables), remarks)
-    if first is None:
-        return DataTable(t, values, tuple(names), origin=None, remarks=remarks)
-    return DataTable(
-        t - t[0], values, tuple(names), origin=origin_at(first + t[0] / second), remarks=remarks
-    )
+    if first is not None:
+        t, origin = t - t[0], origin_at(first + t[0] / second)
+    return DataTable(t, values, tuple(names), origin=origin, remarks=remarks)
 
 
-def _check_overlap(
+def _common_start(
     tables: Sequence[DataTable],
-    starts: Array,
-    ends: Array,
+    times: Sequence[Array],
+    sensors: Collection[str],
     between: Mapping[str, Between],
     where: str,
-) -> None:
-    """Refuse tables without a time in common; what holds continues after its last reading."""
+    *,
+    together: bool,
+) -> tuple[float, float]:
+    """Return when all tables that have to have begun, and by how little one moment may differ.
+
+    Refuses tables without a time in common; what holds continues after its last reading.
+    """
+    starts, ends = np.transpose([(t[0], t[-1]) for t in times])
     holds = [all(between.get(name) == "hold" for name in table.names) for table in tables]
     if np.where(holds, np.inf, ends).min() < starts.max():
         raise DataError(f"{where}: the files have no time in common; check dates and units.")
+    driving = [together or not {*table.names} <= {*sensors} for table in tables]
+    start = starts[driving].max(initial=starts.min())
+    return start, SAME * (ends.max() - starts.min()) or 1.0
 
 
 def _counted(kind: str, names: Iterable[str], marked: Mask) -> Counter[tuple[str, str]]:
@@ -120,7 +124,7 @@ def not_late(
     seen = np.isfinite(table.values)
     late = {name: by for name, by in late.items() if seen[:, table.names.index(name)].any()}
     rest = [name not in late for name in table.names]
-    names = tuple(name for name in table.names if name not in late)
+    names = tuple(compress(table.names, rest))
     found = [replace(table, values=table.values[:, rest], names=names)] if names else []
     for name, by in late.items():
         values = table.values[:, table.names.index(name)]

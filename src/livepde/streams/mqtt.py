@@ -148,9 +148,7 @@ class _Peer:
             self._refusal = reason
             self._started.set()
 
-    def _on_connect(
-        self, client: Client, userdata: Any, flags: Any, reason: Any, properties: Any
-    ) -> None:
+    def _on_connect(self, client: Any, data: Any, flags: Any, reason: Any, more: Any) -> None:
         if reason.is_failure:
             self._refused(str(reason))
             return
@@ -159,9 +157,7 @@ class _Peer:
             log.info("connected to the broker at %s again", self._broker.address)
         self._connected(bool(flags.session_present))
 
-    def _on_disconnect(
-        self, client: Client, userdata: Any, flags: Any, reason: Any, properties: Any
-    ) -> None:
+    def _on_disconnect(self, client: Any, data: Any, flags: Any, reason: Any, more: Any) -> None:
         if reason.is_failure and self._started.is_set():
             soon = time.monotonic() - self._since < PATIENCE
             remedy = "; has another client the same client_id?" if soon else ""
@@ -274,9 +270,7 @@ class MqttSource(_Peer, RowSource):
             self._taken_over = True
             self._client.disconnect()  # and do not take it back
 
-    def _on_subscribe(
-        self, client: Client, userdata: Any, mid: int, reasons: Any, properties: Any
-    ) -> None:
+    def _on_subscribe(self, client: Any, data: Any, mid: int, reasons: Any, more: Any) -> None:
         for topic, reason in zip(self._topics, reasons, strict=True):
             if reason.is_failure:
                 self._refused(f"topic '{topic}': {reason}")
@@ -351,11 +345,8 @@ class MqttSource(_Peer, RowSource):
     def poll(self, wait: float) -> Sequence[Row]:
         """Return the messages that have come.
 
-        Raises
-        ------
-        DataError
-            Another client has taken the session; or nothing can come any more, because as many
-            messages as the broker sends ahead wait for later ones.
+        Raises `DataError`: another client has taken the session; or nothing can come any more,
+        because as many messages as the broker sends ahead wait for later ones.
         """
         rows = drained(self._rows, wait)
         if wait and not rows:
@@ -517,17 +508,21 @@ class MqttSink(_Peer):
                 discovered = not self._discovery
                 self._publish(f"{self._topic}/status", "running")
             if estimate is not None:
-                if not discovered:
-                    for topic, content in home_assistant(estimate, self._topic, self._title):
-                        self._publish(topic, json.dumps(content))
-                    discovered = True
-                row = estimate.to_dict()
-                self._publish(self._topic, json.dumps(row), retain=False)
-                for label, known in row["unknowns"].items():
-                    self._publish(_topic_of(self._topic, label), json.dumps(known))
+                self._publish_numbers(estimate, discovered)
+                discovered = True
             if last:
                 self._publish(f"{self._topic}/status", "offline")
                 return
+
+    def _publish_numbers(self, estimate: Estimate, discovered: bool) -> None:
+        """Publish an estimate, after the messages by which its numbers are discovered."""
+        if not discovered:
+            for topic, content in home_assistant(estimate, self._topic, self._title):
+                self._publish(topic, json.dumps(content))
+        row = estimate.to_dict()
+        self._publish(self._topic, json.dumps(row), retain=False)
+        for label, known in row["unknowns"].items():
+            self._publish(_topic_of(self._topic, label), json.dumps(known))
 
     def _publish(self, topic: str, content: str, *, retain: bool = True) -> None:
         while not self._free.acquire(timeout=0.1):
@@ -535,9 +530,7 @@ class MqttSink(_Peer):
                 return
         self._client.publish(topic, content, qos=1, retain=retain)
 
-    def _on_publish(
-        self, client: Client, userdata: Any, mid: int, reason: Any, properties: Any
-    ) -> None:
+    def _on_publish(self, client: Any, data: Any, mid: int, reason: Any, more: Any) -> None:
         if reason.is_failure:
             log.warning("the broker at %s accepts no estimate: %s", self._broker.address, reason)
         self._free.release()

@@ -252,10 +252,7 @@ class OpcuaSource(_Client, RowSource):
     def poll(self, wait: float) -> Sequence[Row]:
         """Return the changes that have come.
 
-        Raises
-        ------
-        DataError
-            The thread of the connection has ended by an unforeseen error.
+        Raises `DataError`: the thread of the connection has ended by an unforeseen error.
         """
         broken = not self._thread.is_alive()  # asked first: its last rows come before the error
         rows = drained(self._rows, wait)

@@ -151,8 +151,8 @@ class Follow(RowSource):
         self.path = Path(path)
         self.follow = follow
         self._separator, self._encoding = separator, encoding
-        self._skip, self._times = skip, tuple(times)
         self._json = self.path.suffix in JSON_LINES
+        self._skip, self._times = 0 if self._json else skip, tuple(times)
         self._resumed = FilePosition.read(position)
         self._file = GrowingFile(self.path, follow, self._resumed)
         self._ready: deque[Line] = deque()
@@ -252,7 +252,7 @@ class Follow(RowSource):
         if line.kind:
             return Row({}, token=token, broken=line.told, kind=line.kind)
         content = line.content
-        if not self._json and self._above:
+        if self._above:
             self._above -= 1
             return None
         if not content.strip():
@@ -264,30 +264,33 @@ class Follow(RowSource):
         try:
             text = content.decode(self._encoding)
             found = rows_of([text], self._separator, headed=self._header is not None)
-            cells = [cell.strip() for cell in next(found, [""])]
+            cells = list(map(str.strip, next(found, [""])))
         except (UnicodeError, csv.Error) as error:
             self._labels = 0  # rows have begun
             why = f"not a line of a CSV file ({type(error).__name__})"
             if content.startswith(UTF_16):
                 why = "the file is in UTF-16, not to be followed: write UTF-8"
             return Row({}, token=token, broken=why)
+        return self._row_of(cells, token)
+
+    def _row_of(self, cells: list[str], token: tuple[int, int]) -> Row | None:
+        """Return the row of the cells of a line; None of a header, labels or a comment."""
         if self._header is None:
             return None if is_title(cells) else self._headed(cells, token)
         if cells[0].startswith("#"):
             return None
-        if self._labels:
-            labels = are_labels(cells)
-            self._labels = self._labels - 1 if labels else 0
-            if labels:
-                return None
+        if self._labels and are_labels(cells):
+            self._labels -= 1
+            return None
+        self._labels = 0
         if self._is_header(cells):
             return self._headed(cells, token)
         if unlike(cells, self._header, self._separator):
             text = f"{len(cells)} fields, the header has {len(self._header)}"
             return Row({}, token=token, broken=text)
         values = dict(zip(self._header, cells, strict=False))
-        if len(self._times) > 1 and all(name in values for name in self._times):
-            values[self._times[0]] = " ".join(values[name] for name in self._times)
+        if len(self._times) > 1 and values.keys() >= {*self._times}:
+            values[self._times[0]] = " ".join(map(values.__getitem__, self._times))
         return Row(values, token=token)
 
     def _is_header(self, cells: list[str]) -> bool:

@@ -53,11 +53,15 @@ class Thinned:
     """
 
     def __init__(self, between: Sequence[Between]) -> None:
-        self.held: Mask = np.array([one != "line" for one in between], dtype=bool)
+        self.held: Mask = np.array(between, dtype=str) != "line"
         self._hold = [k for k, one in enumerate(between) if one == "hold"]
         self._means = {k: _Mean() for k, one in enumerate(between) if one == "next"}
         self._last = np.full(len(between), math.nan)
         self._begun = False
+
+    def stride(self, every: int) -> int:
+        """Return the number of rows of which one is read: all where a row may hold a switch."""
+        return 1 if self.held.any() else every
 
     def remember(self, row: Array) -> None:
         """Remember the values of a row before the start that hold until the next reading."""
@@ -73,20 +77,24 @@ class Thinned:
         """
         for k, mean in self._means.items():
             mean.add(t, float(row[k]))
-        changed = any(math.isfinite(row[k]) and row[k] != self._last[k] for k in self._hold)
-        self.remember(row)
         kept = chosen and whole
-        states = chosen and any(math.isfinite(row[k]) for k in self._means)
         # Before the first row that is kept, values are remembered for it.
-        if not (kept or (self._begun and (changed or states))):
+        stays = kept or (self._begun and self._states(row, chosen))
+        self.remember(row)
+        if not stays:
             return None
-        found = row.copy() if kept else np.where(self.held, row, math.nan)
-        if kept and not self._begun:
+        found: Array = row.copy() if kept else np.where(self.held, row, math.nan)
+        if not self._begun:
             found[self._hold] = self._last[self._hold]
             self._begun = True
         for k, mean in self._means.items():
             found[k] = mean.taken() if math.isfinite(row[k]) else math.nan
         return found
+
+    def _states(self, row: Array, chosen: bool) -> bool:
+        """Return whether a row changes an input that holds, or has the end of a mean."""
+        changed = any(math.isfinite(row[k]) and row[k] != self._last[k] for k in self._hold)
+        return changed or (chosen and any(math.isfinite(row[k]) for k in self._means))
 
 
 class _Mean:
@@ -344,8 +352,8 @@ def to_table(
         times = with_second_passes(times, written, clock, repeats)
     rows = Thinned([column.between for column in columns.values()])
     # Rows that are left out may hold a switch, or a part of a mean.
-    any_held = bool(rows.held.any())
-    use = _chosen(times, dates, clock, 1 if any_held else every, where)
+    stride = rows.stride(every)
+    use = _chosen(times, dates, clock, stride, where)
     holes = tuple(float(number) for number in missing)
 
     def scaled(column: Column, of: IntArray) -> Array:
@@ -360,7 +368,7 @@ def to_table(
     )
     remarks = Counter(_noise_remarks(columns, values))
     kept = np.zeros(len(use), dtype=bool)
-    kept[:: every if any_held else 1] = True
+    kept[:: every // stride] = True
     chosen = kept.copy()
     # A value that is not valid is missing; a sample is left out for its first missing channel only.
     for k, (name, channel) in enumerate(columns.items()):
@@ -373,7 +381,7 @@ def to_table(
         remarks["skipped", name] = int(lacking.sum())
     if not kept.any():
         raise DataError(f"{where[0]}: no sample has all channels that it needs.")
-    if any_held:
+    if rows.held.any():
         rows.remember(_known_before(int(use[0]), columns, scaled))
         values, kept = _with_held(times[use], values, rows, chosen, kept)
     t, values, origin = times[use][kept], values[kept], None
@@ -397,9 +405,7 @@ def _chosen(
     late = np.flatnonzero(np.diff(times[use]) <= 0)
     if len(late):
         last, t = times[use[late[0] : late[0] + 2]]
-        raise _disorder(
-            row(int(use[late[0] + 1])), bool(t == last), dates and clock.repeated_hour(t) != 0.0
-        )
+        raise _disorder(row(int(use[late[0] + 1])), t, last, clock if dates else None)
     return use
 
 
@@ -480,27 +486,19 @@ class JsonLines:
         first: dict[float, Array] = {}  # rows of an hour that clocks show twice
         needed = np.array([column.needed for column in self.columns.values()], dtype=bool)
         thinned = Thinned([column.between for column in self.columns.values()])
-        any_held = bool(thinned.held.any())
-        rows = islice(self._timed_rows(thinned), 0, None, 1 if any_held else self.every)
+        stride = thinned.stride(self.every)
+        rows = islice(self._timed_rows(thinned), 0, None, stride)
         for k, (where, row, t, dates) in enumerate(rows):
-            values = self._values(row, where)
-            if dates and is_naive(row.get(clock.name), clock) and (again := clock.repeated_hour(t)):
-                if t <= last and not np.array_equal(first.get(t, ()), values, equal_nan=True):
-                    t += again
-                else:
-                    first[t] = values
-            elif first:
-                first = {}
+            values, dated = self._values(row, where), clock if dates else None
+            t += _second_pass(t, last, row.get(clock.name), values, first, dated)
             if t <= last:
-                raise _disorder(where, t == last, dates and clock.repeated_hour(t) != 0.0)
+                raise _disorder(where, t, last, dated)
             if dates and math.isinf(last):  # the first sample is t = 0
                 zero = t
                 self.origin = origin_at(t / clock.second)
-            last = t
+            last, chosen = t, k % (self.every // stride) == 0
             whole = not np.isnan(values[needed]).any()
-            left: Array | None = values if whole else None
-            if any_held:
-                left = thinned.take(t, values, chosen=k % self.every == 0, whole=whole)
+            left = thinned.take(t, values, chosen=chosen, whole=whole)
             if left is not None:
                 yield Sample(t=t - zero, z=dict(zip(self.columns, left.tolist(), strict=True)))
 
@@ -534,6 +532,23 @@ class JsonLines:
                 yield where, row, t, dates
             elif thinned.held.any():
                 thinned.remember(self._values(row, where))
+
+
+def _second_pass(
+    t: float, last: float, cell: Any, values: Array, first: dict[float, Array], clock: Clock | None
+) -> float:
+    """Return how much later a row is than its date shows, in an hour that clocks show twice.
+
+    `first`: time -> values in the first pass of such an hour. `clock`: of times that are dates.
+    """
+    again = clock.repeated_hour(t) if clock is not None and is_naive(cell, clock) else 0.0
+    if not again:
+        first.clear()
+    elif t <= last and not np.array_equal(first.get(t, ()), values, equal_nan=True):
+        return again
+    else:
+        first[t] = values
+    return 0.0
 
 
 def row_time(
@@ -591,11 +606,12 @@ def cell_number(value: Any, where: str, decimal: str = ".") -> float:
     return number
 
 
-def _disorder(where: str, repeated: bool, set_back: bool) -> TimeOrderError:
+def _disorder(where: str, t: float, last: float, clock: Clock | None) -> TimeOrderError:
+    """Return an error about a time that is not later than the last; `clock`: of dates."""
     how, remedy = "earlier than the one before", "sort the rows."
-    if repeated:
+    if t == last:
         how, remedy = "that of the one before", "drop repeated rows."
-    if set_back:
+    if clock is not None and clock.repeated_hour(t):
         remedy = (
             "if clocks were set back, write dates with an offset, such as 2025-10-26 02:30+01:00."
         )

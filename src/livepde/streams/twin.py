@@ -184,13 +184,17 @@ class Twin:
             raise ConfigurationError("times must be two or more increasing numbers.")
         if self.truth == "analytic" and self.u_true is None:
             raise ConfigurationError("truth='analytic' needs the formula u_true(x, t).")
+        self._check_start()
+        if self.truth == "fine" and self.fine is None and not np.isfinite(self.fine_dt):
+            raise ConfigurationError("truth='fine' needs a model `fine`, a `fine_dt`, or both.")
+
+    def _check_start(self) -> None:
+        """Refuse a twin whose initial state is missing, or stated twice."""
         begun = self.model.form_initial is not None
         if begun and self.u0 is not None:
             raise ConfigurationError("the model has its own initial state: leave out u0.")
         if self.u_true is None and self.u0 is None and not begun:
             raise ConfigurationError("give u_true(x, t), or the initial state u0.")
-        if self.truth == "fine" and self.fine is None and not np.isfinite(self.fine_dt):
-            raise ConfigurationError("truth='fine' needs a model `fine`, a `fine_dt`, or both.")
 
     def __len__(self) -> int:
         return len(self.times)

@@ -1,7 +1,5 @@
 """Reduced models that keep the unknown numbers as parameters, by Galerkin projection."""
 
-from __future__ import annotations
-
 from livepde.control.reduction.galerkin import Discrete, Output
 from livepde.control.reduction.reduced import ReducedModel, reduce
 

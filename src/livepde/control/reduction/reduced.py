@@ -351,7 +351,7 @@ def reduce(
     ConfigurationError
         A control is not a channel of the model, or the model is to be linearised and u is missing.
     """
-    chosen = [name for name in model.channels if name in controls]
+    chosen = {*controls} & {*model.channels}
     if isinstance(controls, str) or not 0 < len(controls) == len(chosen):
         raise ConfigurationError(
             f"reduce: controls={controls!r}; the channels of the model are "
