@@ -545,6 +545,18 @@ def test_a_variant_without_an_unknown_lacks_what_is_read_for_it_alone(tmp_path):
     assert not run_variant(path, (), variants["no loss"]).error
 
 
+def test_no_variant_lacks_what_the_equation_needs(tmp_path):
+    """Water flows in a stream bed by `v` or by `K`: the only one of them cannot go."""
+    path = tmp_path / "case.toml"
+    flow = 'v = { prior = "0 m/s", std = "1e-6 m/s" }'
+    lines = [one for one in HEATED.splitlines() if not one.startswith(("loss", "ambient"))]
+    text = "\n".join(lines).replace('"heat"', '"advection_diffusion"')
+    path.write_text(text.replace("alpha =", f"{flow}\nkappa ="))
+    heated().iloc[:5].to_csv(tmp_path / "rod.csv", index=False)
+    found = proposed(cases.load(path).prepare(), ended("as stated", 0.0, 1.0))
+    assert "no v" not in {variant.name for variant in found}
+
+
 def test_a_setting_adds_an_unknown_only_as_a_whole(tmp_path):
     path = short_rod(tmp_path)
     whole = {"unknowns.source": {"prior": "0 K/s", "std": "1e-3 K/s"}}

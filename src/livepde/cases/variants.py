@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
 from operator import itemgetter
@@ -19,7 +20,7 @@ from livepde.cases.process import unread_without
 from livepde.cases.read import parse, settings_in, toml_key, toml_value
 from livepde.cases.remedies import first_miss, freed, usual_shift, with_settings
 from livepde.dates import since_1970
-from livepde.errors import CaseError
+from livepde.errors import CaseError, ModelError
 from livepde.plots.style import modes_told
 from livepde.records import interval_95, scalars, used_errors
 from livepde.result import Result
@@ -502,8 +503,9 @@ def _fewer(case: Case) -> Iterator[Variant]:
         if unknown.regions:
             yield Variant(f"one {name} everywhere", (f"{key}.regions=",))
         if name in optional:
-            unread = (f"{own}=" for own in unread_without(case, name))
-            yield Variant(f"no {name}", (f"{key}=", *unread))
+            with suppress(ModelError):  # the equation needs it, or another one
+                unread = [f"{own}=" for own in unread_without(case, name)]
+                yield Variant(f"no {name}", (f"{key}=", *unread))
 
 
 def _optional(case: Case) -> set[str]:

@@ -75,7 +75,7 @@ class Reading:
         for name in self.units:
             if name not in self.sensor_units:
                 raise ConfigurationError(
-                    f"units: '{name}' is no sensor, so its values are in the unit of the model: "
+                    f"units: '{name}' is not a sensor, so its values are in the unit of the model: "
                     "convert its column."
                 )
             if not self.sensor_units.get(name):
