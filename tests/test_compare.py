@@ -31,7 +31,7 @@ from livepde.cases.variants import (
     variant_of,
 )
 from livepde.errors import CaseError
-from livepde.verdict import Cause, Finding, Verdict
+from livepde.verdict import Cause, Finding, ModelErrors, Verdict
 from livepde.verdict.sentences import estimating
 
 OFFSET = 0.5  # K
@@ -190,6 +190,16 @@ def test_the_best_evidence_counts_unless_validation_sensors_are_predicted_worse(
     assert "Recommended: 'good'" in notes
     assert "'worse' fits the assimilated sensors better and predicts" in notes
     assert "evidence of 'other' is missing or counts other readings" in notes
+
+
+def test_a_variant_whose_fit_fails_is_not_recommended_beside_one_that_fits():
+    errors = ModelErrors(9.0, 0.5, {"a": 9.0}, ())
+    failed = Verdict.of(()).with_errors(errors).to_dict()
+    base, good = ended("as stated", 0.0, math.nan), ended("good", 20.0, math.nan)
+    wild = replace(ended("wild", 800.0, math.nan), verdict=failed)
+    assert recommended(base, [wild]) is base
+    assert recommended(base, [wild, good]) is good
+    assert recommended(replace(base, verdict=failed), [wild]) is wild
 
 
 def test_without_validation_sensors_the_evidence_decides():

@@ -93,6 +93,35 @@ def test_the_column_is_found_from_each_prior(name: str):
     assert fit.passes < 20
 
 
+@pytest.mark.slow
+def test_beyond_a_bound_the_other_unknowns_are_those_of_the_best_fit_within():
+    """At v = 0.28 the best D is not that which goes with the unbounded best v, 0.258."""
+    low, middle, width = 0.28, math.log(0.05), 1.0
+    v = lp.Scalar(lp.Normal(0.35, std=0.1, bounds=(low, 1.0)))
+    z = measured()
+
+    def residuals(a: np.ndarray) -> np.ndarray:
+        v, d = a[0], math.exp(middle + width * a[1])
+        prior = [(v - 0.35) / 0.1, a[1]]
+        return np.concatenate([(np.array(z) - breakthrough(v, d)) / NOISE, prior])
+
+    best = least_squares(residuals, [0.3, 0.0], bounds=([low, -10.0], [1.0, 10.0])).x
+    free = least_squares(residuals, [0.3, 0.0]).x
+    mesh = lp.interval(0.0, 16.0, 80)
+    model = lp.Model(
+        lp.Field(mesh, lp.fem.quadratic(mesh), dirichlet={"left": 0.0}),
+        {"v": v, "D": lp.LogNormal(0.05, std=0.05)},
+        A=lambda q, u, v, x: q.D * lp.dot(lp.grad(u), lp.grad(v)) + q.v * lp.grad(u)[0] * v,
+    )
+    law = lp.SensitivityLaw(shadows=None)
+    who = lp.Identifier(model, lp.Points({"c": AT}, noise=NOISE), law, u0=1.0, dt_max=0.5)
+    last = who.run(stream()).last
+    found = float(np.log(last["D"].median) - middle) / width
+    assert last["v"].mean == pytest.approx(low, abs=1e-9)
+    assert found == pytest.approx(best[1], abs=0.15 * abs(best[1] - free[1]))
+    assert abs(best[1] - free[1]) > 0.1
+
+
 def fitted(identifier: lp.Identifier) -> tuple[StoredSamples, Any]:
     samples = StoredSamples.of(identifier._work, identifier._state)
     return samples, refitted(samples, lp.laws.Refit(), last=True)

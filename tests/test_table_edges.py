@@ -251,5 +251,7 @@ def test_text_in_a_table_is_named(cell, said):
     identifier = lp.Identifier(rod, lp.Points({"T": 0.5}, noise=0.1, unit="degC"), u0=1.0)
     with pytest.raises(lp.errors.SampleError, match=said):
         identifier.run(table)
-    with pytest.raises(lp.errors.ConfigurationError, match="'a' is not a sensor, so its values are"):
+    with pytest.raises(
+        lp.errors.ConfigurationError, match="'a' is not a sensor, so its values are"
+    ):
         identifier.run(table, units={"a": "K"})

@@ -111,6 +111,12 @@ class VariantRun:
         return "failed" if self.error else str(self.verdict["level"])
 
     @property
+    def failed(self) -> bool:
+        """Whether the fit misses the readings grossly, or the run has failed."""
+        errors = Verdict.from_dict(self.verdict).errors if self.verdict else None
+        return bool(self.error) or (errors is not None and errors.failed)
+
+    @property
     def misfit(self) -> float:
         """Root mean square over the sensors."""
         return _pooled(self.misfits.values())
@@ -320,12 +326,14 @@ def recommended(base: VariantRun, others: Sequence[VariantRun]) -> VariantRun:
     """Return the variant with the best evidence that predicts the validation sensors no worse.
 
     Among variants of similar evidence it is the one with the fewest unknowns, and a usable one goes
-    first. It is the case itself if none has strong evidence against it.
+    first. It is the case itself if none has strong evidence against it, or if their fits fail and
+    its own does not.
     """
     strong = [
         (gained, one)
         for one in others
-        if (gained := one.gained(base)) > GAINED and not _worse_sensors(one, base)
+        if (gained := one.gained(base)) > GAINED
+        and not (_worse_sensors(one, base) or one.failed > base.failed)
     ]
     if not strong:
         return base

@@ -22,6 +22,7 @@ import numpy as np
 import scipy
 
 from livepde.laws.assimilation import assimilate
+from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gate import FEW, near_most, near_neighbours, usual_size
 from livepde.laws.history import intervals_since
@@ -580,9 +581,23 @@ def _filter(samples: StoredSamples, found: Found, *, last: bool) -> FilterState 
     # Sums of the verdict and errors of the discretisation stay with the filter until then: a later
     # refit of the same samples may compute them again.
     if (away <= HOLDS and usual(now)) or (away <= NEAR and not last):
-        return best
+        return _within(samples.filter, best) if last else best
     x = samples.judged(found.best, found.used)
-    return None if x is None else changed(x, evidence=evidence)
+    if x is None:
+        return None
+    x = changed(x, evidence=evidence)
+    return _within(samples.filter, x) if last else x
+
+
+def _within(filter_: Filter, x: FilterState) -> FilterState:
+    """Return a filter about a best fit, at that fit if the linear one is beyond a bound.
+
+    Each unknown held by itself at its bound would leave the others where they go with it beyond.
+    """
+    estimate = filter_.estimate(x)
+    if filter_.reduction.bounded(estimate) is estimate:
+        return x
+    return changed(x, da=np.zeros_like(x.da), du=np.zeros_like(x.du))
 
 
 def go_on(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
