@@ -592,12 +592,15 @@ def _filter(samples: StoredSamples, found: Found, *, last: bool) -> FilterState 
 def _within(filter_: Filter, x: FilterState) -> FilterState:
     """Return a filter about a best fit, at that fit if the linear one is beyond a bound.
 
-    Each unknown held by itself at its bound would leave the others where they go with it beyond.
+    Only what is beyond goes on: each unknown held by itself at its bound would leave the others
+    where they go with it.
     """
-    estimate = filter_.estimate(x)
-    if filter_.reduction.bounded(estimate) is estimate:
+    reduction, estimate = filter_.reduction, filter_.estimate(x)
+    within = reduction.bounded(estimate)
+    if within is estimate:
         return x
-    return changed(x, da=np.zeros_like(x.da), du=np.zeros_like(x.du))
+    beyond = np.where(estimate != within, estimate - x.q, 0.0)
+    return changed(x, da=reduction.reduced(beyond), du=np.zeros_like(x.du))
 
 
 def go_on(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
