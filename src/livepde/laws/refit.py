@@ -54,6 +54,7 @@ SHORTEST, LEAST = 1e-7, 1e-9  # step, and predicted decrease relative to the cos
 LARGE, DOUBTFUL = 30.0, 2.5  # mean squares of residuals that need a new search, the second one
 UNSURE = 0.5  # only where a direction keeps more than this share of its prior standard deviation
 ROUNDING = 1e-12  # share of a variance
+AT_BOUND = 1e-6  # prior standard deviations from a bound at which a fit is held by it
 QUANTILE, BLOCKS = 0.8, 8  # of mean squares, over sensors and blocks of samples
 SCREENED, FITTED, SPREAD = 32, 3, 1.5  # points, best of them that are tried, and their deviation
 # Searches from elsewhere that must end at the best trajectory, and what they leave of their misfit
@@ -581,25 +582,24 @@ def _filter(samples: StoredSamples, found: Found, *, last: bool) -> FilterState 
     # Sums of the verdict and errors of the discretisation stay with the filter until then: a later
     # refit of the same samples may compute them again.
     if (away <= HOLDS and usual(now)) or (away <= NEAR and not last):
-        return _within(samples.filter, best) if last else best
+        return _within(samples.filter, best)
     x = samples.judged(found.best, found.used)
-    if x is None:
-        return None
-    x = changed(x, evidence=evidence)
-    return _within(samples.filter, x) if last else x
+    return None if x is None else _within(samples.filter, changed(x, evidence=evidence))
 
 
 def _within(filter_: Filter, x: FilterState) -> FilterState:
     """Return a filter about a best fit, at that fit if the linear one is beyond a bound.
 
-    Only what is beyond goes on: each unknown held by itself at its bound would leave the others
-    where they go with it.
+    Only what the fit holds at a bound goes on: the others would go with it, and beyond the bound
+    each is held by itself.
     """
     reduction, estimate = filter_.reduction, filter_.estimate(x)
     within = reduction.bounded(estimate)
     if within is estimate:
         return x
-    beyond = np.where(estimate != within, estimate - x.q, 0.0)
+    latent = filter_.problem.model.latent
+    held = (estimate != within) & (np.abs(within - x.q) <= AT_BOUND * latent.deviations)
+    beyond = np.where(held, estimate - x.q, 0.0)
     return changed(x, da=reduction.reduced(beyond), du=np.zeros_like(x.du))
 
 
