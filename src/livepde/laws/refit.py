@@ -582,9 +582,12 @@ def _filter(samples: StoredSamples, found: Found, *, last: bool) -> FilterState 
     # Sums of the verdict and errors of the discretisation stay with the filter until then: a later
     # refit of the same samples may compute them again.
     if (away <= HOLDS and usual(now)) or (away <= NEAR and not last):
-        return _within(samples.filter, best)
+        return _within(samples.filter, best) if last else best
     x = samples.judged(found.best, found.used)
-    return None if x is None else _within(samples.filter, changed(x, evidence=evidence))
+    if x is None:
+        return None
+    x = changed(x, evidence=evidence)
+    return _within(samples.filter, x) if last else x
 
 
 def _within(filter_: Filter, x: FilterState) -> FilterState:
