@@ -156,7 +156,7 @@ def test_a_column_of_times_and_other_names():
 def test_units_of_columns():
     table = measured().assign(T_30=1.8 * measured()["T_30"] + 32.0)
     assert same(identifier().run(table, units={"T_30": "degF"}), rtol=1e-9)
-    with pytest.raises(lp.errors.ConfigurationError, match="units: 'T_left' is no sensor"):
+    with pytest.raises(lp.errors.ConfigurationError, match="units: 'T_left' is not a sensor"):
         identifier().run(table, units={"T_left": "degF"})
 
 
