@@ -354,7 +354,7 @@ class Model(Shown):
     def refined(self) -> Model:
         """Return the same process on a mesh whose elements are halved in every direction.
 
-        Raises `ModelError` or `SpaceError`: something that was given belongs to this mesh alone.
+        Raises `ModelError` or `SpaceError`: a part of the model is defined on this mesh alone.
         """
         mesh = halved(self.mesh)
 

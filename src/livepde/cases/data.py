@@ -128,7 +128,7 @@ def read_data(case: CaseContent, source: str | Iterable[str] | None) -> DataTabl
 def _tables(
     case: CaseContent, source: str | None, columns: Mapping[str, Column], clock: Clock
 ) -> list[DataTable]:
-    """Return the tables of a file, of the case's reader, or of its own file or files."""
+    """Return the tables of a given file, of the case's reader, or of the files that it names."""
     spec = case.spec.data
     if source is None and isinstance(spec.file, tuple):
         return _of_files(case, spec.file, columns)

@@ -263,7 +263,7 @@ class Loop:
     def load(self, path: str | os.PathLike[str]) -> None:
         """Restore a saved state; the loop must be built as the saved one was.
 
-        Raises `RunError`: the file is damaged, or belongs to another loop.
+        Raises `RunError`: the file is damaged or of another loop.
         """
         where = str(path)
         header, leaves = checkpoint.unpacked(checkpoint.read(path), where)

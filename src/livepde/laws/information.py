@@ -13,7 +13,7 @@ the prior (G_Q is divided by the square of `std`). Then the best q given all dat
     S ||q - q0||_Q^2 + int ||R^T eps(q)||^2_{D^{-1}} dt.
 
 Its recursion, recursive least squares for a field, is the second line of the method in the metric
-of the information, H = S G_Q + J in the place of G_Q/gain, J = int A^T R D^{-1} R^T A dt. With
+of the information, H = S G_Q + J instead of G_Q/gain, J = int A^T R D^{-1} R^T A dt. With
 M_op = M and theta = PULL/h all of r, about -h M^{-1} eps/PULL, comes from the step itself, and the
 stage solves
 
@@ -34,9 +34,9 @@ S is the power of the remaining equation error, as far as q sees it,
     power(eps) = mean of h ||A^T D^{-1} eps||_{Q*}^2 / mean of trace(G_Q^{-1} A^T R D^{-1} R^T A),
     S          = (power(eps_k) power(eps_k - eps_{k-1})/2)^{1/2}.
 
-Of white noise both powers are S. An error that goes on counts less, the slower it changes: errors
-of mesh, time step, smoothing and a wrong P u hold q back as noise does, and a wrong q hardly. The
-same is done with the diagonal of G_Q in the place of G_Q, and the larger S is taken: the first
+For white noise both powers are S. A lasting error counts less, the slower it changes: errors of
+mesh, time step, smoothing and P u slow q as noise does, and an error of q hardly does. The
+same is done with the diagonal of G_Q instead of G_Q, and the larger S is taken: the first
 measures the error against smooth functions, the second against rough ones, where derivatives of
 noisy data are far larger. Means weigh a sample at time t by t^FORGETS. The first sample moves
 nothing: it tells S.
@@ -55,8 +55,8 @@ to the sampling interval.
 If all of this holds, ||q - q0||_Q^2 is a sum of chi-squares with weights of at most 1, whose sum k
 is at most m and at most trace(G_Q^{-1} J)/S, with a J that has not faded. It is more than
 k + 2 sqrt(k s) + 2 s with a probability below exp(-s) (Laurent and Massart 2000). Beyond that the
-step holds q, which is a failed status, and the data go on to tell J, b and S. A bias that q
-absorbs, as of a smoothing that takes too much, is not in S (`livepde.laws.observed_part`).
+step holds q, with a failed status, and J, b and S are updated as before. S does not contain a bias
+that q absorbs, such as that of too strong smoothing (`livepde.laws.observed_part`).
 
 A diagonal D >= M (Gershgorin; the lumped mass for P1) makes A^T R D^{-1} R^T A as sparse as A^T A
 where sensors select coefficients. Else the rows are those of a basis of N(G)^perp, D is M, and the

@@ -56,7 +56,7 @@ TIMES = (1.0 / 30.0, 1.0 / 6.0, 2.0, math.inf)  # correlation times over the len
 MOST_GAIN = 0.3  # standard deviation of the scale of a sensor that is plausible
 FARTHEST = 0.1  # the same of its place, over the length of the domain
 FEWEST = 20  # readings
-SAME_ERROR = 0.03  # relative difference of two errors of a sensor that are one
+SAME_ERROR = 1e-3  # relative difference of two errors of a sensor that are one
 NEAR = 0.03  # posterior standard deviations within which a trajectory is that of the best fit
 QUANTILE = 1.96  # standard deviations to the end of a 95 % interval
 SHRINK = 10.0  # pairs of readings that the stated noise counts
@@ -278,11 +278,10 @@ def _columns(values: Array, used: Mask) -> Iterator[tuple[Array, Mask]]:
             yield column, there
 
 
-def _of_process(model: Model) -> set[str]:
-    """Return the unknowns that equation or initial state read: others are errors of sensors.
+def _read(model: Model) -> set[str]:
+    """Return the unknowns that equation or initial state read: the others are errors of sensors.
 
-    Errors of inputs, which the equation reads, are none of the process either. Probed at a drawn
-    state, with all inputs one.
+    Probed at a drawn state, with all inputs one.
     """
     rng = np.random.default_rng(0)
     latent, inputs = model.latent, Inputs(dict.fromkeys(model.channels, 1.0))
@@ -293,13 +292,7 @@ def _of_process(model: Model) -> set[str]:
         if (form := model.form_initial) is not None:
             parts.append(form.matrix("v", "q", moment, q=latent.prior))
     found = np.sum([abs(part).sum(axis=0) for part in parts], axis=0)
-    read = {name for name in latent.parts if found[model.parameter_space.part(name)].any()}
-    corrected = {
-        name
-        for name, item in latent.parts.items()
-        if isinstance(item.unknown, Scalar) and item.unknown.corrects
-    }
-    return read - corrected
+    return {name for name in latent.parts if found[model.parameter_space.part(name)].any()}
 
 
 def _allowed(
@@ -312,7 +305,10 @@ def _allowed(
     """
     problem, reduction = filter_.problem, filter_.reduction
     latent = problem.model.latent
-    own = set(latent.parts) - _of_process(problem.model)
+    own = set(latent.parts) - _read(problem.model)
+    for name, item in latent.parts.items():
+        if isinstance(item.unknown, Scalar) and item.unknown.corrects:  # an input
+            own.add(name)
     known = filter_.estimate(x)[0]
     both = (known, *ends, known - QUANTILE * std, known + QUANTILE * std)
     value, low_end, high_end, plain_low, plain_high = (
@@ -409,9 +405,9 @@ def _basis_of_sensors(samples: StoredSamples, J: Array) -> Array:
     """
     filter_ = samples.filter
     model, own = filter_.problem.model, np.zeros(filter_.reduction.size, dtype=bool)
-    process = _of_process(model)
+    read = _read(model)
     for name, evolution in zip(model.latent.parts, filter_.reduction.evolutions, strict=True):
-        own[evolution.part] = name not in process
+        own[evolution.part] = name not in read
     if not own.any():
         return np.zeros((len(J), 0))
     by_unknown = J @ np.linalg.pinv(samples.start.C[0].T)

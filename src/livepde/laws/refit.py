@@ -593,8 +593,8 @@ def _filter(samples: StoredSamples, found: Found, *, last: bool) -> FilterState 
 def _within(filter_: Filter, x: FilterState) -> FilterState:
     """Return a filter about a best fit, at that fit if the linear one is beyond a bound.
 
-    Only what the fit holds at a bound goes on: the others would go with it, and beyond the bound
-    each is held by itself.
+    Estimates are clipped to their bounds one by one. An unknown at its bound keeps the linear step,
+    so that it is clipped there; the others keep the values of the fit, without that step.
     """
     reduction, estimate = filter_.reduction, filter_.estimate(x)
     within = reduction.bounded(estimate)

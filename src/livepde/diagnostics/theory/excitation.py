@@ -142,7 +142,7 @@ class Excitation:
     ) -> ExcitationState:
         """Take the state estimate w at a time; return the new state.
 
-        `w`: u_alpha + P u, or the estimate u if they hardly differ; shape (n,). `inputs`: input
+        `w`: u_alpha + P u, or u where both are close, shape (n,). `inputs`: input
         channels at t. `q`: estimate of the parameter, shape (m,), default the prior mean: the
         linearisation point of A for a model that is nonlinear in the latent coefficients.
         """
