@@ -111,10 +111,11 @@ def _misplaced(
     """
     positions = stated_positions(problem.observed)
     shifts, step = sensor_shifts(problem.model, problem.observed)
+    every = np.column_stack(states)
     for axis, matrix in enumerate(shifts):
         size = abs(matrix)
-        slope = np.array([matrix @ u for u in states]) / step
-        terms = np.array([size @ np.abs(u) for u in states]) / step
+        slope = (matrix @ every).T / step
+        terms = (size @ np.abs(every)).T / step
         for k in range(len(step)):
             slope[:, k] = beyond_rounding(slope[:, k], terms[:, k])
         vertices = np.asarray(problem.model.mesh.p)[axis]

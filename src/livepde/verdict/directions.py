@@ -163,7 +163,7 @@ def later(stage: ForwardStage, p: Array, now: Now, h: float, loads: Array, lifts
         return found
     free = stage.model.X.free
     factor, rows = stage.linearised(now.u, now.q, h, now.moment)
-    known = np.array([stage.model.mass @ one for one in p]) / h + loads
+    known = (stage.model.mass @ p.T).T / h + loads
     if lifted.any():
         known[lifted] -= np.asarray((rows @ lifts[lifted].T).T)
     known *= free
