@@ -53,6 +53,7 @@ PROBED = (0.0, 0.3, 1.0, 1e3, 1e6)
 # Number of products of local functions up to which a trilinear form is stored as a sparse matrix.
 # Beyond, element tensors need less memory.
 LARGEST_TENSOR = 5_000_000
+FEW = 12  # unknown numbers for which a form that is not linear in them is fixed once
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +201,7 @@ class Form(FormMatrices):
         self._tensors: dict[tuple[str, str], Tensor] = {}
         self._scatters: dict[tuple[str, str], Scatter] = {}
         self._products: list[TensorTerm] | None = None
+        self._about: FormAbout | None = None
 
     def on(self, cells: IntArray) -> Form:
         """Return the form integrated over some cells of the mesh, and over their facets.
@@ -460,6 +462,22 @@ class Form(FormMatrices):
                 return product
         return self._quadrature(rows, cols, moment, coefficients)
 
+    @cached_property
+    def fixed_by_numbers(self) -> bool:
+        """True if a constant form is affine in u as soon as a few unknown numbers are given."""
+        few = self.parameter is not None and self.spaces[self.parameter].dim <= FEW
+        return few and not self.linear_in_parameter and self.constant and self.affine
+
+    def about(self, q: Array) -> FormAbout:
+        """Return the form about few numbers, cached for the last q; see `fixed_by_numbers`.
+
+        A process takes many steps with the same numbers, and would integrate the form in each.
+        """
+        kept = self._about  # read once: copies of an identifier may step in other threads
+        if kept is None or not np.array_equal(kept.q, q):
+            self._about = kept = FormAbout(self, q.copy())
+        return kept
+
     def product(
         self, rows: str, cols: str, x: Array, moment: Moment = START, **coefficients: Array
     ) -> Array:
@@ -601,11 +619,11 @@ class Form(FormMatrices):
             self._tensors[rows, cols] = make(rows, cols, third)
         return self._tensors[rows, cols]
 
-    def _sparse(self, rows: str, cols: str, third: str) -> sp.csr_array:
+    def _sparse(self, rows: str, cols: str, third: str, q: Array | None = None) -> sp.csr_array:
         places = self._scatter(rows, cols)
         total = sp.csr_array((places.pattern.nnz, self.spaces[third].dim))
         for number, term in enumerate(self.terms):
-            parts = [local for _, local in self._trilinear_parts(term, rows, cols, third)]
+            parts = [local for _, local in self._trilinear_parts(term, rows, cols, third, q=q)]
             local = np.concatenate(parts, axis=-1)
             at = np.broadcast_to(places.places(number)[:, :, None], local.shape).ravel()
             dofs = self.spaces[third].dofs_on(term.measure)
@@ -629,15 +647,51 @@ class Form(FormMatrices):
         return ElementTensor(self._products, slots, self._scatter(rows, cols))
 
     def _trilinear_parts(
-        self, whole: _Term, first: str, second: str, third: str
+        self, whole: _Term, first: str, second: str, third: str, *, q: Array | None = None
     ) -> Iterator[tuple[slice, Array]]:
-        """Yield the integrals over elements of all products of local functions, (i, j, n, E)."""
+        """Yield the integrals over elements of all products of local functions, (i, j, n, E).
+
+        Of a form that is not linear in its parameter, about the parameter q.
+        """
         axes = {first: 0, second: 1, third: 2}
         for at, term in whole.pieces():
             values = {key: local.units(axes[key], 3) for key, local in term.spaces.items()}
+            if q is not None and self.parameter is not None:
+                own = term.spaces[self.parameter].values(q)[:, None, None, None]
+                values[self.parameter] = own + 1j * STEP * values[self.parameter]
             density, _ = term.evaluate(values, START)
             if self.nonlinear is not None:
                 values[self.nonlinear] = 0.0 * values[self.nonlinear]
                 density = density - term.evaluate(values, START)[0]
+            density = np.asarray(density) if q is None else np.imag(density) / STEP
             a, b, c = (term.spaces[key] for key in (first, second, third))
-            yield at, a.tripled(np.asarray(density), term.measure.weights, b, c)
+            yield at, a.tripled(density, term.measure.weights, b, c)
+
+
+@dataclass(frozen=True, eq=False)
+class FormAbout:
+    """A form A(q, u, v) about few numbers q, affine in u."""
+
+    form: Form
+    q: Array
+
+    @cached_property
+    def at_zero(self) -> Array:
+        """The derivative in v at u = 0, shape (n,)."""
+        return self.form.vector("v", q=self.q, u=np.zeros(self.form.spaces["u"].dim))
+
+    @cached_property
+    def by_state(self) -> Array:
+        """Data of the derivative in v and u."""
+        return self.form.data("v", "u", q=self.q)
+
+    @cached_property
+    def _by_numbers(self) -> tuple[Array, sp.csr_array]:
+        """Data of the derivative in v and q at u = 0, and their slope in u."""
+        slope = self.form._sparse("v", "q", "u", self.q)
+        return self.form.data("v", "q", q=self.q), slope
+
+    def product(self, x: Array, u: Array) -> Array:
+        """Return the derivative in v and q at u times x, shape (m, k)."""
+        at_zero, slope = self._by_numbers
+        return self.form.pattern("v", "q").product(at_zero + slope @ u, x)

@@ -412,9 +412,8 @@ def _changed(model: Model, direction: Array) -> Load:
     """Return the derivative of the load by a latent unknown."""
 
     def load(now: Now) -> Array:
-        ends = (now.q + STEP * direction, now.q - STEP * direction)
-        up, down = (force(model, now._replace(q=q)) for q in ends)
-        return beyond_rounding(up - down, up) / (2.0 * STEP)
+        driven = model.form_A.product("v", "q", direction, now.moment, q=now.q, u=now.u)
+        return beyond_rounding(-driven, force(model, now) / STEP)
 
     return load
 

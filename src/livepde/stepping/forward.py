@@ -154,6 +154,8 @@ class ForwardStage:
             self._rate = rate = (h, data)
         if self._slope is not None:
             changing: Array = self._slope @ q
+        elif self.form.fixed_by_numbers:
+            changing = maps["A"] @ self.form.about(q).by_state
         else:
             changing = maps["A"] @ self.form.data("v", "u", moment, u=zero, q=q)
         return changing + rate[1]
@@ -213,6 +215,8 @@ class ForwardStage:
         if not model.constant:
             return model.B(zero, moment) + self.form.vector("v", moment, q=q, u=zero)
         offset, constant = self._offset
+        if self.form.fixed_by_numbers:
+            return offset + self.form.about(q).at_zero
         if constant is None:
             return offset + self.form.vector("v", moment, q=q, u=zero)
         return offset + constant @ q if constant.data.any() else offset
@@ -395,7 +399,10 @@ class ForwardStage:
     ) -> Array:
         """Return the right-hand sides of tangents, shape (n, r)."""
         at = {} if self.form.linear_in_parameter else {"q": self.model.latent.value(q)}
-        forcing = self.form.product("v", "q", directions, moment, u=u, **at)
+        if self.form.fixed_by_numbers:
+            forcing = self.form.about(at["q"]).product(directions, u)
+        else:
+            forcing = self.form.product("v", "q", directions, moment, u=u, **at)
         driven: Array = self._mass @ c
         driven /= h
         driven -= forcing
