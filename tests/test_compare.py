@@ -207,6 +207,22 @@ def test_without_validation_sensors_the_evidence_decides():
     assert recommended(base, [better]) is better
 
 
+def test_causes_that_the_data_cannot_distinguish_widen_the_intervals():
+    low, high, far = (LastEstimate(k, 0.1, k - 0.2, k + 0.2) for k in (1.0, 2.0, 9.0))
+    base = ended("as stated", 0.0, math.nan, estimates={"k": high})
+    first = ended("gain of a", 50.2, math.nan, estimates={"k": low})
+    second = ended("gain of b", 50.0, math.nan, estimates={"k": high, "gain[b]": far})
+    refuted = ended("offset", 40.0, math.nan, estimates={"k": far})
+    best = recommended(base, [first, second, refuted])
+    assert (best.variant, best.rivals, best.level) == (first.variant, ("gain of b",), "caution")
+    assert best.estimates["k"] == replace(low, low=0.8, high=2.2)
+    notes = " ".join(conclusions(base, [first, second, refuted]))
+    assert "cannot distinguish it from 'gain of b', with other values of k." in notes
+    # Variants that agree confirm each other.
+    agreed = replace(second, estimates={"k": replace(low, high=1.3)})
+    assert recommended(base, [first, agreed, refuted]) is first
+
+
 def test_an_unknown_that_depends_on_the_variant_is_named():
     near, far = LastEstimate(1.0, 0.1, 0.8, 1.2), LastEstimate(2.0, 0.1, 1.8, 2.2)
     base = ended("as stated", 10.0, 1.0, estimates={"k": near, "c": near})

@@ -104,11 +104,14 @@ class VariantRun:
     validation: Mapping[str, float] = field(default_factory=dict)
     estimates: Mapping[str, LastEstimate] = field(default_factory=dict)
     unknowns: int = 0  # numbers, and modes of fields
+    # Variants that fit as well with other values; the intervals contain theirs.
+    rivals: tuple[str, ...] = ()
 
     @property
     def level(self) -> str:
-        """Level of the verdict; "failed" of a run that failed."""
-        return "failed" if self.error else str(self.verdict["level"])
+        """Level of the verdict, at most "caution" with rivals; "failed" of a run that failed."""
+        level = "failed" if self.error else str(self.verdict["level"])
+        return "caution" if self.rivals and level == "trusted" else level
 
     @property
     def failed(self) -> bool:
@@ -152,6 +155,19 @@ class VariantRun:
             if name in base.estimates and not one.overlaps(base.estimates[name])
         ]
 
+    def beside(self, rivals: Sequence[VariantRun]) -> VariantRun:
+        """Return the run with intervals that contain those of its rivals."""
+
+        def both(name: str, own: LastEstimate) -> LastEstimate:
+            each = [own, *(one.estimates[name] for one in rivals if name in one.estimates)]
+            return replace(
+                own, low=min(one.low for one in each), high=max(one.high for one in each)
+            )
+
+        estimates = {name: both(name, own) for name, own in self.estimates.items()}
+        names = tuple(one.variant.name for one in rivals)
+        return replace(self, estimates=estimates, rivals=names)
+
     def to_dict(self) -> dict[str, Any]:
         """Return the run as JSON can hold it."""
         return {
@@ -164,6 +180,7 @@ class VariantRun:
             "misfit": _known(self.misfit),
             "validation_error": _known(self.validation_error),
             "unknowns": self.unknowns,
+            "rivals": list(self.rivals),
             "estimates": {
                 name: {key: _known(value) for key, value in vars(one).items()}
                 for name, one in self.estimates.items()
@@ -327,7 +344,8 @@ def recommended(base: VariantRun, others: Sequence[VariantRun]) -> VariantRun:
 
     Among variants of similar evidence it is the one with the fewest unknowns, and a usable one goes
     first. It is the case itself if none has strong evidence against it, or if their fits fail and
-    its own does not.
+    its own does not. Variants of similar evidence that exclude its estimates are its rivals: which
+    one is right the data cannot tell, as a scale of one of two sensors.
     """
     strong = [
         (gained, one)
@@ -340,7 +358,9 @@ def recommended(base: VariantRun, others: Sequence[VariantRun]) -> VariantRun:
     usable = [(gained, one) for gained, one in strong if one.level in USABLE] or strong
     best, _ = max(usable, key=itemgetter(0))
     near = [(one.unknowns, -gained, one) for gained, one in usable if gained > best - GAINED]
-    return min(near, key=itemgetter(0, 1))[-1]
+    chosen: VariantRun = min(near, key=itemgetter(0, 1))[-1]
+    rivals = [one for *_, one in near if one.apart(chosen)]
+    return chosen.beside(rivals) if rivals else chosen
 
 
 def _worse_sensors(one: VariantRun, base: VariantRun) -> list[str]:
@@ -366,7 +386,7 @@ def conclusions(base: VariantRun, others: Sequence[VariantRun]) -> list[str]:
         remarks = iter(())
     failed = _names_of(one for one in others if one.error)
     why = [f"Not compared, because they failed: {failed}."] if failed else []
-    return [text, *why, *remarks, *_disagreements(best, [base, *others])]
+    return [text, *_equals(best, others), *why, *remarks, *_disagreements(best, [base, *others])]
 
 
 def _recommendation(base: VariantRun, best: VariantRun) -> str:
@@ -386,6 +406,21 @@ def _recommendation(base: VariantRun, best: VariantRun) -> str:
     else:
         text += " No validation sensor confirms it."
     return text
+
+
+def _equals(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
+    """Iterate over sentences on the rivals of the recommended variant."""
+    if not best.rivals:
+        return
+    names = ", ".join(f"'{name}'" for name in best.rivals)
+    own = next(one for one in others if one.variant == best.variant)
+    rivals = [one for one in others if one.variant.name in best.rivals]
+    differ = ", ".join(dict.fromkeys(name for one in rivals for name in own.apart(one)))
+    yield (
+        f"These data cannot distinguish it from {names}, with other values of {differ}. The "
+        "intervals of the recommended variant contain theirs. A run of it alone has narrower "
+        "intervals: find out which variant is right before you use them."
+    )
 
 
 def _remarks(base: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
