@@ -44,6 +44,19 @@ def test_a_reading_that_is_refused_counts_as_one_at_the_limit_of_the_gate(refit)
     assert refused.to_xarray().attrs["log_evidence"] == refused.log_evidence
 
 
+def test_the_readings_of_a_sensor_that_is_set_aside_count_after_a_refit_too():
+    law = lp.SensitivityLaw(gate=6.0, shadows=None)
+    broken, missing = (
+        [lp.Sample(t=one.t, z={"a": value}) if one.t > 1.6 else one for one in readings()]
+        for value in (-127.0, math.nan)
+    )
+    found, without = run(broken, law), run(missing, law)
+    assert [one.what for one in found.verdict.findings if one.what == "aside"] == ["aside"]
+    each = math.log(NOISE) + 0.5 * math.log(2.0 * math.pi) + 0.5 * 6.0**2
+    lost = without.log_evidence - found.log_evidence
+    assert lost == pytest.approx(sum(one.t > 1.6 for one in broken) * each, rel=0.01)
+
+
 def test_a_law_without_covariance_has_no_evidence():
     law = lp.GradientLaw()
     assert math.isnan(run(readings(), law).log_evidence)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.laws.assimilation import OK, Assimilation, MemberReports, UpdateOptions
+from livepde.laws.assimilation import HALF_LOG, OK, Assimilation, MemberReports, UpdateOptions
 from livepde.laws.filter import Filter, robust_factors
 from livepde.laws.filter_state import NO_LEDGER, FilterState, unaccompanied
 from livepde.laws.history import added, trimmed, withdrawn
@@ -76,6 +76,19 @@ class SensitivityWork:
     @cached_property
     def _of_sensors(self) -> IntArray:
         return rows_of_sensors(self.filter.problem, self.filter.reduction)
+
+    def evidence_of_refused(self, log: Array, kept: Array, level: Array) -> Array:
+        """Return the log densities at the limit of the gate of the readings that `kept` lacks.
+
+        `level`: variance of the noise over the stated one, shape (members,).
+        """
+        sensors = len(self.filter.noise)
+        readings, stds = slice(1, 1 + sensors), slice(1 + sensors, 1 + 2 * sensors)
+        lost = np.isfinite(log[:, :, readings]) & ~np.isfinite(kept[:, :, readings])
+        stated = np.where(np.isfinite(log[:, :, stds]), log[:, :, stds], self.filter.noise)
+        limit = self.options.gate.beyond
+        each = np.log(stated * np.sqrt(level)[:, None, None]) + HALF_LOG + 0.5 * limit**2
+        return np.asarray(-np.where(lost, each, 0.0).sum(axis=(1, 2)))
 
     def at_level(self, start: FilterState, now: FilterState) -> FilterState:
         """Return the filter at the start, where the noise has the level that was found since.
@@ -332,7 +345,7 @@ def stored(
     log = added(state.log, span, taken, now.parts)
     parts["log"] = log
     if np.count_nonzero(now.screened.aside):
-        parts |= _set_aside(state, now, log, taken)
+        parts |= _set_aside(work, state, now, log, taken)
     if work.window:
         parts["assimilated"] = state.assimilated + (taken & span.present)
     # After a pause the state is another one, too.
@@ -347,19 +360,23 @@ def stored(
 
 
 def _set_aside(
-    state: SensitivityState, now: FilterState, log: Array, taken: Mask
+    work: SensitivityWork, state: SensitivityState, now: FilterState, log: Array, taken: Mask
 ) -> dict[str, Any]:
     """Return the fields that change with sensors set aside, which bring no measurements.
 
     From the first one that misfitted on. A refit under way that has used one of them is dropped.
     """
     kept = withdrawn(log, now.screened.aside & taken[:, None], now.screened.since)
-    if kept is log or not len(state.fork):
-        return {"log": kept}
-    row = int(state.fork.row[0]) + 1
+    if kept is log:
+        return {"log": log}
+    # A refit knows them no longer, but counts them, as refused ones: else a case would gain or lose
+    # evidence, by the unit of the sensor, where it uses fewer readings.
+    evidence = state.start.evidence + work.evidence_of_refused(log, kept, now.level)
+    parts = {"log": kept, "start": changed(state.start, evidence=evidence)}
+    row = int(state.fork.row[0]) + 1 if len(state.fork) else 0
     if np.array_equal(kept[:, :row], log[:, :row], equal_nan=True):
-        return {"log": kept}
-    return {"log": kept, "fork": Fork.none(now), "due": state.assimilated}
+        return parts
+    return {**parts, "fork": Fork.none(now), "due": state.assimilated}
 
 
 def _points_of_return(
