@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.sparse as sp
+import xarray as xr
 from factories import diffusion, laplace, line, observe, product, truth
 from skfem import ElementLineP1
 
@@ -254,3 +255,20 @@ def test_options_of_a_result_are_checked():
     for n in (0, -1, 2.5):
         with pytest.raises(lp.errors.ConfigurationError, match="sample: n must be"):
             result.sample(n)
+
+
+def test_names_and_masks_of_arrays_count():
+    """They were dropped: a masked reading counted as measured, another sensor's as one's own."""
+    sensors = lp.Points({"a": 0.2, "b": 0.6}, noise=0.1)
+    for given in (
+        np.ma.masked_array([0.7, 99.0], [False, True]),
+        {"a": 0.7, "b": pd.NA},
+        pd.Series({"b": pd.NA, "a": 0.7}),
+        xr.DataArray([np.nan, 0.7], {"sensor": ["b", "a"]}),
+    ):
+        estimate = lp.Identifier(conduction(), sensors).step(0.1, given)
+        assert np.isnan(estimate.innovation).tolist() == [False, True]
+        other = lp.Identifier(conduction(), sensors).step(0.1, [0.7, np.nan])
+        assert estimate.q[0] == other.q[0]
+    with pytest.raises(lp.errors.SampleError, match="not a number"):
+        lp.Identifier(conduction(), sensors).step(0.1, np.array([0.7 + 1j, 0.2]))

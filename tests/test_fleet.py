@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from factories import laplace, line, truth
@@ -380,6 +381,33 @@ def test_channels_by_name_and_validation_sensors():
     assert estimate.innovation[0, 0] == pytest.approx(estimate.innovation[1, 0] + 0.7)
 
 
+def test_values_with_names_are_those_of_the_members_of_these_names():
+    """They were taken in their order: each member took the readings of another."""
+    z = np.array([[0.1, 0.2, np.nan], [0.4, 0.5, 0.6]])
+    rows = pd.DataFrame(z, ["north", "south"], ["T_1", "T_2", "T_3"]).loc[["south", "north"]]
+    heated = pd.Series({"south": 1.0, "north": 0.5})
+    plain = fleet_of_two().step(0.1, z, {"T_0": [0.5, 1.0], "ambient": 0.0})
+    for readings, T_0 in (
+        (rows, heated),
+        ({name: rows[name] for name in rows}, dict(heated)),
+        (
+            {name: rows[name].rename_axis("member").to_xarray() for name in rows},
+            heated.rename_axis("member").to_xarray(),
+        ),
+        (np.ma.masked_array(np.nan_to_num(z), np.isnan(z)), heated),
+    ):
+        named = fleet_of_two().step(0.1, readings, {"T_0": T_0, "ambient": 0.0})
+        np.testing.assert_array_equal(named.q, plain.q)
+        np.testing.assert_array_equal(named.innovation, plain.innovation)
+
+
+def test_a_missing_input_leaves_the_value_among_the_readings():
+    row = {"T_1": 0.2, "T_0": [0.1, np.nan], "ambient": 0.0}
+    estimate = fleet_of_two().step(0.1, row, {"T_0": [np.nan, 0.3]})
+    other = fleet_of_two().step(0.1, {"T_1": 0.2}, {"T_0": [0.1, 0.3], "ambient": 0.0})
+    np.testing.assert_array_equal(estimate.innovation, other.innovation)
+
+
 @pytest.mark.slow
 def test_a_run_becomes_a_dataset_with_a_dimension_of_members():
     fleet = lp.Fleet(rod(), SENSORS, LAWS["plain"], ["north", "south"])
@@ -416,6 +444,13 @@ INPUTS = {"T_0": 0.1, "ambient": 0.0}
             r"channel 'T_1' has shape \(3,\)",
         ),
         ((0.1, np.zeros((2, 3)), {"T_9": 1.0}), lp.errors.SampleError, "unknown input 'T_9'"),
+        ((0.1, {"T_1": {"north": 1.0}}, INPUTS), lp.errors.SampleError, "each of the members"),
+        ((pd.Timestamp(0), np.zeros((2, 3)), INPUTS), lp.errors.SampleError, "time t is the date"),
+        (
+            (0.1, {"T_1": 0.1, "T_0": [0.1, 0.2]}, {"T_0": 0.1}),
+            lp.errors.SampleError,
+            "'T_0' of member 'south' is 0.2 among the readings and 0.1",
+        ),
         ((-0.1, np.zeros((2, 3)), INPUTS), lp.errors.TimeOrderError, "not later"),
         (
             (0.1, np.zeros((2, 3)), {"T_0": [0.1, np.nan], "ambient": 0.0}),
@@ -441,6 +476,16 @@ def test_bad_members():
         lp.Fleet(rod(), SENSORS, LAWS["plain"], ["a", "a"])
     with pytest.raises(lp.errors.ConfigurationError, match="a list of 3 for 2 members"):
         lp.Fleet(rod(), SENSORS, LAWS["plain"], 2, u0=[0.0, 0.0, 0.0])
+    with pytest.raises(lp.errors.ConfigurationError, match="got 'north'; expected their count"):
+        lp.Fleet(rod(), SENSORS, LAWS["plain"], "north")
+    fleet = fleet_of_two()
+    estimate = fleet.step(0.1, np.zeros((2, 3)), INPUTS)
+    for look in (fleet.identifier, estimate.member):
+        for member in ("east", 2):
+            with pytest.raises(lp.errors.ConfigurationError, match="it has north, south"):
+                look(member)
+    with pytest.raises(lp.errors.SampleError, match="no table as a whole"):
+        fleet.run(pd.DataFrame())
 
 
 def test_statistics_of_innovations_are_those_of_each_member():

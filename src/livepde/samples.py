@@ -134,16 +134,46 @@ def by_name(z: Any, names: Sequence[str]) -> dict[str, Any]:
     return found
 
 
+def _series(values: Any) -> Any:
+    """Return a data array with one labelled axis as a series, and anything else as it is."""
+    if getattr(values, "ndim", 0) == 1 and hasattr(values, "to_series") and len(values.coords):
+        return values.to_series()
+    return values
+
+
 def labelled(z: Any) -> Any:
-    """Return a row of a pandas table as a mapping: its names count, not its order."""
+    """Return a row of a pandas table as a mapping: its names count, not its order.
+
+    So do those of a data array of xarray with one axis. A dataset is a mapping already.
+    """
+    z = _series(z)
     if isinstance(z, Mapping) or not (hasattr(z, "to_dict") and hasattr(z, "keys")):
-        return z  # an xarray.Dataset is a mapping already, a DataArray has no names
+        return z
     if not all(isinstance(name, str) for name in z.keys()):  # noqa: SIM118
         return z
     named: dict[str, Any] = z.to_dict()
     if len(named) < len(z):
         raise SampleError("two values of the sample have the same name; rename one.")
     return named
+
+
+def in_order_of(members: Sequence[str], values: Any, what: str) -> Any:
+    """Return values with labels in the order of the members of a fleet, and others as they are.
+
+    Those of a mapping, a series or a data array have labels. `what` names them in messages.
+    """
+    values = _series(values)
+    if isinstance(values, np.ndarray) or not (hasattr(values, "items") and hasattr(values, "keys")):
+        return values
+    labels, each = list(values.keys()), list(values.items())
+    found = {str(label): value for label, value in each}
+    if len(found) == len(each) and found.keys() == set(members):
+        return [found[name] for name in members]
+    if isinstance(values, Mapping) or labels != list(range(len(members))):
+        raise SampleError(
+            f"{what} has values for {labels}; expected one for each of the members {list(members)}."
+        )
+    return values  # a series that is only numbered
 
 
 def mapped(given: Any, what: str) -> Mapping[str, Any]:
@@ -157,10 +187,10 @@ def mapped(given: Any, what: str) -> Mapping[str, Any]:
 
 
 def number(value: Any, what: str) -> float:
-    """Return a float; None is missing (NaN). `what` names it in messages."""
+    """Return a float; None, NA or masked is missing (NaN). `what` names it in messages."""
     if type(value) is float and math.isfinite(value):
         return value
-    if value is None:
+    if value is None or value is np.ma.masked or type(value).__name__ == "NAType":
         return np.nan
     if isinstance(value, str | bytes | bool):
         raise SampleError(f"{what}: got {value!r}; expected a number (NaN if it is missing).")
@@ -174,8 +204,12 @@ def number(value: Any, what: str) -> float:
 
 
 def numbers(values: Any, what: str) -> Array:
-    """Return an array of floats. `what` names it in messages."""
+    """Return an array of floats, NaN where it is masked. `what` names it in messages."""
     try:
+        if np.iscomplexobj(values):
+            raise TypeError
+        if isinstance(values, np.ma.MaskedArray):
+            values = np.ma.filled(values.astype(float), np.nan)
         array: Array = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
         raise SampleError(f"{what} = {values!r} holds something that is not a number.") from None
@@ -213,6 +247,8 @@ def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
     usual = type(z) is np.ndarray and z.dtype == float and z.shape == (observed.size,)
     if usual and np.count_nonzero(np.isfinite(z)) == z.size:
         return np.array(z), None
+    if isinstance(z, np.ma.MaskedArray):
+        z = numbers(z, "z")
     pairs = False
     with suppress(ValueError):  # rows of several lengths
         pairs = np.shape(z) == (observed.size, 2)

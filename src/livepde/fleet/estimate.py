@@ -20,11 +20,23 @@ from livepde.linalg import Array, IntArray, Mask
 from livepde.model import Model
 from livepde.records import NOTE, STATUS_CODES, STATUS_FLAGS, Layout, Record, Snapshot
 from livepde.result import Estimate, kept
+from livepde.showing import listed
 
 if TYPE_CHECKING:
     import xarray as xr
 
 MEMBER = "member"  # dimension of the dataset
+
+
+def number_of(members: Sequence[str], member: str | int) -> int:
+    """Return the number of a member, which is given by its name or number."""
+    if member in members:
+        return members.index(str(member))
+    if isinstance(member, int) and -len(members) <= member < len(members):
+        return member % len(members)
+    raise ConfigurationError(
+        f"there is no member {member!r} in this fleet: it has {listed(members)}."
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -121,7 +133,7 @@ class FleetEstimate:
 
     def member(self, name: str | int) -> Estimate:
         """Return the estimate of one member, by name or number, as `Identifier.step` does."""
-        k = name if isinstance(name, int) else self.members.index(name)
+        k = number_of(self.members, name)
         return Estimate(
             t=self.t,
             belief=self.belief(k),

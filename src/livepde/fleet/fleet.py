@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike
 
 from livepde import checkpoint, errors
 from livepde.checkpoint import Fingerprint
+from livepde.dates import stamp_of
 from livepde.fem import Inputs, Moment
 from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEngine, beginnings
-from livepde.fleet.estimate import FleetEstimate, FleetResult
+from livepde.fleet.estimate import FleetEstimate, FleetResult, number_of
 from livepde.frames import layout_of
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status
@@ -25,7 +26,17 @@ from livepde.linalg import Array, IntArray, nonfinite_allowed
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.records import STATUS_CODES
-from livepde.samples import check_noise, noise_channel
+from livepde.samples import (
+    check_noise,
+    in_order_of,
+    is_frame,
+    is_tabular,
+    mapped,
+    noise_channel,
+    number,
+    numbers,
+    sample_of,
+)
 from livepde.start import initial_errors, initial_readings
 from livepde.stepping import Advance, Between, Scheme, Span, own_noise
 
@@ -248,7 +259,8 @@ class Fleet:
         z
             Measurements, shape (members, sensors), NaN where missing, or (members, sensors, 2) with
             the noise of each; or channel name -> a number for all members, or one for each, noise
-            as "noise of T_1".
+            as "noise of T_1", such as a pandas table with a row for each member. Values with
+            labels, as of a series or a mapping, are those of the members of these names.
         inputs
             Input channels, each a number for all members, or one for each; NaN holds the last one.
 
@@ -257,10 +269,15 @@ class Fleet:
         SampleError, TimeOrderError, MissingInputError
             As `Identifier.step`.
         """
-        t = float(t)
+        if stamp_of(t) is not None:
+            raise errors.SampleError(
+                f"time t is the date {t}; the times of a fleet are numbers: give the time since "
+                "a date of your choice, in the unit of the model."
+            )
+        t = number(t, "time t")
         if not np.isfinite(t):
             raise errors.SampleError(f"time t is {t}; give the time of the sample.")
-        measured, noise, validation, named = self._parsed(z, inputs or {})
+        measured, noise, validation, named = self._parsed(z, inputs)
         self._one._check_weighs(noise)
         # The times of members differ after a failed step: a sample has to be later than all.
         last = float(self._t.max())
@@ -392,7 +409,7 @@ class Fleet:
 
         Steps of this identifier do not change the fleet.
         """
-        k = member if isinstance(member, int) else self.members.index(member)
+        k = number_of(self.members, member)
         state = None if self._state is None else self._engine.member(self._state, k)
         ends = {name: values[k].copy() for name, values in self.ends.items()}
         # Kept, since its fingerprint is computed once for all checkpoints of this member.
@@ -443,26 +460,46 @@ class Fleet:
 
     def run(self, stream: Iterable[Sequence[Any]]) -> FleetResult:
         """Take every sample of a stream, (t, z) or (t, z, inputs), and collect the estimates."""
+        if is_tabular(stream):
+            raise errors.SampleError(
+                "a fleet takes no table as a whole: give (t, z) or (t, z, inputs) for each time."
+            )
         result = FleetResult(self.members, layout_of(self.model, self.observed, self.validation))
-        for sample in stream:
-            result.add(self.step(*sample))
+        for item in stream:
+            sample = sample_of(item)
+            result.add(self.step(sample.t, sample.z, sample.inputs))
         if result.last is not None:
             result._settle(self._settled(result.last))
         return result
 
     def _parsed(
-        self, z: Values, inputs: Mapping[str, ArrayLike]
+        self, z: Values, inputs: Mapping[str, ArrayLike] | None
     ) -> tuple[Array, Array | None, Array, dict[str, Array]]:
         """Return assimilated values and their noise, validation values and inputs, all checked."""
+        z = mapped(z, "z") if is_frame(z) else z
         parse = self._by_name if isinstance(z, Mapping) else self._by_place
         measured, noise, validation, named = parse(z)
-        for name, values in inputs.items():
+        for name, values in mapped(inputs, "inputs").items():
             if name not in self.inputs:
                 raise errors.SampleError(
                     f"unknown input '{name}'; model and sensors have {list(self.inputs)}."
                 )
-            named[name] = self._column(name, values)
+            named[name] = self._given_once(name, named.get(name), self._column(name, values))
         return measured, None if noise is None else own_noise(noise), validation, named
+
+    def _given_once(self, name: str, before: Array | None, column: Array) -> Array:
+        """Return the values of an input; `before` are those among the readings, None without."""
+        if before is None:
+            return column
+        twice = (before != column) & ~np.isnan(before) & ~np.isnan(column)
+        sensors = {*self.observed.names, *(self.validation.names if self.validation else ())}
+        if twice.any() and name not in sensors:  # a sensor may have the name of an input
+            k = int(np.argmax(twice))
+            raise errors.SampleError(
+                f"input '{name}' of member '{self.members[k]}' is {before[k]:g} among the readings "
+                f"and {column[k]:g} among the inputs; give one of them."
+            )
+        return np.where(np.isnan(column), before, column)
 
     def _by_name(self, z: Any) -> tuple[Array, Array | None, Array, dict[str, Array]]:
         hidden = self.validation.names if self.validation else ()
@@ -506,7 +543,8 @@ class Fleet:
 
     def _column(self, name: str, values: ArrayLike) -> Array:
         """Return a value of a channel for each member."""
-        array = _numbers(f"channel '{name}'", values)
+        what = f"channel '{name}'"
+        array = _numbers(what, in_order_of(self.members, values, what))
         if array.shape not in ((), (len(self),)):
             raise errors.SampleError(
                 f"channel '{name}' has shape {array.shape}; give one number for all, or "
@@ -615,6 +653,10 @@ class Fleet:
 
 def _named(members: int | Sequence[str]) -> tuple[str, ...]:
     """Return the names of the members: numbers from 0 if only their count is given."""
+    if isinstance(members, str) or not isinstance(members, int | Iterable):
+        raise errors.ConfigurationError(
+            f"members: got {members!r}; expected their count, or a list of their names."
+        )
     names = tuple(map(str, range(members)) if isinstance(members, int) else members)
     if not names:
         raise errors.ConfigurationError("a fleet needs at least one member.")
@@ -634,6 +676,6 @@ def _numbers(what: str, values: ArrayLike) -> Array:
     try:
         if np.asarray(values).dtype.kind in "USb":
             raise TypeError
-        return np.array(values, dtype=float)
-    except (TypeError, ValueError):
+        return numbers(values, what).copy()
+    except (TypeError, ValueError, errors.SampleError):
         raise errors.SampleError(f"{what} holds something that is not a number.") from None
