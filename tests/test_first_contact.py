@@ -156,8 +156,20 @@ def test_a_column_of_times_and_other_names():
 def test_units_of_columns():
     table = measured().assign(T_30=1.8 * measured()["T_30"] + 32.0)
     assert same(identifier().run(table, units={"T_30": "degF"}), rtol=1e-9)
-    with pytest.raises(lp.errors.ConfigurationError, match="units: 'T_left' is not a sensor"):
-        identifier().run(table, units={"T_left": "degF"})
+    table = measured().assign(T_left=1.8 * measured()["T_left"] + 32.0)
+    assert same(identifier().run(table, units={"T_left": "degF"}), rtol=1e-9)
+
+
+def test_units_of_a_dataset_are_those_of_all_its_temperatures():
+    """Those of a boundary value were ignored: it was off by 273 where its sensors were right."""
+    kelvin = measured()[["T_30", "T_60", "T_left"]] + 273.15
+    data = kelvin.assign(**{"noise of T_30": NOISE}).to_xarray()
+    for name in kelvin:
+        data[name].attrs["units"] = "K"
+    assert same(identifier().run(data), rtol=1e-9)
+    data["T_30"] = (1.8 * data["T_30"] - 459.67).assign_attrs(units="degF")
+    data["noise of T_30"].attrs["units"] = "K"
+    assert same(identifier().run(data), rtol=1e-9)
 
 
 def test_a_column_that_is_no_channel_is_ignored_unless_strict():

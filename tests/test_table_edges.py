@@ -20,7 +20,7 @@ from livepde.cases.new_case import channels_in
 from livepde.cases.remedies import after_gaps, freed, start_missed, with_settings
 from livepde.cli.check import _refused
 from livepde.errors import CaseError, DataError, SampleError
-from livepde.models import EQUATIONS, heat
+from livepde.models import EQUATIONS, Flux, heat, with_conditions
 from livepde.runs import input_findings
 from livepde.samples import by_name
 from livepde.streams import DataTable
@@ -247,11 +247,12 @@ def test_a_compressed_file_is_named(tmp_path):
 )
 def test_text_in_a_table_is_named(cell, said):
     rod = heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": lp.Channel("a")})
-    table = pd.DataFrame({"T": ["0.9", cell], "a": [1.0, 1.0]}, index=[1.0, 2.0])
+    rod = with_conditions(rod, {"right": Flux(lp.Channel("c"))})
+    table = pd.DataFrame({"T": ["0.9", cell], "c": [0.0, 0.0], "a": [1.0, 1.0]}, index=[1.0, 2.0])
     identifier = lp.Identifier(rod, lp.Points({"T": 0.5}, noise=0.1, unit="degC"), u0=1.0)
     with pytest.raises(lp.errors.SampleError, match=said):
         identifier.run(table)
     with pytest.raises(
-        lp.errors.ConfigurationError, match="'a' is not a sensor, so its values are"
+        lp.errors.ConfigurationError, match="'c' is neither a sensor nor a boundary value"
     ):
-        identifier.run(table, units={"a": "K"})
+        identifier.run(table.assign(c=1.0), units={"c": "K"})

@@ -564,6 +564,17 @@ class Model(Shown):
         """Return u with the Dirichlet values of a moment."""
         return self.state_space.impose(u, moment)
 
+    @property
+    def boundary_units(self) -> dict[str, str]:
+        """Mapping from the channel of a boundary value to the unit of its component."""
+        fields = [block.field for block in self.state_space.fields.values()]
+        return {
+            value.name: field.unit
+            for field in fields
+            for value in field.boundary_values
+            if isinstance(value, Channel)
+        }
+
     def boundary_readings(self, u0: Any) -> dict[str, float]:
         """Return the values of boundary channels that an initial state implies.
 

@@ -123,7 +123,8 @@ class StreamRuns(Shown):
         columns
             Channel -> name of its column, where they differ: {"T_10": "TS_3_2_1"}.
         units
-            Sensor -> unit of its column, where that is not the unit of the sensor.
+            Sensor or boundary channel -> unit of its column, where that is not the unit of the
+            sensor or of the state.
         strict
             Refuse columns that are no channel; by default they are ignored.
 
@@ -185,16 +186,14 @@ class StreamRuns(Shown):
 
         optional = [name for name in self._channels.inputs if name in self._channels.optional]
         needed = [name for name in self._channels.names if name not in optional]
-        units = {
-            name: unit
-            for sensors in self._channels.sensors
-            for name, unit in zip(sensors.names, sensors.units, strict=True)
-        }
+        units = self.model.boundary_units
+        for sensors in self._channels.sensors:
+            units |= dict(zip(sensors.names, sensors.units, strict=True))
         how = Reading(
             channels=needed,
             optional=[*optional, *self._channels.noise],
             unit=self.model.time_unit,
-            sensor_units=units,
+            channel_units=units,
             **reading,
         )
         table = how.table(data)

@@ -35,13 +35,13 @@ class Reading:
     channels: Sequence[str]  # that need a column
     optional: Sequence[str]  # that are read if there is such a column: noise of readings, places
     unit: str  # the model's unit of time; empty if it has none
-    sensor_units: Mapping[str, str]  # sensor -> unit of its readings in the model
+    channel_units: Mapping[str, str]  # sensor or boundary channel -> its unit in the model
     # The column of times. Default: the index of a table, the coordinate of a dataset, else the one
     # column that is called time, t, date or the like.
     time: str | None = None
     time_unit: str | None = None  # of times that are numbers, default that of the model
     columns: Mapping[str, str] = field(default_factory=dict)  # channel -> column of another name
-    units: Mapping[str, str] = field(default_factory=dict)  # sensor -> unit of its column
+    units: Mapping[str, str] = field(default_factory=dict)  # the same -> unit of its column
     strict: bool = False  # whether a column that is no channel is an error; else it is ignored
 
     def table(self, data: Any) -> tables.DataTable:
@@ -73,15 +73,15 @@ class Reading:
                         f"{option}: there is no channel '{name}'{tables.hint(name, known)}"
                     )
         for name in self.units:
-            if name not in self.sensor_units:
+            if name not in self.channel_units:
                 raise ConfigurationError(
-                    f"units: '{name}' is not a sensor, so its values are in the unit of the model: "
-                    "convert its column."
+                    f"units: '{name}' is neither a sensor nor a boundary value, so its values are "
+                    "in the unit of the model: convert its column."
                 )
-            if not self.sensor_units.get(name):
+            if not self.channel_units[name]:
                 raise ConfigurationError(
-                    f"units: the model has no unit for '{name}': name it where the sensors are "
-                    'defined, as in Points(..., unit="degC").'
+                    f"units: the model has no unit for '{name}': name it where the sensors or the "
+                    'state are defined, as in Points(..., unit="degC").'
                 )
         if self.time_unit is not None:
             self._need_unit("time_unit is given")
@@ -128,11 +128,15 @@ class Reading:
                 if name in self.optional and name not in self.columns:
                     continue
                 raise self._missing(where, name, column, names)
-            unit, own = self.units.get(name, units.get(column, "")), self.sensor_units.get(name)
+            of = noise_of.get(name, "")  # the noise of each reading of this channel
+            unit, own = (
+                self.units.get(name, units.get(column, "")),
+                self.channel_units.get(of or name),
+            )
             rule = conversion(unit or own, own, f"units of '{name}'") if own else Affine()
             scale = rule.factor, rule.offset
-            if of := noise_of.get(name, ""):  # the noise of each reading of a channel
-                scale = found[of].factor, 0.0
+            if of:  # in the unit of the readings where it states none
+                scale = rule.factor if unit else found[of].factor, 0.0
             found[name] = tables.Column((column,), *scale, decimal=decimal, noise_of=of)
         if self.strict:
             self._refuse_more(where, names, {time, *(one.names[0] for one in found.values())})
