@@ -15,7 +15,7 @@ import livepde as lp
 from livepde.fleet import Fleet, FleetRecords
 from livepde.laws.innovations import Innovations
 from livepde.linalg import BandedBlocks, BandedSolver, Pattern
-from livepde.models import heat
+from livepde.models import Flux, heat, with_conditions
 from livepde.result import Result
 
 SENSORS = lp.Points({"T_1": 0.3, "T_2": 0.5, "T_3": 0.8}, noise=0.02)
@@ -406,6 +406,21 @@ def test_a_missing_input_leaves_the_value_among_the_readings():
     estimate = fleet_of_two().step(0.1, row, {"T_0": [np.nan, 0.3]})
     other = fleet_of_two().step(0.1, {"T_1": 0.2}, {"T_0": [0.1, 0.3], "ambient": 0.0})
     np.testing.assert_array_equal(estimate.innovation, other.innovation)
+
+
+def test_a_gap_of_one_member_changes_nothing_of_another():
+    """Its covariance had rows of zeros then, and its intervals were other ones after a refit."""
+    flux = lp.Scalar(lp.Normal(0.0, 0.5), evolution=lp.fem.Periodic(2.0, harmonics=2))
+    model = heat(line(12), lp.LogNormal(0.3, 0.15), {"left": lp.Channel("T_0")})
+    model = with_conditions(model, {"right": Flux("J")}, unknowns={"J": flux})
+    sensors = lp.Points({"T_1": 0.3, "T_2": 0.55}, noise=0.02)
+    fleet = lp.Fleet(model, sensors, lp.SensitivityLaw(), 2, u0=0.1)
+    one = lp.Identifier(model, sensors, lp.SensitivityLaw(verdict=False), u0=0.1)
+    for k, t in enumerate(0.2 * np.arange(6)):
+        T_0 = 0.1 + 0.5 * np.sin(3.0 * t)
+        both = fleet.step(t, {"T_1": 0.1, "T_0": [np.nan if k % 2 else T_0, T_0]})
+        alone = one.step(t, {"T_1": 0.1, "T_0": T_0})
+        np.testing.assert_allclose(both.q_std[1], alone.q_std, rtol=1e-9)
 
 
 @pytest.mark.slow

@@ -171,10 +171,15 @@ def _searched(
     moved = apart(work.filter, best.x, now)
     if searched is samples:
         return best.x, moved
-    if moved <= holds and usual(now) and now.C.shape[1] == now.C.shape[2]:
+    size = now.C.shape[2]
+    # Other members of a fleet may have more rows: of one without them, those are zero.
+    more = now.U[0, size:].any() or now.C[0, size:].any()
+    square = not more and best.x.C.shape[1] == size
+    if moved <= holds and usual(now) and square:
         # Ledger and errors of the discretisation are linear about the trajectory, on the rows of
         # the square root, which are those of the prior: updates move them alike.
-        parts = {"ledger": now.ledger, "causes": now.causes, "shadows": now.shadows}
+        causes = now.causes[:, :size]
+        parts = {"ledger": now.ledger, "causes": causes, "shadows": now.shadows}
         return changed(best.x, **parts), moved
     whole = samples.about(best.trajectory)
     return None if whole is None else whole.x, moved
