@@ -15,7 +15,17 @@ from skfem import ElementLineP1
 import livepde as lp
 from livepde.cases import load
 from livepde.errors import CaseError, ModelError
-from livepde.models import Exchange, Flux, Source, conduction, heat, with_conditions
+from livepde.models import (
+    Exchange,
+    Flux,
+    Source,
+    battery_particle,
+    borehole,
+    conduction,
+    heat,
+    pumping_test,
+    with_conditions,
+)
 from livepde.stepping import Advance, Alexander2, simulate
 from livepde.stepping.member_stage import BandedStage
 
@@ -447,3 +457,14 @@ def test_a_product_of_an_unknown_and_an_input_that_vanishes_at_the_prior_mean_is
     x = mesh.p[0]
     exact = np.exp(0.7 * 1.5) * (LENGTH * x - 0.5 * x**2)
     assert np.abs(u - exact).max() < 1e-5
+
+
+def test_an_equation_in_the_radius_is_refused() -> None:
+    """A flux through the wall of a borehole counted 1/r times."""
+    mesh = lp.interval(0.05, 5.0, 20, geometric=True)
+    ground = borehole(mesh, lp.Normal(2.0), lp.Normal(0.1), H=100.0, rho_c=2e6, T0=10.0)
+    particle = battery_particle(lp.interval(0.0, 1.0, 9), lp.Normal(1.0), area=1.0, c_max=1.0)
+    well = pumping_test(mesh, lp.Normal(1.0), lp.Normal(1.0), b=1.0)
+    for model in (ground, particle, well):
+        with pytest.raises(ModelError, match="multiplied by the radius"):
+            with_conditions(model, {"left": Flux(1.0)})

@@ -200,7 +200,7 @@ class Model(Shown):
             rows[f"state {name}"] = f"{kind}, {block.size} coefficients"
             if block.field.dirichlet:
                 rows[f"state {name}"] += f", Dirichlet values {block.field.boundary_text}"
-        formula = self._about["formula"]
+        formula = self.formula
         rows["equation"] = formula or _equation(self._parts)
         shown = {} if formula else {"M": "mass M(u, v)"}
         for name, what in {**shown, "initial": "initial state"}.items():
@@ -563,6 +563,11 @@ class Model(Shown):
     def impose(self, u: Array, moment: Moment) -> Array:
         """Return u with the Dirichlet values of a moment."""
         return self.state_space.impose(u, moment)
+
+    @property
+    def formula(self) -> str:
+        """The equation as text; empty if none was given."""
+        return str(self._about["formula"])
 
     @property
     def boundary_units(self) -> dict[str, str]:

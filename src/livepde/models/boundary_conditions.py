@@ -7,6 +7,7 @@ J v, in the unit of D u_n.
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ from livepde.fem import Channel, On, Place, Unknown, ignores
 from livepde.fem.measure import Measure, sizes
 from livepde.model import Model
 
+# An equation in the radius, multiplied by it: "rho_c r T_t = ...".
+RADIAL = re.compile(r"\br(\^2)? \w+_t\b")
 # Share of the size of a source that a mesh may miss without a warning.
 MISSED = 0.01
 
@@ -96,8 +99,8 @@ def with_conditions(
     Raises
     ------
     ModelError
-        A boundary does not exist or has a Dirichlet value, no condition names an unknown, or `per`
-        is not an unknown of the model.
+        A boundary does not exist or has a Dirichlet value, no condition names an unknown, `per`
+        is not an unknown of the model, or the equation is multiplied by the radius.
 
     Examples
     --------
@@ -114,6 +117,11 @@ def with_conditions(
     ('k', 'J')
     """
     more = dict(unknowns or {})
+    if (boundary or sources) and RADIAL.search(model.formula):
+        raise ModelError(
+            f"with_conditions: the equation {model.formula} is multiplied by the radius, but "
+            "fluxes and sources would not be: add terms with this factor by Model.with_terms."
+        )
     terms = _Terms(model, tuple(more), per)
     for name, given in (boundary or {}).items():
         terms.through(name, given)
