@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 from pathlib import Path
 from typing import Any
 
@@ -189,6 +190,19 @@ def test_a_unit_at_the_end_of_a_name_is_that_of_the_sensor(tmp_path):
     assert given["T_12cm_degF"]["unit"] == "degF"
     assert "unit" not in given["T_20cm"]
     assert "unit" not in given["T_in"]
+
+
+@pytest.mark.parametrize("name", ["T_10cm degF", "T [degF]", "bottom_degF"])
+def test_a_unit_in_the_name_of_a_channel_is_not_passed_over(tmp_path, name):
+    """Readings in Fahrenheit that were read in Celsius moved a diffusivity by two decades."""
+    path = short_rod(tmp_path, ROWS)
+    settings = {"channels.T_10.column": name}
+    said = f"'{name}' states the unit 'degF'.*: set unit = 'degF', or unit = 'degC'"
+    with pytest.raises(CaseError, match=re.escape(said).replace(r"\.\*", ".*")):
+        _ = cases.load(path, settings=settings).columns
+    for key, value in (("unit", "degF"), ("unit", "degC"), ("factor", 1.0)):
+        stated = cases.load(path, settings={**settings, f"channels.T_10.{key}": value})
+        assert "T_10" in stated.columns
 
 
 @pytest.mark.parametrize("name", ["time_min", "t [min]", "minutes"])

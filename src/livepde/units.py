@@ -32,6 +32,7 @@ NOT_A_UNIT = (
 )
 IN_BRACKETS = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]\s*$")  # T [degC], time (min)
 AT_THE_END = re.compile(r"(?:_|^(?=\w{3}))([A-Za-z]+)$")  # time_s, minutes
+AFTER_A_WORD = re.compile(r"(?<=[^\W\d])[_ ](degC|degF|[kM]W|[mc]m|ft)$")  # T_30cm degF, power_kW
 OF_TIME = re.compile(r"[mu]?s|sec|min|hr?|d|(second|minute|hour|day|week|year)s?", re.I)
 QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
 
@@ -166,8 +167,19 @@ def other_time_unit(name: str, unit: str) -> str:
     stated = (pattern.search(name) for pattern in (IN_BRACKETS, AT_THE_END))
     if not (unit and any(found and OF_TIME.fullmatch(found[1]) for found in stated)):
         return ""  # before pint is loaded
-    given = unit_in(name, unit, IN_BRACKETS, AT_THE_END)
-    return given if given and conversion(given, unit, name).factor != 1.0 else ""
+    return other_unit(name, unit, IN_BRACKETS, AT_THE_END)
+
+
+def other_unit(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
+    """Return the unit in the name of a column if its numbers are others in `unit`; else empty.
+
+    >>> other_unit("T [degF]", "degC", IN_BRACKETS), other_unit("q (W/m2)", "W/m^2", IN_BRACKETS)
+    ('degF', '')
+    """
+    if not unit:
+        return ""
+    given = unit_in(name, unit, *patterns)
+    return given if given and conversion(given, unit, name) != Affine() else ""
 
 
 def in_si(unit: str) -> SI | None:

@@ -22,7 +22,7 @@ from livepde.observation.sensors import POSITION, shift_names
 from livepde.samples import Sample, by_name, noise_channel
 from livepde.stepping import Between
 from livepde.streams import Column
-from livepde.units import conversion
+from livepde.units import AFTER_A_WORD, IN_BRACKETS, conversion, other_unit
 
 # The first sample interpolated, under two names; or as if it were exact, and the lines between.
 EXACT = "interpolate-exact"
@@ -38,6 +38,7 @@ def columns_of(case: CaseContent) -> dict[str, Column]:
     found, decimal = {}, case.spec.data.decimal
     for name, channel in case.spec.channels.items():
         unit = case.unit(name)
+        _check_stated(case, name, unit)
         rule = conversion(channel.unit or unit, unit, case.where(f"channels.{name}.unit"))
         valid = (-np.inf, np.inf)
         if channel.valid is not None:
@@ -54,6 +55,20 @@ def columns_of(case: CaseContent) -> dict[str, Column]:
             raise case.error(key, f"another channel is called '{noise}': rename it.")
         found[noise] = Column((channel.noise_column,), abs(factor), decimal=decimal, noise_of=name)
     return found
+
+
+def _check_stated(case: CaseContent, name: str, unit: str) -> None:
+    """Refuse a column whose name states another unit than the one that its channel is read in."""
+    channel = case.spec.channels[name]
+    if channel.unit or channel.factor is not None:
+        return
+    for column in channel.sources:
+        if given := other_unit(column, unit, IN_BRACKETS, AFTER_A_WORD):
+            raise case.error(
+                f"channels.{name}.unit",
+                f"the name of the column '{column}' states the unit '{given}', which is not that "
+                f"of the model: set unit = '{given}', or unit = '{unit}' if the name is wrong.",
+            )
 
 
 def observation_of(case: CaseContent, *roles: str) -> observation.Observation | None:
