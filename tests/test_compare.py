@@ -558,6 +558,51 @@ def test_a_layer_for_each_sensor_and_a_source_that_jumps_are_tried(tmp_path, nam
         assert abs(one.value / value - 1.0) < 0.1
 
 
+SWITCHED = """
+equation = "pumping_test"
+initial = 0
+mesh = { from = "10 cm", to = "1 km", cells = 20, spacing = "geometric" }
+options.b = "1 m"
+data = { file = "well.csv", time = "time_s" }
+unknowns.k = { prior = 5e-3, std = 5e-3, transform = "log" }
+unknowns.Ss = { prior = 5e-4, std = 5e-4, transform = "log" }
+channels.Q = { role = "input", column = "Q" }
+channels.s = { role = "sensor", column = "s", at = "30 m", noise = 0.01 }
+"""
+
+
+def test_an_input_that_switches_is_held_in_a_variant_and_the_only_sensor_stays(tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text(SWITCHED)
+    rate = np.repeat([0.02, 0.01, 0.0], 20)
+    table = {"time_s": 600.0 * np.arange(60), "Q": rate, "s": 10 * rate}
+    pd.DataFrame(table).to_csv(tmp_path / "well.csv", index=False)
+    prepared = cases.load(path).prepare()
+    cause = Cause("sensor", "s", "", setting='channels.s.role="ignored"')
+    found = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=(cause,))])
+    base = replace(ended("as stated", 0.0, 1.0, errors={"s": 0.3}), verdict=found.to_dict())
+    names = [one.name for one in proposed(prepared, base)]
+    assert "Q held" in names
+    stated = cases.load(path, settings={"channels.Q.between": "line"}).prepare()
+    assert "Q held" not in [one.name for one in proposed(stated, base)]
+    assert freed(prepared, cause) == ()
+    (causes,) = [one.causes for one in with_settings(prepared, found).findings]
+    assert causes[0].setting == ""
+
+
+def test_estimates_of_a_recommended_variant_that_is_not_trusted_are_not_to_be_used():
+    unusable = Verdict.of([Finding("misfit", "do not trust", "It misfits.")]).to_dict()
+    estimate = {"k": LastEstimate(1.0, 0.1, 0.8, 1.2)}
+    base = ended("as stated", 10.0, math.nan, estimates=estimate)
+    best = replace(ended("best", 50.0, math.nan, estimates=estimate), verdict=unusable)
+    said = " ".join(conclusions(base, [best]))
+    assert "Recommended: 'best'" in said
+    assert "Do not use its estimates: no variant explains the data." in said
+    assert "All variants agree" not in said
+    usable = replace(best, verdict=base.verdict)
+    assert "All variants agree" in " ".join(conclusions(base, [usable]))
+
+
 def test_a_variant_without_an_unknown_lacks_what_is_read_for_it_alone(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(HEATED)

@@ -15,6 +15,8 @@ from livepde.cases.read import settings_in, toml_key, toml_value
 from livepde.laws import SensitivityLaw
 from livepde.linalg import Array
 from livepde.samples import by_name
+from livepde.streams import DataTable
+from livepde.streams.oddities import switches
 from livepde.verdict import Cause, Finding, Severity, Verdict, channel_setting
 from livepde.verdict.directions import stated_positions, usual_shifts
 from livepde.verdict.sentences import ESTIMATED, FINDINGS, LIKELY, amount_of, estimating
@@ -107,6 +109,17 @@ def _may_jump(case: Case, name: str) -> bool:
     return jumps is not None and (not jumps.unknowns or name in jumps.unknowns)
 
 
+def switching(case: Case, table: DataTable) -> list[str]:
+    """Return the inputs that switch, if the case does not specify `between`."""
+    return [
+        name
+        for name, channel in case.roles("input").items()
+        if "between" not in channel.model_fields_set
+        and name in table.names
+        and switches(table.t, table.values[:, table.names.index(name)])
+    ]
+
+
 def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     """Return the settings that make a cause an unknown of the case; empty if none does."""
     case = prepared.case
@@ -178,7 +191,9 @@ def _stated(case: Case, cause: Cause) -> tuple[str, ...]:
     channel, settings = case.spec.channels.get(cause.subject), settings_in(cause.setting)
     keys = [setting.partition("=")[0].rpartition(".")[2] for setting in settings]
     taken = [key for key in keys if key in STATED and getattr(channel, key, None) is not None]
-    return () if taken else settings
+    # A case needs a sensor: the only one cannot be left out.
+    only = "role" in keys and list(case.roles("sensor")) == [cause.subject]
+    return () if taken or only else settings
 
 
 def _exchanged(prepared: Prepared, cause: Cause) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from livepde.cases.case_channels import columns_of
 from livepde.cases.data import clock_of, delays
 from livepde.cases.process import unread_without
 from livepde.cases.read import parse, settings_in, toml_key, toml_value
-from livepde.cases.remedies import first_miss, freed, usual_shift, with_settings
+from livepde.cases.remedies import first_miss, freed, switching, usual_shift, with_settings
 from livepde.dates import since_1970
 from livepde.errors import CaseError, ModelError
 from livepde.plots.style import modes_told
@@ -405,6 +405,8 @@ def _recommendation(base: VariantRun, best: VariantRun) -> str:
         text += f" Its error at the validation sensors is {errors}."
     else:
         text += " No validation sensor confirms it."
+    if best.level not in USABLE:
+        text += " Do not use its estimates: no variant explains the data."
     return text
 
 
@@ -454,7 +456,7 @@ def _disagreements(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[s
     for name, names in found.items():
         listed = ", ".join(f"'{one}'" for one in names)
         yield f"{name} depends on the variant: its interval in {listed} does not overlap."
-    if shared and not found:
+    if shared and not found and best.level in USABLE:
         yield "All variants agree: their intervals overlap with that of the recommended one."
 
 
@@ -476,6 +478,9 @@ def _candidates(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     # A start that the first readings miss looks like many other errors.
     if first_miss(prepared) > _usual_error(base):
         yield Variant(NAMES["initial"], freed(prepared, Cause("initial", "", "")))
+    for name in switching(case, prepared.raw) if isinstance(prepared.raw, DataTable) else ():
+        # Lines between the rows of a switch look like many other errors, too.
+        yield Variant(f"{name} held", (channel_setting(name, "between", '"hold"'),))
     for cause in base.causes:
         name = NAMES.get(cause.kind, cause.kind + " of {}").format(cause.subject)
         yield Variant(name, settings_in(cause.setting))

@@ -14,6 +14,7 @@ from rich.markup import escape
 from livepde.cases import Case, Prepared
 from livepde.cases.data import policy_of, source_text
 from livepde.cases.preview import MOST_SAMPLES, advise, predicted, preview
+from livepde.cases.remedies import switching
 from livepde.cli.options import CaseArgument, CodeOption, DataOption, SetOption, load_case, option
 from livepde.cli.printing import CHECK_FAILED, extent, print_table, terminal
 from livepde.runs import Table, sampling_findings
@@ -21,7 +22,7 @@ from livepde.samples import by_name
 from livepde.showing import in_percent
 from livepde.stepping import ForwardStage
 from livepde.streams import DataTable
-from livepde.streams.oddities import sentinels, switches
+from livepde.streams.oddities import sentinels
 from livepde.verdict.sentences import LONGER_DATA
 
 MOST_CHANNELS = 40  # rows of the table of channels
@@ -127,9 +128,7 @@ def _switching(case: Case, samples: DataTable) -> list[str]:
         f'{name}: constant stretches with jumps, but the default `between = "line"` interpolates '
         f'each jump. If a value holds until the next reading, add `between = "hold"` to '
         f'`[channels.{name}]`. If it is the mean since the last reading, add `between = "next"`.'
-        for name, channel in case.roles("input").items()
-        if "between" not in channel.model_fields_set
-        and switches(samples.t, samples.values[:, samples.names.index(name)])
+        for name in switching(case, samples)
     ]
 
 

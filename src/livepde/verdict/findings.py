@@ -54,7 +54,10 @@ LISTED = 5  # unknowns in a sentence
 REFINE = {
     "step": ("the time step", "Reduce `steps.dt_max`, or use a second-order scheme."),
     "mesh": ("the mesh", "Refine the mesh (`mesh.cells`) where the state varies most."),
-    "input": ("the linear interpolation of inputs", "Sample these inputs more often."),
+    "input": (
+        "the linear interpolation of inputs",
+        'Sample these inputs more often. If they switch, add `between = "hold"` to their channels.',
+    ),
 }
 """Kind of a discretisation error -> its name, and the remedy."""
 NOT_KNOWN: Any = math.nan
