@@ -590,6 +590,26 @@ def test_an_input_that_switches_is_held_in_a_variant_and_the_only_sensor_stays(t
     assert causes[0].setting == ""
 
 
+def test_the_loss_of_a_column_is_its_decay(tmp_path):
+    path = tmp_path / "case.toml"
+    unknown = '{ prior = 10.0, std = 10.0, transform = "log" }'
+    path.write_text(
+        'equation = "advection_dispersion"\ninitial = 0\n'
+        'mesh = { from = 0, to = 40, cells = 10 }\ndata = { file = "t.csv", time = "t" }\n'
+        f"options.R = 2.0\nunknowns = {{ D = {unknown}, v = {unknown} }}\n"
+        'channels.c_in = { role = "input", column = "c_in" }\n'
+        'channels.c = { role = "sensor", column = "c", at = 20, noise = 0.01 }\n'
+    )
+    (tmp_path / "t.csv").write_text("t,c_in,c\n0,1,0\n1,1,0.1\n2,1,0.2\n")
+    lost = Cause("loss", "", "", size=0.05)
+    (setting,) = freed(cases.load(path).prepare(), lost)
+    assert setting.startswith("unknowns.decay=")
+    assert "prior = 0.1" in setting  # R times the rate
+    assert cases.load(path, settings=(parse([setting]),)).prepare()
+    stated = cases.load(path, settings={"options.decay": 0.1}).prepare()
+    assert freed(stated, lost) == ()
+
+
 def test_estimates_of_a_recommended_variant_that_is_not_trusted_are_not_to_be_used():
     unusable = Verdict.of([Finding("misfit", "do not trust", "It misfits.")]).to_dict()
     estimate = {"k": LastEstimate(1.0, 0.1, 0.8, 1.2)}

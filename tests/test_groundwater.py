@@ -365,6 +365,13 @@ def test_decay_on_the_way():
     assert np.abs(u - exact)[mesh.p[0] < 29].max() < 1e-4
 
 
+def test_an_unknown_decay_is_that_of_the_option():
+    mesh = lp.interval(0.0, 30.0, 30)
+    given = at_the_end(advection_dispersion(mesh, ONE, ONE, decay=0.3), [D, V], 30)
+    found = at_the_end(advection_dispersion(mesh, ONE, ONE, decay=ONE), [D, V, 0.3], 30)
+    assert np.allclose(found, given, rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("inlet", ["flux", "fixed"])
 @pytest.mark.parametrize(("phi", "omega"), [(0.7, 0.3), (0.5, 0.05), (0.8, 3.0)])

@@ -251,7 +251,8 @@ def _capacity(case: Case) -> float:
 def _free(case: Case, name: str) -> bool:
     """Return whether an unknown of the equation may be added to the case."""
     known = case.equation.unknowns.get(name)
-    return known is not None and known.optional and name not in case.spec.unknowns
+    stated = name in case.spec.unknowns or name in case.spec.options
+    return known is not None and known.optional and not stated
 
 
 def _source(prepared: Prepared, cause: Cause) -> tuple[str, ...]:

@@ -12,7 +12,15 @@ from livepde.errors import ModelError
 from livepde.fem import Channel, Field, On, Piecewise, Place, Unknown, dot, grad, linear
 from livepde.linalg import Array
 from livepde.model import Model
-from livepde.models.description import Equation, Option, Variable, by_name, everywhere, one_number
+from livepde.models.description import (
+    Equation,
+    Number,
+    Option,
+    Variable,
+    by_name,
+    everywhere,
+    one_number,
+)
 
 
 def pumping_test(
@@ -254,7 +262,7 @@ def advection_dispersion(
     v: Unknown,
     *,
     R: float = 1.0,
-    decay: float = 0.0,
+    decay: Number = 0.0,
     inlet: str = "flux",
     element: Any = None,
     unit: str = "",
@@ -276,7 +284,7 @@ def advection_dispersion(
     R
         Retardation factor.
     decay
-        Rate of decay in 1/h.
+        Rate of decay in 1/h, known or unknown: a number, or by layer.
     inlet
         "flux" or "fixed".
     element, unit
@@ -296,11 +304,18 @@ def advection_dispersion(
     def flux(q: Any, c: Any, w: Any, x: Any) -> Any:
         return (q.D * grad(c)[0] - q.v * c) * grad(w)[0]
 
+    known, unknowns = True, {"D": D, "v": v}
+    if not isinstance(decay, int | float):
+        known, unknowns = False, {**unknowns, "decay": decay}
     return Model(
         state,
-        {"D": D, "v": v},
-        A=[flux, *_ends(lambda q: q.v, lambda u: u, inlet)],
-        B=lambda c, w, x: decay * c * w,
+        unknowns,
+        A=[
+            flux,
+            *_ends(lambda q: q.v, lambda u: u, inlet),
+            *([] if known else [lambda q, c, w, x: q.decay * c * w]),
+        ],
+        B=[lambda c, w, x: decay * c * w] if known else [],
         M=lambda c, w, x: R * c * w,
         inputs=["c_in"],
         **ADVECTION_DISPERSION.about(),
@@ -404,7 +419,10 @@ ADVECTION_DISPERSION = Equation(
     summary="a tracer in a column of soil that is fed on the left",
     formula="R c_t = D c_xx - v c_x - decay c,  v c - D c_x = v c_in on the left",
     state=Variable("", "concentration, relative to that of the feed"),
-    unknowns=COLUMN,
+    unknowns={
+        **COLUMN,
+        "decay": Variable("1/h", "rate of decay, instead of the option", True),
+    },
     inputs=INFLOW,
     options={
         "R": Option("", "retardation factor", 1.0),
@@ -413,6 +431,8 @@ ADVECTION_DISPERSION = Equation(
     },
     build=by_name(advection_dispersion, FED),
     element=linear,
+    loss="decay",
+    capacity=("R",),
     length_unit="cm",
     time_unit="h",
 )
