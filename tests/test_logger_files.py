@@ -13,7 +13,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from typer.testing import CliRunner
 
+from livepde.cases.measured import measured
+from livepde.cli import app
 from livepde.errors import DataError, TimeOrderError
 from livepde.runs.directory import RunWriter, open_run
 from livepde.streams.clock import Clock
@@ -84,6 +87,21 @@ def test_a_repeated_row_is_no_second_pass(tmp_path: Path, read: Reader, again: i
     rows = [{"t": text, "a": float(k)} for k, text in enumerate(local(1, 100))]
     with pytest.raises(TimeOrderError, match="if clocks were set back, write dates with an offset"):
         read(tmp_path, [*rows[:80], rows[again], *rows[80:]])
+
+
+@pytest.mark.parametrize("minutes", [10, 60])
+def test_a_case_for_local_times_needs_their_zone(tmp_path: Path, minutes: int) -> None:
+    """'Sort the rows' and 'drop repeated rows' would mix or lose an hour."""
+    path, count = tmp_path / "wall.csv", 240 // minutes
+    rows = [f"{text},{20.0 + 0.1 * k:.1f}" for k, text in enumerate(local(minutes, count))]
+    path.write_text("\n".join(["t,a", *rows]))
+    with pytest.raises(TimeOrderError, match=r"If clocks were set back here, set `data\.zone`"):
+        measured(path, "s")
+    made = ["init", str(tmp_path / "wall"), "--data", str(path)]
+    result = CliRunner().invoke(app, [*made, "--set", "data.zone=Europe/Berlin"])
+    assert result.exit_code == 0, result.output
+    assert 'zone = "Europe/Berlin"' in (tmp_path / "wall/case.toml").read_text()
+    assert measured(path, "s", zone=BERLIN).steps.max() == 60.0 * minutes
 
 
 @pytest.mark.parametrize("read", BATCH)

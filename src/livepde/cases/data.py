@@ -8,7 +8,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from datetime import datetime
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 from zoneinfo import ZoneInfo
@@ -26,6 +26,7 @@ from livepde.cases.schema import (
     NodesSpec,
 )
 from livepde.dates import since_1970
+from livepde.errors import CaseError
 from livepde.runs.backlog import Backlog, Retention, Sink
 from livepde.streams import (
     Clock,
@@ -70,17 +71,24 @@ LEAP = "30 d"  # after a longer pause a second row has to confirm the time
 Data: TypeAlias = str | Iterable[str] | RowSource | None  # a file, lines of JSON, or the case's own
 
 
+def zone_named(name: str, where: str) -> tzinfo:
+    """Return the time zone of dates that name none; raises `CaseError`."""
+    if name == "UTC":
+        return UTC
+    try:
+        return ZoneInfo(name)
+    except (KeyError, OSError, ValueError):  # not found, a folder, not a name at all
+        text = f"there is no time zone '{name}'; expected a name such as Europe/Berlin."
+        raise CaseError(f"{where}: {text}") from None
+
+
 def clock_of(case: CaseContent, data: DataSpec | None = None) -> Clock:
     """Return how times are read, by default those of `[data]`."""
     data, unit = data or case.spec.data, case.equation.time_unit
     rule = conversion(data.time_unit or unit, unit, case.where("data.time_unit"))
     second = conversion("s", unit, case.where("data.time")).factor if unit else 1.0
     start, stop = _instant(case, data.start, "start"), _instant(case, data.stop, "stop")
-    try:  # dates that name no zone have this one
-        zone = ZoneInfo(name := case.spec.data.zone)
-    except (KeyError, OSError, ValueError):  # not found, a folder, not a name at all
-        text = f"there is no time zone '{name}'; expected a name such as Europe/Berlin."
-        raise case.error("data.zone", text) from None
+    zone = zone_named(case.spec.data.zone, case.where("data.zone"))
     return Clock(
         data.times[0],
         rule.factor,

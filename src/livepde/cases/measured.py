@@ -6,7 +6,7 @@ import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta, tzinfo
 from functools import partial
 from pathlib import Path
 from statistics import mode
@@ -92,12 +92,18 @@ def _moment(t: float, origin: datetime | None) -> str:
 
 
 def measured(
-    table: Path, time_unit: str, *, time_format: str = "", skip: int | None = None
+    table: Path,
+    time_unit: str,
+    *,
+    time_format: str = "",
+    skip: int | None = None,
+    zone: tzinfo = UTC,
 ) -> Measured:
     """Read a CSV file of which nothing is known.
 
     `time_unit`: the unit of time of the equation. `time_format`: of dates; empty: found from the
-    cells. `skip`: lines before the header; None: found from the lines.
+    cells. `skip`: lines before the header; None: found from the lines. `zone`: of dates
+    without one.
     """
     if table.suffix in (*JSON_LINES, ".parquet"):
         raise SampleError(f"{table}: expected a CSV file with a header.")
@@ -112,7 +118,7 @@ def measured(
     samples = read_csv(
         table,
         columns,
-        Clock(time[0], format=found, decimal=written.decimal, hour="".join(time[1:])),
+        Clock(time[0], zone=zone, format=found, decimal=written.decimal, hour="".join(time[1:])),
         separator=written.separator,
         encoding=written.encoding,
         skip=written.skip,

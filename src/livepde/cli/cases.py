@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from livepde.cases import new_case
+from livepde.cases.data import zone_named
 from livepde.cases.measured import Measured, measured
 from livepde.cases.read import blanks_in, filled, parse, read_toml, toml_value
 from livepde.cli.options import names_in, option
@@ -84,13 +85,14 @@ def init(
         new_case.check_free(folder, ["case.toml"])
         found = named(equation or "heat", EQUATIONS, "equation")
         case = folder / "case.toml"
-        first, *others = (
-            measured(file, found.time_unit, time_format=time_format, skip=skip) for file in data
-        )
+        changes = parse(settings or [])
+        zone = zone_named(str(changes.get("data.zone") or "UTC"), "--set data.zone")
+        how: dict[str, Any] = {"time_format": time_format, "skip": skip, "zone": zone}
+        first, *others = (measured(file, found.time_unit, **how) for file in data)
         read = reduce(Measured.joined, others, first)
         files = new_case.files_for(read, folder, found)
         _show_read(console, read, found)
-        files["case.toml"] = filled(files["case.toml"], parse(settings or []), f"{case}")
+        files["case.toml"] = filled(files["case.toml"], changes, f"{case}")
         new_case.write_files(folder, files)
         _show_written(console, case, data, files)
     console.print(f"  livepde check {case}\n  livepde run {case}")

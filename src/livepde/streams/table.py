@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
-from datetime import datetime
+from datetime import UTC, datetime
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any
@@ -121,6 +121,7 @@ class _Mean:
         return sum(time * value for time, value in parts) / whole
 
 
+HOUR = 3600.0  # seconds by which clocks are set back in autumn
 JSON_LINES = (".jsonl", ".ndjson")  # endings of files of JSON lines
 STREAM = "standard input"
 MOST = 12  # names that are listed
@@ -611,6 +612,9 @@ def _disorder(where: str, t: float, last: float, clock: Clock | None) -> TimeOrd
     how, remedy = "earlier than the one before", "sort the rows."
     if t == last:
         how, remedy = "that of the one before", "drop repeated rows."
+    if clock is not None and clock.zone is UTC and last - t <= HOUR * clock.second:
+        zone = "`data.zone`, such as 'Europe/Berlin'"
+        remedy += f" If clocks were set back here, set {zone}."
     if clock is not None and clock.repeated_hour(t):
         remedy = (
             "if clocks were set back, write dates with an offset, such as 2025-10-26 02:30+01:00."
