@@ -15,10 +15,12 @@ import livepde as lp
 from livepde import cases
 from livepde.cases.data import source_of
 from livepde.cases.measured import measured
-from livepde.cases.new_case import write_template
+from livepde.cases.new_case import channels_in, write_template
 from livepde.cases.read import blanks_in, read_toml
 from livepde.cli import app
+from livepde.errors import CaseError
 from livepde.models import EQUATIONS
+from livepde.units import conversion, convert
 
 GERMAN = """\
 Zeit;Tiefe 5 cm [°C];Fühler (0,2 m);Bemerkung
@@ -633,3 +635,13 @@ def test_tables_that_init_refuses(here, text, told):
     error = CliRunner().invoke(app, ["init", "mine", *arguments]).exception
     assert isinstance(error, lp.errors.DataError)
     assert told in str(error)
+
+
+def test_a_column_with_a_unit_fits_a_model_without_one(tmp_path):
+    """`unit = "? mg/L"` could not be filled in: a concentration of the model has no unit."""
+    (tmp_path / "t.csv").write_text("t (h),c_in (mg/L),c_10cm (mg/L)\n0,50,0\n1,50,9\n2,50,20\n")
+    found = channels_in(measured(tmp_path / "t.csv", "h"), EQUATIONS["advection_dispersion"])
+    assert ["unit" in one.given for one in found] == [False, False]
+    assert convert("1.44", "", "options.ratio") == 1.44  # as `"?"` is filled in
+    with pytest.raises(CaseError, match="'mg/L' cannot be converted to '1'; expected no unit"):
+        conversion("mg/L", "", "channels.c.unit")

@@ -110,6 +110,8 @@ def convert(value: float | str, unit: str, where: str, *, difference: bool = Fal
         raise CaseError(f"{where}: got {number:g}; expected less than {LARGEST:g}.")
     if given.startswith(","):
         raise CaseError(f"{where}: got '{value}'; decimals need a point.")
+    if not given and not unit:
+        return number
     if not given:
         raise CaseError(f"{where}: got '{value}' without a unit; write {match[1]} or add a unit.")
     rule = conversion(given, unit, where)
@@ -242,7 +244,7 @@ def _towers(unit: str) -> bool:
 
 def _expected(unit: str, given: str) -> str:
     if not unit:
-        return "expected a number without a unit"
+        return "expected no unit: remove it"
     if re.search(r"[A-Za-z][0-9]", given):
         return (
             f"write powers as in '{unit}'" if "^" in unit else f"expected a unit such as '{unit}'"

@@ -343,7 +343,7 @@ def _stated(name: str, unit: str) -> str:
     """Return the unit that the name of a column states; empty if it is the model's, or none."""
     found = unit_in(name, unit, IN_BRACKETS) or unit_in(IN_BRACKETS.sub("", name), unit, SUFFIX)
     stated = IN_BRACKETS.search(name)
-    if not found and stated:
+    if not found and stated and unit:  # without a unit of the model all numbers are as they are
         found = f"{BLANK} {stated[1]}"
     return "" if found == unit else found
 
@@ -374,7 +374,7 @@ def _unit_of_sensor(name: str, unit: str) -> str:
     """Return the unit that the name of a sensor's column states; empty if it states none."""
     stated, suffix = IN_BRACKETS.search(name), SUFFIX.search(name)
     if stated and not PLACE.fullmatch(stated[1].strip()):
-        return unit_in(name, unit, IN_BRACKETS) or f"{BLANK} {stated[1]}"
+        return unit_in(name, unit, IN_BRACKETS) or (f"{BLANK} {stated[1]}" if unit else "")
     if not stated and suffix and suffix["unit"] not in NO_UNITS:
         return unit_in(name, unit, SUFFIX)  # T_in_degF
     return ""
