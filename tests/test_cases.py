@@ -73,7 +73,7 @@ def test_quantities(value, unit, expected):
 
 def test_decibels_are_no_unit_of_a_case():
     with pytest.raises(
-        lp.errors.CaseError, match="here: 'dB' has no linear scale; expected a number"
+        lp.errors.CaseError, match="here: 'dB' has no linear scale; expected no unit"
     ):
         convert("3 dB", "", "here")
 
