@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from livepde.laws.shadow_kinds import HalvedMesh
 from livepde.models import conduction
 from livepde.observation import Combined, FluxPlates
 from livepde.runs.summary import LAYERS, SURFACES, resistance, tables
+from livepde.verdict.model_errors import Allowed, ModelErrors
 
 REPORTS = Path(__file__).parent / "reports"
 NOW = Moment(0.0, Inputs())
@@ -264,6 +266,22 @@ def test_the_report_of_a_wall_says_which_resistance_it_is() -> None:
     data = run_of([0.4], [0.004], 0.0, **{SURFACES: 0.17})
     names = [row[0] for table in tables(data) for row in table.rows]
     assert "U, with 0.17 m^2 K/W of surface resistances" in names
+
+
+def test_the_interval_of_a_wall_allows_for_model_errors() -> None:
+    """R is highest where each conductivity is lowest, and U the other way round."""
+    data = run_of([0.4, 0.6], [0.004, 0.006], 0.0, **{SURFACES: 0.17})
+    found = [
+        Allowed(label, "W/(m K)", k, 0.9 * k, 1.2 * k, 0.98 * k, 1.02 * k, 5.0)
+        for label, k in zip(["k[a]", "k[b]"], [0.4, 0.6], strict=True)
+    ]
+    errors = ModelErrors(3.0, 0.1, unknowns=tuple(found)).to_dict()
+    data.attrs["verdict"] = json.dumps({"level": "caution", "errors": errors})
+    (wall,) = (table for table in tables(data) if "Wall" in table.title)
+    assert wall.columns[2] == "with model errors"
+    R, U = wall.rows
+    assert (R[1], R[2]) == ("0.5000", "0.4167 to 0.5556")
+    assert (U[1], U[2]) == ("1.4925", "1.3783 to 1.7045")
 
 
 def test_the_layers_of_a_case_have_their_thickness(tmp_path: Path) -> None:

@@ -54,6 +54,11 @@ def minutes() -> None:
     case('time_unit = "s"', "")()
 
 
+def fahrenheit() -> None:
+    data("T_10", "T_10 degF")()
+    case('column = "T_10"', 'column = "T_10 degF"')()
+
+
 def nothing() -> None:
     """All is as `livepde init mine` wrote it."""
 
@@ -64,6 +69,7 @@ MISTAKES = {
     "a key": (case("prior =", "priro ="), RUN),
     "a unit": (case('"5e-5 m^2/s"', '"5e-5 m2/s"'), RUN),
     "a unit in a name": (minutes, RUN),
+    "a unit in the name of a channel": (fahrenheit, RUN),
     "another kind of unit": (case('time_unit = "s"', 'time_unit = "m"'), RUN),
     "no unit": (case('"5e-5 m^2/s"', '"5e-5"'), RUN),
     "a decimal comma in the case": (case('at = "10 cm"', 'at = "10,5 cm"'), RUN),

@@ -53,6 +53,10 @@ class Resistance:
     relative: float  # standard deviation of ln R, to first order in those of ln k
     # Sum of the surface resistances in m^2 K/W; None if they are not stated
     surfaces: float | None = None
+    # R if each conductivity is at the upper or lower end of its interval with model errors; NaN if
+    # these are not known
+    low: float = math.nan
+    high: float = math.nan
 
     @property
     def U(self) -> float:
@@ -83,7 +87,18 @@ def resistance(data: xr.Dataset) -> Resistance | None:
     slopes = relative * parts / R
     variance = float(slopes @ correlation @ slopes)
     surfaces = data.attrs.get(SURFACES)
-    return Resistance(R, variance**0.5, None if surfaces is None else float(surfaces))
+    errors = model_errors(data)
+    each = {one.label: (one.high, one.low) for one in (errors.unknowns if errors else ())}
+    ends = np.array([each.get(label, (math.nan, math.nan)) for label in layers])
+    # A lower end at zero, or below, is none of a conductivity.
+    low, high = np.array([*layers.values()]) / np.where(ends > 0.0, ends, math.nan).T
+    return Resistance(
+        R,
+        variance**0.5,
+        None if surfaces is None else float(surfaces),
+        low=float(low.sum()),
+        high=float(high.sum()),
+    )
 
 
 def digits(value: float, std: float) -> tuple[str, str]:
@@ -313,18 +328,24 @@ def _estimates(data: xr.Dataset, labels: Sequence[str]) -> Table:
 def _wall(data: xr.Dataset) -> Table:
     """Return the table of R and U of a wall, with their 95 % intervals; empty for other runs."""
     found, rows = resistance(data), list[tuple[Any, ...]]()
+    errors = model_errors(data)
+    differ = errors is not None and errors.differ
     if found is not None:
-        surfaces = "without surface resistances"
+        surfaces, more = "without surface resistances", found.surfaces or 0.0
         if found.surfaces is not None:
             surfaces = f"with {found.surfaces:g} m^2 K/W of surface resistances"
-        for name, value, relative, unit in (
-            ("R, without surface resistances", found.R, found.relative, "m^2 K/W"),
-            (f"U, {surfaces}", found.U, found.relative_U, "W/(m^2 K)"),
+        R, U = (found.low, found.high), tuple(1.0 / (end + more) for end in (found.high, found.low))
+        for name, value, relative, (least, most), unit in (
+            ("R, without surface resistances", found.R, found.relative, R, "m^2 K/W"),
+            (f"U, {surfaces}", found.U, found.relative_U, U, "W/(m^2 K)"),
         ):
             std = value * relative
             low, high = (value * math.exp(sign * NORMAL_95 * relative) for sign in (-1.0, 1.0))
-            rows.append((name, *digits(value, std), interval(low, high, std), unit))
-    columns = ("quantity", "value", "± std. dev.", "95 %", "unit")
+            number, deviation = digits(value, std)
+            wide = interval(least, most, std) if differ else deviation
+            rows.append((name, number, wide, interval(low, high, std), unit))
+    beside = "with model errors" if differ else "± std. dev."
+    columns = ("quantity", "value", beside, "95 %", "unit")
     return Table("Wall: R = sum of thickness/k, U = 1/(R + surfaces)", columns, rows)
 
 
