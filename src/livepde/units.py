@@ -32,7 +32,8 @@ NOT_A_UNIT = (
 )
 IN_BRACKETS = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]\s*$")  # T [degC], time (min)
 AT_THE_END = re.compile(r"(?:_|^(?=\w{3}))([A-Za-z]+)$")  # time_s, minutes
-AFTER_A_WORD = re.compile(r"(?<=[^\W\d])[_ ](degC|degF|[kM]W|[mc]m|ft)$")  # T_30cm degF, power_kW
+# power_kW, T_30cm degF, T_1 degF; not T_1 cm, which is a place
+AFTER_A_WORD = re.compile(r"(?:(?<=[^\W\d])[_ ]|(?<=\d)[_ ](?=deg))(deg[CF]|[kM]W|[mc]m|ft)$")
 OF_TIME = re.compile(r"[mu]?s|sec|min|hr?|d|(second|minute|hour|day|week|year)s?", re.I)
 QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
 

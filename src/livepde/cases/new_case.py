@@ -64,7 +64,8 @@ def documented(text: str) -> tuple[str, dict[str, str]]:
 # T_5cm, depth 0.05 m; not m3/h, nor -0.5 m, whose sign may be a hyphen
 PLACE = re.compile(r"(?<![\d.,-])(\d+(?:[.,]\d+)?)[ _]?(mm|cm|m|ft)(?![A-Za-z\d/^²³])")
 FRACTION = re.compile(r"\d+\.\d+")  # T_0.05
-SUFFIX = re.compile(r"(?:(?<=\w)_|(?<=[^\W\d]) )(?P<unit>[A-Za-z]\w*)$")  # Q_W, T_5cm degF
+# Q_W, T_5cm degF, T_1 degF
+SUFFIX = re.compile(r"(?:(?<=\w)_|(?<=[^\W\d]) |(?<=\d) (?=deg))(?P<unit>[A-Za-z]\w*)$")
 NO_UNITS = {*string.ascii_letters, "in"}  # at the end of a sensor's name: T_K, T_in
 NUMBERED = re.compile(r"(.*?)(\d+)")  # u_17
 PLACES = "places.csv"  # the table of positions that is written beside the case
