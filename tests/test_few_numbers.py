@@ -34,3 +34,27 @@ def test_products_are_those_of_quadrature_whatever_numbers_come() -> None:
             expected = form.matrix("v", "q", q=numbers, u=u) @ x
             found = form.about(numbers).product(x, u)
             assert np.abs(found - expected).max() <= 1e-13 * np.abs(expected).max()
+
+
+def test_members_with_other_numbers_are_as_they_are_alone() -> None:
+    """They share the form, and its numbers change from member to member."""
+    mesh = lp.interval(0.0, 1.0, 8)
+    model = lp.Model(
+        lp.Field(mesh, lp.linear(mesh), dirichlet={"left": 1.0}),
+        {"D": lp.Normal(0.3, 0.1), "phi": lp.Normal(0.6, 0.1)},
+        A=lambda q, u, v, x: q.D**2 * lp.dot(lp.grad(u), lp.grad(v)) + u * v / q.phi,
+    )
+    sensors, law = lp.Points([0.4, 0.8], noise=0.01), lp.SensitivityLaw()
+    fleet = lp.Fleet(model, sensors, law, 3, u0=0.0)
+    alone = [lp.Identifier(model, sensors, law, u0=0.0) for _ in range(3)]
+    rng = np.random.default_rng(5)
+    for k in range(1, 20):
+        z = (1.0 - np.exp(-0.2 * k)) * np.array([0.6, 0.4]) + 0.01 * rng.standard_normal((3, 2))
+        z[k % 3, 0] = np.nan
+        together = fleet.step(0.1 * k, z)
+        each = [one.step(0.1 * k, row) for one, row in zip(alone, z, strict=True)]
+    for k, one in enumerate(each):
+        found = together.member(k)
+        assert np.allclose(found.q, one.q, rtol=1e-9, atol=0.0)
+        assert found.q_std is not None and one.q_std is not None
+        assert np.allclose(found.q_std, one.q_std, rtol=1e-9, atol=0.0)

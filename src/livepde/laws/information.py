@@ -34,8 +34,8 @@ S is the power of the remaining equation error, as far as q sees it,
     power(eps) = mean of h ||A^T D^{-1} eps||_{Q*}^2 / mean of trace(G_Q^{-1} A^T R D^{-1} R^T A),
     S          = (power(eps_k) power(eps_k - eps_{k-1})/2)^{1/2}.
 
-For white noise both powers are S. A lasting error counts less, the slower it changes: errors of
-mesh, time step, smoothing and P u slow q as noise does, and an error of q hardly does. The
+For white noise both powers are S. A lasting error counts less, the slower it changes. Errors of
+mesh, time step, smoothing and P u slow q down like noise; an error of q has little effect. The
 same is done with the diagonal of G_Q instead of G_Q, and the larger S is taken: the first
 measures the error against smooth functions, the second against rough ones, where derivatives of
 noisy data are far larger. Means weigh a sample at time t by t^FORGETS. The first sample moves
