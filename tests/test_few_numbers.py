@@ -56,5 +56,6 @@ def test_members_with_other_numbers_are_as_they_are_alone() -> None:
     for k, one in enumerate(each):
         found = together.member(k)
         assert np.allclose(found.q, one.q, rtol=1e-9, atol=0.0)
-        assert found.q_std is not None and one.q_std is not None
+        assert found.q_std is not None
+        assert one.q_std is not None
         assert np.allclose(found.q_std, one.q_std, rtol=1e-9, atol=0.0)

@@ -466,7 +466,8 @@ class Form(FormMatrices):
     def fixed_by_numbers(self) -> bool:
         """True if a constant form is affine in u as soon as a few unknown numbers are given."""
         few = self.parameter is not None and self.spaces[self.parameter].dim <= FEW
-        return few and not self.linear_in_parameter and self.constant and self.affine
+        curved = few and not self.linear_in_parameter and self._stores_products
+        return curved and self.constant and self.affine
 
     def about(self, q: Array) -> FormAbout:
         """Return the form about few numbers, cached for the last q; see `fixed_by_numbers`.
@@ -608,14 +609,19 @@ class Form(FormMatrices):
             return None
         return self._tensor(rows, cols, third)
 
+    @property
+    def _stores_products(self) -> bool:
+        """True if the products of local functions are few enough for a sparse matrix."""
+        sizes = [
+            int(np.prod([len(space.dofs_on(term.measure)) for space in term.over.values()]))
+            * term.measure.shape[0]
+            for term in self.terms
+        ]
+        return sum(sizes) <= LARGEST_TENSOR
+
     def _tensor(self, rows: str, cols: str, third: str) -> Tensor:
         if (rows, cols) not in self._tensors:
-            sizes = [
-                int(np.prod([len(space.dofs_on(term.measure)) for space in term.over.values()]))
-                * term.measure.shape[0]
-                for term in self.terms
-            ]
-            make = self._sparse if sum(sizes) <= LARGEST_TENSOR else self._elementwise
+            make = self._sparse if self._stores_products else self._elementwise
             self._tensors[rows, cols] = make(rows, cols, third)
         return self._tensors[rows, cols]
 
@@ -649,10 +655,7 @@ class Form(FormMatrices):
     def _trilinear_parts(
         self, whole: _Term, first: str, second: str, third: str, *, q: Array | None = None
     ) -> Iterator[tuple[slice, Array]]:
-        """Yield the integrals over elements of all products of local functions, (i, j, n, E).
-
-        Of a form that is not linear in its parameter, about the parameter q.
-        """
+        """Yield the integrals over elements of products of local functions, (i, j, n, E), at q."""
         axes = {first: 0, second: 1, third: 2}
         for at, term in whole.pieces():
             values = {key: local.units(axes[key], 3) for key, local in term.spaces.items()}
