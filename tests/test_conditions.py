@@ -23,7 +23,6 @@ from livepde.models import (
     borehole,
     conduction,
     heat,
-    pumping_test,
     with_conditions,
 )
 from livepde.stepping import Advance, Alexander2, simulate
@@ -459,12 +458,35 @@ def test_a_product_of_an_unknown_and_an_input_that_vanishes_at_the_prior_mean_is
     assert np.abs(u - exact).max() < 1e-5
 
 
-def test_an_equation_in_the_radius_is_refused() -> None:
-    """A flux through the wall of a borehole counted 1/r times."""
-    mesh = lp.interval(0.05, 5.0, 20, geometric=True)
-    ground = borehole(mesh, lp.Normal(2.0), lp.Normal(0.1), H=100.0, rho_c=2e6, T0=10.0)
-    particle = battery_particle(lp.interval(0.0, 1.0, 9), lp.Normal(1.0), area=1.0, c_max=1.0)
-    well = pumping_test(mesh, lp.Normal(1.0), lp.Normal(1.0), b=1.0)
-    for model in (ground, particle, well):
-        with pytest.raises(ModelError, match="multiplied by the radius"):
-            with_conditions(model, {"left": Flux(1.0)})
+@pytest.mark.parametrize("known", [True, False])
+def test_a_flux_into_a_borehole_is_that_through_its_area(known: bool) -> None:
+    """It counted 1/r times: the equation is multiplied by the radius."""
+    wall, H, Q, rho_c = 0.05, 100.0, 6000.0, 2e6
+    mesh = lp.interval(wall, 5.0, 20, geometric=True)
+    capacity = rho_c if known else lp.LogNormal(rho_c, std=1e5)
+    plain = borehole(mesh, lp.Normal(2.0), lp.Normal(0.1), H=H, rho_c=capacity, T0=10.0)
+    half = Flux(0.5 * Q / (2 * np.pi * wall * H))
+    heated = with_conditions(plain, {"left": half}, per=None if known else "rho_c")
+    times = np.linspace(0.0, 3600.0, 30).tolist()
+    ends = []
+    for model, power in ((plain, Q), (heated, 0.5 * Q)):
+        q = model.initial_parameter({"k": 2.0, "R_b": 0.1} | ({} if known else {"rho_c": rho_c}))
+        control = Advance(Alexander2())
+        *_, (_, u) = simulate(model, q, 10.0, times, control, lambda t, power=power: {"Q": power})
+        ends.append(u)
+    assert ends[1] == pytest.approx(ends[0], rel=1e-9)
+    assert ends[1].max() > 11.0
+
+
+def test_amounts_of_a_sphere_are_those_of_its_volume() -> None:
+    """What a source and a flux bring into a particle is the mean over its volume times that."""
+    R, rate, flux, t = 0.5, 3.0, 0.2, 0.7
+    mesh = lp.interval(0.0, R, 15)
+    particle = battery_particle(mesh, lp.Normal(1.0), area=1.0, c_max=1.0)
+    fed = with_conditions(particle, {"right": Flux(flux)}, {"all": Source(rate)})
+    q, times = fed.initial_parameter({"D": 1.0}), np.linspace(0.0, t, 8).tolist()
+    *_, (_, u) = simulate(fed, q, 2.0, times, Advance(Alexander2()), lambda t: {"I": 0.0})
+    mean = lp.Averages({"all": lambda x: x[0] < 1.0, "centre": "left"}, noise=0.1)
+    found = mean.matrix(fed.state_space) @ u
+    assert found[0] == pytest.approx(2.0 + t * (rate + 3 * flux / R), rel=1e-9)
+    assert found[1] == pytest.approx(u[0], rel=1e-12)

@@ -13,10 +13,9 @@ import pytest
 import scipy
 
 import livepde as lp
-from livepde.laws.error_columns import SMALL, ErrorColumns, radial_power
+from livepde.laws.error_columns import SMALL, ErrorColumns
 from livepde.laws.model_errors import linear_model, model_errors
 from livepde.laws.stored_samples import StoredSamples
-from livepde.models import pumping_test
 from livepde.stepping import ForwardStage
 from livepde.verdict import (
     Allowed,
@@ -136,28 +135,6 @@ def test_hypotheses_without_weight_are_left_out():
 
 
 # --- the answers of the process ------------------------------------------------------------------
-
-
-def test_errors_of_a_radial_equation_have_its_weight():
-    """r for a radius in a plane, r^2 in space; a heat capacity that varies is none of them."""
-    mesh = lp.interval(0.1, 100.0, 30, geometric=True)
-    k = lp.LogNormal(1e-3, std=1e-3)
-    assert radial_power(pumping_test(mesh, k, k, b=5.0)) == 1
-    sphere = lp.interval(0.0, 1.0, 12)
-    in_space = lp.Model(
-        lp.Field(sphere, lp.fem.linear(sphere)),
-        k,
-        A=lambda q, u, v, x: q * x[0] ** 2 * lp.dot(lp.grad(u), lp.grad(v)),
-        M=lambda u, v, x: x[0] ** 2 * u * v,
-    )
-    assert radial_power(in_space) == 2
-    layered = lp.Model(
-        lp.Field(sphere, lp.fem.linear(sphere)),
-        k,
-        A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
-        M=lambda u, v, x: np.where(x[0] < 0.5, 1.0, 3.0) * u * v,
-    )
-    assert radial_power(layered) == radial_power(rod()) == 0
 
 
 LENGTH, STEP, COUNT = 1.0, 0.02, 120

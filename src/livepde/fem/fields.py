@@ -40,6 +40,11 @@ Predicate: TypeAlias = Callable[[Array], Any]
 """A subset of the domain: x of shape (d, ...) -> booleans of shape (...)."""
 
 
+def unweighted(x: Any) -> float:
+    """Return the volume element of Cartesian coordinates, one."""
+    return 1.0
+
+
 @dataclass(frozen=True)
 class Channel:
     """A value supplied by the stream, identified by the name of its channel.
@@ -282,6 +287,10 @@ class Field(_Declared):
     periodic
         Pairs of boundaries of equal shape, as in (("left", "right"),), whose coefficients are
         identified.
+    weight
+        Volume element of the coordinates, by which A, M, B and f are multiplied: `lambda x: x[0]`
+        where x[0] is the distance from an axis, its square where it is that from a point. Means
+        over regions, added fluxes and sources, and errors of the model have this factor, too.
 
     Examples
     --------
@@ -305,6 +314,7 @@ class Field(_Declared):
     periodic: Sequence[tuple[str, str]] = ()
     clamped: bool = False
     within: float = WITHIN
+    weight: Callable[[Any], Any] = unweighted
 
     @property
     def boundary_values(self) -> list[Any]:

@@ -44,7 +44,6 @@ STEP = 0.01  # of a difference: prior standard deviations of an unknown, share o
 NARROW = 0.03  # of the length: a contact
 COMPARED = 4  # moments at which loads are compared
 ALIKE = 1e-3  # relative difference of loads that are the same
-SAME = 1e-9  # relative difference of weights that are the same
 ROUNDING = 1e-11  # share of its terms, below which an effect is none: it would be scaled to one
 
 
@@ -203,10 +202,10 @@ class ErrorColumns:
         stage = ForwardStage(model)
         places = PLACES if stage.symmetric or not stage.keeps else ()
 
-        power = radial_power(model)
+        weight = model.state_block.field.weight
 
         def stiffness(shape: Callable[[Any], Any]) -> Any:
-            return model.bilinear(lambda u, v, x: x[0] ** power * shape(x) * dot(grad(u), grad(v)))
+            return model.bilinear(lambda u, v, x: weight(x) * shape(x) * dot(grad(u), grad(v)))
 
         for k in range(1, 1 + modes):
             load = _minus(stiffness(self._mode(k)))
@@ -225,7 +224,7 @@ class ErrorColumns:
         axes = len(self.span)
         for k in range(axes * math.ceil(modes / axes)):  # along each axis as many
             axis, number = k % axes, k // axes
-            load = _minus(self._flow(axis, power, self._mode(number)))
+            load = _minus(self._flow(axis, self._mode(number)))
             yield Answer("flow", "", axes * self._powers[number][0], load), hats(times)
             if number == 0:
                 yield Answer("steady flow", "xyz"[axis], load=load), ALWAYS
@@ -237,8 +236,9 @@ class ErrorColumns:
         amount = np.asarray(self.model.mass @ self.model.state_space.interpolate(1.0))
         return float(amount @ self.samples.start.u[0] / amount.sum())
 
-    def _flow(self, axis: int, power: int, shape: Callable[[Any], Any]) -> Any:
-        return self.model.bilinear(lambda u, v, x: x[0] ** power * shape(x) * grad(u)[axis] * v)
+    def _flow(self, axis: int, shape: Callable[[Any], Any]) -> Any:
+        weight = self.model.state_block.field.weight
+        return self.model.bilinear(lambda u, v, x: weight(x) * shape(x) * grad(u)[axis] * v)
 
     def _halves(self, axis: int) -> Callable[[Any], Any]:
         """Return a shape that tells two layers apart, from either side with the same size."""
@@ -348,20 +348,6 @@ class ErrorColumns:
                 lift = answer.lift(now) if callable(answer.lift) else answer.lift
                 lifts[own] = weights * lift
         return later(stage, p, now, h, loads, lifts)
-
-
-def radial_power(model: Model) -> int:
-    """Return the power of the first coordinate that weighs all integrals: 0 where none does.
-
-    It is that in M: 1 for a radius in a plane or around an axis, 2 for one in space.
-    """
-    one = model.state_space.interpolate(1.0)
-    own = np.asarray(model.mass @ one)
-    for power in (1, 2):
-        alike = model.bilinear(lambda u, v, x, power=power: x[0] ** power * u * v) @ one
-        if np.ptp(own * alike.max() - alike * own.max()) <= SAME * alike.max() * own.max():
-            return power
-    return 0
 
 
 def beyond_rounding(values: Array, terms: Array) -> Array:

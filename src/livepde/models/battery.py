@@ -74,17 +74,19 @@ def battery_particle(
     R = float(mesh.p.max())
     unknowns = {"D": D} if slope is None else {"D": D, "slope": slope}
 
-    # The weights (r/R)^2 are of order one, which keeps the matrices well scaled. Quadrature of
-    # order four is exact for them with elements of first order.
+    # It is of order one, which keeps the matrices well scaled.
+    def shell(x: Any) -> Any:
+        return (x[0] / R) ** 2
+
     def diffusion(q: Any, c: Any, v: Any, x: Place) -> Any:
         mobility = q.D if slope is None else q.D * exp(q.slope * (c / c_max - 0.5))
-        return mobility * (x[0] / R) ** 2 * dot(grad(c), grad(v))
+        return mobility * shell(x) * dot(grad(c), grad(v))
 
     return Model(
-        Field(mesh, element or linear(mesh), unit="mol/m^3", quadrature=4),
+        Field(mesh, element or linear(mesh), unit="mol/m^3", weight=shell, quadrature=4),
         unknowns,
         A=diffusion,
-        M=lambda c, v, x: (x[0] / R) ** 2 * c * v,
+        M=lambda c, v, x: shell(x) * c * v,
         f=On("right", lambda x, _: -x.inputs["I"] / (FARADAY * area)),
         inputs=["I"],
         **BATTERY_PARTICLE.about(),

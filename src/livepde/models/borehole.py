@@ -13,6 +13,7 @@ from livepde.errors import ModelError
 from livepde.fem import Field, On, Place, Scalar, Unknown, declared, dot, grad, linear
 from livepde.model import Model
 from livepde.models.description import (
+    AROUND_AXIS,
     Equation,
     Number,
     Option,
@@ -54,8 +55,8 @@ def borehole(
         rho_c is unknown by region or as a field.
     """
     one_number("borehole", rho_c=rho_c)
-    # Quadrature of order four integrates the weight r with elements of first order exactly.
-    state = Field(mesh, element or linear(mesh), dirichlet={"right": T0}, unit="degC", quadrature=4)
+    ends = {"right": T0}
+    state = Field(mesh, element or linear(mesh), dirichlet=ends, unit="degC", **AROUND_AXIS)
     if isinstance(rho_c, int | float):
         return Model(
             state,
@@ -152,7 +153,7 @@ def grouted_borehole(
     The capacity of the ground may be unknown because radii there are replaced by a coordinate that
     measures the heat content: x^2 - r_b^2 = (rho_c/rho_0) (r^2 - r_b^2), with the prior rho_0. In x
     the capacity is known, and k appears as k (rho_c/rho_0) r^2/x. The right end in r moves with
-    rho_c.
+    rho_c. A source that is added there counts per heat content of rho_0.
 
     Parameters
     ----------
@@ -190,9 +191,8 @@ def grouted_borehole(
         raise ModelError("grouted_borehole: rho_c must be one number: a prior, or a Scalar.")
     layered = _layered(mesh, r_p, r_b)
     thickness, around, rho_0 = r_p - float(mesh.p[0].min()), log(r_b / r_p), heat.prior.centre
-    # Quadrature of order four integrates the weight r with elements of first order exactly.
     cold = {name: T0 for name in ("right", "end") if name in layered.boundaries}
-    state = Field(layered, linear(layered), dirichlet=cold, unit="degC", quadrature=4)
+    state = Field(layered, linear(layered), dirichlet=cold, unit="degC", **AROUND_AXIS)
 
     def pipes(q: Any, u: Any, v: Any, x: Place) -> Any:
         return thickness / (2 * pi * q.share * q.R_b) * _outwards(u, v)

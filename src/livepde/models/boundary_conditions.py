@@ -7,7 +7,6 @@ J v, in the unit of D u_n.
 from __future__ import annotations
 
 import math
-import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,8 +20,6 @@ from livepde.fem import Channel, On, Place, Unknown, ignores
 from livepde.fem.measure import Measure, sizes
 from livepde.model import Model
 
-# An equation in the radius, multiplied by it: "rho_c r T_t = ...".
-RADIAL = re.compile(r"\br(\^2)? \w+_t\b")
 # Share of the size of a source that a mesh may miss without a warning.
 MISSED = 0.01
 
@@ -99,8 +96,8 @@ def with_conditions(
     Raises
     ------
     ModelError
-        A boundary does not exist or has a Dirichlet value, no condition names an unknown, `per`
-        is not an unknown of the model, or the equation is multiplied by the radius.
+        A boundary does not exist or has a Dirichlet value, no condition names an unknown, or `per`
+        is not an unknown of the model.
 
     Examples
     --------
@@ -117,11 +114,6 @@ def with_conditions(
     ('k', 'J')
     """
     more = dict(unknowns or {})
-    if (boundary or sources) and RADIAL.search(model.formula):
-        raise ModelError(
-            f"with_conditions: the equation {model.formula} is multiplied by the radius, but "
-            "fluxes and sources would not be: add terms with this factor by Model.with_terms."
-        )
     terms = _Terms(model, tuple(more), per)
     for name, given in (boundary or {}).items():
         terms.through(name, given)
@@ -192,7 +184,12 @@ class _Terms:
         # In M u_t + A(u) q + B(u) = f the terms stand on the left side, hence the sign.
         self._add(where, lambda q, _, v, x: -amount(q, x) * inside(x) * v, value)
 
-    def _add(self, where: str | None, term: Callable[..., Any], *amounts: Amount) -> None:
+    def _add(self, where: str | None, plain: Callable[..., Any], *amounts: Amount) -> None:
+        weight = self.model.state_block.field.weight
+
+        def term(q: Any, u: Any, v: Any, x: Place) -> Any:
+            return plain(q, u, weight(x) * v, x)
+
         def known(u: Any, v: Any, x: Place) -> Any:
             return term(None, u, v, x)
 
@@ -200,10 +197,11 @@ class _Terms:
             return term(None, None, v, x)
 
         # B and f may not read q, so a term belongs to A as soon as one amount is an unknown.
+        form: Callable[..., Any]
         if self.per is not None or any(isinstance(one, str | Multiple) for one in amounts):
             form, terms = term, self.A
         else:
-            form, terms = driving if ignores(term, 1) else known, self.B
+            form, terms = driving if ignores(plain, 1) else known, self.B
         terms.append(form if where is None else On(where, form))
 
     def _divided(self, value: Amount) -> Callable[[Any, Place], Any]:

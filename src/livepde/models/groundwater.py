@@ -13,6 +13,7 @@ from livepde.fem import Channel, Field, On, Piecewise, Place, Unknown, dot, grad
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.models.description import (
+    AROUND_AXIS,
     Equation,
     Number,
     Option,
@@ -64,8 +65,8 @@ def pumping_test(
     everywhere("pumping_test", mesh, k=k)
     if not b > 0:
         raise ModelError(f"pumping_test: b, the thickness, must be positive; got {b}.")
-    # Quadrature of order four integrates the weight r with elements of first order exactly.
-    state = Field(mesh, element or linear(mesh), dirichlet={"right": 0.0}, unit="m", quadrature=4)
+    ends = {"right": 0.0}
+    state = Field(mesh, element or linear(mesh), dirichlet=ends, unit="m", **AROUND_AXIS)
     terms: list[Any] = [
         lambda q, u, v, x: q.diffusivity * x[0] * dot(grad(u), grad(v)),
         On("left", lambda q, _, v, x: -x.inputs["Q"] / (2 * pi * b) * q.per_storage * v),

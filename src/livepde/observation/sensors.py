@@ -420,6 +420,8 @@ def _reached(block: FieldBlock, start: Array, axis: int, step: float) -> Array:
 class Averages(Observation):
     """Mean values over regions or boundaries, z_k = (integral of u over omega_k) / |omega_k|.
 
+    Volumes are those of the coordinates, see `Field.weight`.
+
     Parameters
     ----------
     regions
@@ -458,25 +460,29 @@ class Averages(Observation):
 
     @staticmethod
     def _row(block: FieldBlock, name: str, region: Predicate | str) -> Array:
-        mesh, element = block.field.mesh, block.field.element
+        mesh, weight = block.field.mesh, block.field.weight
         where = region if isinstance(region, str) else None
         known = [*(mesh.boundaries or {}), *(mesh.subdomains or {})]
         if where is not None and where not in known:
             raise ObservationError(
                 f"Averages: region '{name}' is '{where}'; the mesh names {known or 'nothing'}."
             )
-        order = 2 * int(element.maxdeg)
+        order = max(2 * int(block.field.element.maxdeg), block.field.quadrature or 0)
         measure = Measure(mesh, order, where)
         if isinstance(region, str):
-            size, row = _integral(block, measure)
+            size, row = _integral(block, measure, lambda x, _: weight(x))
+            if size == 0.0:  # a boundary on the axis
+                size, row = _integral(block, measure, lambda x, _: 1.0)
         else:
             cut = crossed(measure, region)
-            size, row = _integral(block, measure, lambda x, cells: region(x) * ~np.isin(cells, cut))
+            size, row = _integral(
+                block, measure, lambda x, cells: weight(x) * region(x) * ~np.isin(cells, cut)
+            )
             # A region between the quadrature points of one cell is looked for on finer parts.
             members = cut if size > 0 or len(cut) else np.arange(mesh.nelements)
             if len(members):
                 fine = FineMeasure(mesh, order, members=members)
-                more, added = _integral(block, fine, lambda x, _: region(x))
+                more, added = _integral(block, fine, lambda x, _: weight(x) * region(x))
                 size, row = size + more, row + added
         if size <= 0:
             raise ObservationError(f"Averages: region '{name}' contains no part of the mesh.")
@@ -484,20 +490,16 @@ class Averages(Observation):
 
 
 def _integral(
-    block: FieldBlock,
-    measure: Measure,
-    inside: Callable[[Array, IntArray], Any] | None = None,
+    block: FieldBlock, measure: Measure, density: Callable[[Array, IntArray], Any]
 ) -> tuple[float, Array]:
-    """Return size of a region, and integral of each shape function over it, shape (size,).
+    """Return integrals of a density, and of its product with each shape function, shape (size,).
 
-    `inside`: function of points and of the numbers of their cells, shape (cells, 1); None: all.
+    The density is a function of points and of the numbers of their cells, shape (cells, 1).
     """
     size, row = 0.0, np.zeros(block.size)
     for at, piece in measure.pieces():
-        weights = piece.weights
-        if inside is not None:
-            cells = np.arange(at.start, at.stop) if piece.cells is None else piece.cells
-            weights = inside(piece.points, cells[:, None]) * weights
+        cells = np.arange(at.start, at.stop) if piece.cells is None else piece.cells
+        weights = density(piece.points, cells[:, None]) * piece.weights
         size += float(weights.sum())
         local = block.local(piece)
         np.add.at(row, local.dofs, (local.part("value")[0] * weights).sum(axis=-1))

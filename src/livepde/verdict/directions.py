@@ -209,8 +209,9 @@ def boundary_lifts(model: Model) -> dict[str, Array]:
 def flux_loads(model: Model, most: int | None = None) -> dict[str, Array]:
     """Return loads of a flux of one, (n,), through those of `most` boundaries without a value."""
     ones, found = model.state_space.interpolate(1.0), {}
+    weight = model.state_block.field.weight
     for name in [str(one) for one in model.mesh.boundaries or {}][:most]:
-        form: Any = On(name, lambda u, v, x: u * v)
+        form: Any = On(name, lambda u, v, x: weight(x) * u * v)
         load = model.bilinear(form) @ ones
         if load.sum() > 0.0 and not load[model.X.free == 0.0].any():
             found[name] = load
