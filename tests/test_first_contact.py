@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 
 import livepde as lp
-from livepde.models import heat
+from livepde.models import borehole, fluid, heat
 
 TRUE = 0.07  # diffusivity of the rod
 NOISE = 0.05  # of its sensors, K
@@ -170,6 +170,27 @@ def test_units_of_a_dataset_are_those_of_all_its_temperatures():
     data["T_30"] = (1.8 * data["T_30"] - 459.67).assign_attrs(units="degF")
     data["noise of T_30"].attrs["units"] = "K"
     assert same(identifier().run(data), rtol=1e-9)
+
+
+def test_units_of_inputs_are_converted_like_those_of_sensors():
+    """The power of a dataset in kW was taken as in W."""
+    wall, hours = 0.07, np.linspace(0.0, 10.0, 11)
+    mesh = lp.interval(wall, 5.0, 12, geometric=True)
+    k, resistance = lp.LogNormal(2.0, std=0.5), lp.LogNormal(0.1, std=0.03)
+    model = borehole(mesh, k, resistance, H=100.0, rho_c=2e6, T0=10.0)
+    table = pd.DataFrame({"T": 10.0 + 2.0 * np.sqrt(hours), "Q": 5000.0}, index=3600.0 * hours)
+
+    def ends(data, **how):
+        sensors = lp.Points({"T": wall}, direct={"T": fluid(100.0)}, noise=0.1, unit="degC")
+        return lp.Identifier(model, sensors, u0=10.0).run(data, **how).summary()["value"].to_numpy()
+
+    data = table.assign(Q=5.0).to_xarray()
+    data["Q"].attrs["units"] = "kW"
+    assert ends(data) == pytest.approx(ends(table), rel=1e-12)
+    assert ends(table.assign(Q=5.0), units={"Q": "kW"}) == pytest.approx(ends(table), rel=1e-12)
+    data["Q"].attrs["units"] = "m"
+    with pytest.raises(lp.errors.ConfigurationError, match="units of 'Q'"):
+        ends(data)
 
 
 def test_a_column_that_is_no_channel_is_ignored_unless_strict():

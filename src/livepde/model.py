@@ -99,7 +99,8 @@ class Model(Shown):
         Optional integrands of the derivatives in u, (q, u, du, v, x) and (u, du, v, x). Without
         them a complex step is taken (exact for analytic integrands).
     inputs
-        Names of the channels that forms read as x.inputs["name"].
+        Names of the channels that forms read as x.inputs["name"]; a mapping has their units, by
+        which the values of data that state another unit are converted.
     time_unit, length_unit, formula
         Units of times and coordinates, and the equation as text; default the weak form in code.
     initial
@@ -153,7 +154,7 @@ class Model(Shown):
         *,
         dA: Integrand | Sequence[Integrand] | None = None,
         dB: Integrand | Sequence[Integrand] | None = None,
-        inputs: Sequence[str] = (),
+        inputs: Sequence[str] | Mapping[str, str] = (),
         time_unit: str = "",
         length_unit: str = "",
         formula: str = "",
@@ -323,7 +324,7 @@ class Model(Shown):
                 raise ModelError(f"with_terms: the model has d{name}; add the terms to {name}.")
             given = parts[name] if isinstance(parts[name], Sequence) else [parts[name]]
             parts[name] = [*given, *more]
-        parts["inputs"] = tuple(dict.fromkeys([*self.inputs, *inputs]))
+        parts["inputs"] = dict.fromkeys([*self.inputs, *inputs], "") | self._input_units
         about, added = dict(self._about), ", with added conditions and sources"
         if about["formula"] and not about["formula"].endswith(added):
             about["formula"] += added
@@ -346,7 +347,7 @@ class Model(Shown):
                 return [bound(item) for item in part]
             return with_constants(part, values) if callable(part) else part
 
-        left = [name for name in self.inputs if name not in values]
+        left = {name: unit for name, unit in self._input_units.items() if name not in values}
         kept = {"inputs": left, "coefficients": self._parts["coefficients"]}  # read no channels
         parts = {name: bound(part) for name, part in self._parts.items() if name not in kept}
         return Model(self.state, self.parameter, **parts, **kept, **self._about)
@@ -570,10 +571,15 @@ class Model(Shown):
         return str(self._about["formula"])
 
     @property
-    def boundary_units(self) -> dict[str, str]:
-        """Mapping from the channel of a boundary value to the unit of its component."""
+    def _input_units(self) -> dict[str, str]:
+        given = self._parts["inputs"]
+        return dict(given) if isinstance(given, Mapping) else dict.fromkeys(self.inputs, "")
+
+    @property
+    def channel_units(self) -> dict[str, str]:
+        """Mapping from input, or channel of a boundary value, to its unit; empty if not known."""
         fields = [block.field for block in self.state_space.fields.values()]
-        return {
+        return self._input_units | {
             value.name: field.unit
             for field in fields
             for value in field.boundary_values

@@ -186,7 +186,7 @@ class StreamRuns(Shown):
 
         optional = [name for name in self._channels.inputs if name in self._channels.optional]
         needed = [name for name in self._channels.names if name not in optional]
-        units = self.model.boundary_units
+        units = self.model.channel_units
         for sensors in self._channels.sensors:
             units |= dict(zip(sensors.names, sensors.units, strict=True))
         how = Reading(

@@ -88,7 +88,7 @@ def battery_particle(
         A=diffusion,
         M=lambda c, v, x: shell(x) * c * v,
         f=On("right", lambda x, _: -x.inputs["I"] / (FARADAY * area)),
-        inputs=["I"],
+        inputs={"I": "A"},
         **BATTERY_PARTICLE.about(),
     )
 

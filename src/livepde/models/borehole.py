@@ -64,7 +64,7 @@ def borehole(
             A=lambda q, u, v, x: q.k * x[0] * dot(grad(u), grad(v)),
             M=lambda u, v, x: rho_c * x[0] * u * v,
             f=On("left", lambda x, _: x.inputs["Q"] / (2 * pi * H)),
-            inputs=["Q"],
+            inputs={"Q": "W"},
             **BOREHOLE.about(),
         )
     # The mass term must not contain unknowns, so the equation is divided by the heat capacity.
@@ -77,7 +77,7 @@ def borehole(
         ],
         coefficients=lambda q: {"diffusivity": q.k / q.rho_c, "per_capacity": 1 / q.rho_c},
         M=lambda u, v, x: x[0] * u * v,
-        inputs=["Q"],
+        inputs={"Q": "W"},
         **BOREHOLE.about(),
     )
 
@@ -219,7 +219,7 @@ def grouted_borehole(
             On("ground", lambda u, v, x: rho_0 * x[0] * u * v),
         ],
         f=On("left", lambda x, _: x.inputs["Q"] / (2 * pi * H)),
-        inputs=["Q"],
+        inputs={"Q": "W"},
         **GROUTED_BOREHOLE.about(),
     )
 

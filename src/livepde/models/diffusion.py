@@ -169,7 +169,7 @@ def _model(
         given,
         A=_terms(equation, part, field),
         M=lambda u, v, x: capacity(x) * u * v,
-        inputs=[AMBIENT] if {"loss", "transfer"} & set(given) else [],
+        inputs={AMBIENT: unit} if {"loss", "transfer"} & set(given) else {},
         coefficients=(lambda q: _ratios(q, part)) if divided else None,
         **equation.about(given),
     )

@@ -86,7 +86,7 @@ def pumping_test(
         A=terms,
         coefficients=coefficients,
         M=lambda u, v, x: x[0] * u * v,
-        inputs=["Q"],
+        inputs={"Q": "m^3/s"},
         **PUMPING_TEST.about(unknowns),
     )
 
@@ -167,7 +167,7 @@ def groundwater(
         Field(mesh, element or linear(mesh), dirichlet=held, unit="m", quadrature=4),
         {"T": T, "S": S},
         A=[flow, taken],
-        inputs=tuple(sources),
+        inputs=dict.fromkeys(sources, "m^3/s"),
         **GROUNDWATER.about(),
     )
 
@@ -318,7 +318,7 @@ def advection_dispersion(
         ],
         B=[lambda c, w, x: decay * c * w] if known else [],
         M=lambda c, w, x: R * c * w,
-        inputs=["c_in"],
+        inputs={"c_in": unit},
         **ADVECTION_DISPERSION.about(),
     )
 
@@ -382,7 +382,7 @@ def mobile_immobile(
             "into_mobile": q.omega / q.phi,
             "into_immobile": q.omega / (1 - q.phi),
         },
-        inputs=["c_in"],
+        inputs={"c_in": unit},
         **MOBILE_IMMOBILE.about(),
     )
 

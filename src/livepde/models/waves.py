@@ -124,7 +124,7 @@ def advection_diffusion(
         Field(mesh, element or linear(mesh), dirichlet=dict(dirichlet or {}), unit=unit),
         unknowns,
         A=transport,
-        inputs=["dH"] if K is not None else [],
+        inputs={"dH": "m"} if K is not None else {},
         **ADVECTION_DIFFUSION.about(unknowns),
     )
 

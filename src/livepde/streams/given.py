@@ -35,7 +35,7 @@ class Reading:
     channels: Sequence[str]  # that need a column
     optional: Sequence[str]  # that are read if there is such a column: noise of readings, places
     unit: str  # the model's unit of time; empty if it has none
-    channel_units: Mapping[str, str]  # sensor or boundary channel -> its unit in the model
+    channel_units: Mapping[str, str]  # sensor or input -> its unit in the model
     # The column of times. Default: the index of a table, the coordinate of a dataset, else the one
     # column that is called time, t, date or the like.
     time: str | None = None
@@ -73,15 +73,10 @@ class Reading:
                         f"{option}: there is no channel '{name}'{tables.hint(name, known)}"
                     )
         for name in self.units:
-            if name not in self.channel_units:
+            if not self.channel_units.get(name):
                 raise ConfigurationError(
-                    f"units: '{name}' is neither a sensor nor a boundary value, so its values are "
-                    "in the unit of the model: convert its column."
-                )
-            if not self.channel_units[name]:
-                raise ConfigurationError(
-                    f"units: the model has no unit for '{name}': name it where the sensors or the "
-                    'state are defined, as in Points(..., unit="degC").'
+                    f"units: the model has no unit for '{name}': name it where sensors, state or "
+                    'inputs are defined, as in Points(..., unit="degC") or inputs={"Q": "W"}.'
                 )
         if self.time_unit is not None:
             self._need_unit("time_unit is given")
