@@ -382,7 +382,7 @@ def test_a_source_that_is_dead_is_silent_without_a_key(tmp_path):
     now = [0.0]
     given = [{**row, "t": 120.0 * row["t"]} for row in rows(40)]  # 12 s apart
     run = live(tmp_path, Bursts(given), clock=lambda: now[0])
-    assert run.silence == math.inf
+    assert run.ailments.silence == math.inf
     run.run()
     found = [(event.kind, event.message) for event in run.journal.events]
     assert [kind for kind, _ in found if kind in ("silent", "heard")] == ["silent", "heard"] * 2 + [
@@ -492,8 +492,8 @@ def test_refused_rows_are_told_also_without_a_limit_of_silence(tmp_path):
     run = live(tmp_path, Rows([*right, *({**right[0], "t": -1.0 - k} for k in range(9))]))
     run.run()
     assert not run.health["ok"]
-    assert run.health["why"] == run.why
-    assert "late" in run.why
+    assert run.health["why"] == run.ailments.ill[1]
+    assert "late" in run.ailments.ill[1]
 
 
 @pytest.mark.slow
@@ -507,8 +507,8 @@ def test_a_run_whose_directory_is_gone_is_not_well(tmp_path):
     run = live(tmp_path, Vanishing(rows(10)))
     run.run()
     assert not run.health["ok"]
-    assert run.why.startswith("the journal in the run directory was replaced")
-    assert run.journal.health == run.why
+    assert run.ailments.ill[1].startswith("the journal in the run directory was replaced")
+    assert run.journal.health == run.ailments.ill[1]
     (tmp_path / "journal.sqlite").write_text("another")
     assert not run.health["ok"]
 
@@ -655,11 +655,11 @@ def test_health_and_metrics(tmp_path):
     assert "livepde_silent 0.0" in told
     assert f"livepde_step_seconds_total {run.health['seconds']!r}" in told
     assert ask("/livez") == ask("/readyz") == "ok\n"
-    run.silent = True
+    run.ailments.silent = True
     assert "livepde_silent 1.0" in ask("/metrics")
     assert "livepde_ok 0.0" in ask("/metrics")
     assert 'livepde_unwell{why="silent"} 1.0' in ask("/metrics")
-    assert run.why not in ask("/metrics")
+    assert run.ailments.ill[1] not in ask("/metrics")
     with pytest.raises(urllib.error.HTTPError, match="503"):
         ask("/health")
     with pytest.raises(urllib.error.HTTPError, match="404"):

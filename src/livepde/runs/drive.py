@@ -76,7 +76,7 @@ def conduct(live: Live, *, patient: bool = False) -> Driven:
         The source never blocks for long: a signal is heard when it has answered.
     """
     driven = Driven(live.result, live.journal)
-    with stopped_by_signals(live.stopping, lambda: patient or live.busy):
+    with stopped_by_signals(live.stopping, lambda: patient or live.ailments.busy):
         try:
             live.run()
             if live.stopping.is_set():

@@ -16,6 +16,7 @@ from livepde.errors import DataError, LivepdeError, RunError
 from livepde.identifier import Identifier
 from livepde.laws import numerical
 from livepde.result import Estimate, Result
+from livepde.runs.ailments import Ailments
 from livepde.runs.backlog import Backlog, Retention, Sink
 from livepde.runs.directory import attempted
 from livepde.runs.feeds import Feed
@@ -33,16 +34,10 @@ CHECKPOINT = 256  # most samples between two checkpoints
 APART, COST = 1.0, 0.05
 # Seconds after a signal in which a step may end, and the last fit; then they are interrupted.
 GRACE, LAST_GRACE = 0.5, 1.0
-# Without `intake.silence`: usual intervals and seconds after which a source without rows is silent.
-SILENT, LEAST_SILENCE = 10.0, 60.0
 LOOK = 0.5  # seconds between two checks whether to stop
 LONGEST = 500  # characters of an event
 RECENT = 1000  # events that are written again when a journal has lost them
 TRIES = 2  # times that a sample in whose step the process has ended is tried again
-REFUSED = 20  # rows and values refused in a row, after which a run is not well
-UNUSED = frozenset(  # rows and values of no use
-    {"malformed", "late", "conflict", "leap", "outside", "skipped"}
-)
 HARMLESS = frozenset({"heard", "well", "missing", "disordered", "outside"})
 LOG = logging.getLogger("livepde.run")
 
@@ -96,9 +91,7 @@ class Live:
     Attributes
     ----------
     ailments
-        Kind -> function that returns the reason why the run is not well, in one sentence, or an
-        empty string; /health, the log and the page report the first reason, the metrics its kind. A
-        verdict is no ailment: the process is well while its model is not.
+        What is wrong with the run.
     """
 
     def __init__(
@@ -128,35 +121,19 @@ class Live:
         self.sinks = list(sinks)
         self.backlog = backlog or Backlog()
         self.retention = retention or Retention()
-        self._stated_silence = silence
         self.strict = strict
         self.waits = waits
         self.patient = patient
-        self.silent = False
         self.stopping = stopping or threading.Event()
-        self.busy = False  # a step is taken
         self._clock = clock
-        self._heard = self._taken = clock()
-        self._refused = self._failed = 0  # in a row
-        self._refusal = self._failure = ""
-        self._longest = 0.0  # silence of the source that has ended
-        self._unwell, self._told = "", ("", "well")
-        self._unwritten = ""  # why the journal cannot be written
+        self.ailments = Ailments(feed, journal, lambda: self.result.last, silence, clock)
         self._group: deque[Ready] = deque()  # to be acknowledged once they are committed
         # Of the group, to be stored at its end: number of the sample, and whether with its fields.
         self._unread: deque[tuple[int, Estimate, bool]] = deque()
         self._untold: deque[Estimate] = deque()  # for the sinks, once they are committed
-        self._committed = self._heard
+        self._committed = clock()
         self._one_by_one = journal.accepted + GROUP  # the last sample that has its own commit
         self._put_last = -math.inf  # time of the last estimate that sinks were given
-        self.ailments: dict[str, Callable[[], str]] = {
-            "disk": lambda: self._unwritten,
-            "journal": self._unlinked,
-            "silent": self._silence,
-            "clock": lambda: self.feed.doubt,
-            "refused": self._refusing,
-            "steps": self._failing,
-        }
         self._waiting = deque(begun)
         self._counts = Counter(journal.counts)
         self._uncounted: deque[Remark] = deque()
@@ -199,11 +176,10 @@ class Live:
             if not (self.patient and self.journal.remedy):
                 raise error
             why = f"the journal cannot be written ({error.__cause__}): {self.journal.remedy}"
-            if not self._unwritten:
+            if not self.ailments.unwritten:
                 about = {"kind": "disk", "channel": "", "t": self.identifier.t}
                 LOG.warning("disk: %s; the run continues", why, extra=about)
-            self._unwritten = self._unwell = why
-            self._told = "disk", "unwell"
+            self.ailments.away(why)
             if self.stopping.wait(LOOK):
                 raise error
             try:
@@ -216,9 +192,7 @@ class Live:
                 self._tell("disk", f"the disk was not writable for {away}")
             except RunError as still:
                 error, again = still, None
-        self._unwritten = ""
-        # The source was not polled meanwhile, so that time is no silence of it.
-        self._heard = self._taken = self._clock()
+        self.ailments.back()
         return again
 
     def _one_at_a_time(self) -> None:
@@ -380,7 +354,9 @@ class Live:
             if self.backlog.has_room(self._waiting):
                 # Samples at hand must not wait for the source; an idle run still checks `stopping`.
                 self._waiting.extend(self.feed.poll(0.0 if self._waiting else LOOK))
-                self._listen(self.feed.heard())
+                ended = self.ailments.listen(self.feed.heard())
+                if ended:
+                    self._tell("heard", ended)
             self._relieve()
             if self._waiting:
                 self._take()
@@ -409,14 +385,14 @@ class Live:
 
     def _record(self) -> None:
         """Store the estimates of the group."""
-        group, before, self.busy = [*self._unread], self.busy, True
+        group, before, self.ailments.busy = [*self._unread], self.ailments.busy, True
         try:
             records = self.result._records([(estimate, keeps) for _, estimate, keeps in group])
             for (number, *_), record in zip(group, records, strict=True):
                 self.journal.append(record, number)
             self._unread.clear()
         finally:
-            self.busy = before
+            self.ailments.busy = before
 
     def _tell_wild(self, estimate: Estimate) -> None:
         """Report the first readings that a law without a covariance has refused."""
@@ -455,9 +431,7 @@ class Live:
         self._uncounted.extend(remarks)
         while self._uncounted:
             remark = self._uncounted.popleft()
-            if remark.kind in UNUSED:
-                self._refused += remark.number
-                self._refusal = f"{remark.kind}: {remark.message}"
+            self.ailments.remarked(remark)
             first = (remark.kind, remark.channel) not in self._counts
             self._counts[remark.kind, remark.channel] += remark.number
             if first or remark.kind == "clock":
@@ -479,7 +453,7 @@ class Live:
         """State of the run for a watchdog: "ok", the reason if not, and counters."""
         last = self.result.last
         counts = self._counts.copy()  # requests come from other threads
-        (ailment, why), verdict = self._ill(), self.looks.verdict
+        (ailment, why), verdict = self.ailments.ill, self.looks.verdict
         return {
             "ok": not why,
             "why": why,
@@ -487,7 +461,7 @@ class Live:
             "t": self.identifier.t,
             "samples": len(self.result),
             "waiting": len(self._waiting),
-            "silent": self.silent,
+            "silent": self.ailments.silent,
             "status": self.replaying or ("" if last is None else last.status.code),
             "replaying": self.replaying,
             "seconds": self._seconds,
@@ -502,73 +476,13 @@ class Live:
         again, total = self._replay
         return f"replaying {again} of {total} since the checkpoint" if total else ""
 
-    @property
-    def why(self) -> str:
-        """Reason why the run is unhealthy, in one sentence; empty if it is healthy.
-
-        While the same ailment lasts, the sentence is that of its beginning.
-        """
-        return self._ill()[1]
-
-    def _ill(self) -> tuple[str, str]:
-        """Return the kind of the first active ailment and its sentence; empty if there is none."""
-        ailing, why = self._ailing()
-        return ailing, self._unwell if ailing == self._told[0] else why
-
-    def _ailing(self) -> tuple[str, str]:
-        """Return the kind of the first active ailment and its reason; empty if there is none."""
-        found = ((kind, why) for kind, ailment in self.ailments.items() if (why := ailment()))
-        return next(found, ("", ""))
-
-    @property
-    def silence(self) -> float:
-        """Seconds without a row after which the source is reported as silent."""
-        if self._stated_silence is not None:
-            return self._stated_silence
-        # A source that brings a day of rows once a day is silent for a day.
-        return max(LEAST_SILENCE, SILENT * self.feed.interval, 2.0 * self._longest)
-
-    def _unlinked(self) -> str:
-        if self.journal.in_place:
-            return ""
-        return (
-            "the journal in the run directory was replaced, so new results will be lost when this "
-            "process ends: stop it, and run the case into a new folder"
-        )
-
-    def _silence(self) -> str:
-        if not self.silent:
-            return ""
-        return f"no data from the source for more than {self.silence:g} s"
-
-    def _refusing(self) -> str:
-        waits = not (self.busy or self.feed.done)
-        long = waits and self._clock() - self._taken > self.silence
-        if not (long or self._refused >= REFUSED):
-            return ""
-        if not self._refused:
-            return f"no sample was accepted for more than {self.silence:g} s"
-        return f"rows arrive, but none is accepted; the last one: {self._refusal}"
-
-    def _failing(self) -> str:
-        last = self.result.last
-        if self._failed > 1:
-            return f"the last steps failed; the last one: {self._failure}"
-        return "" if last is None or last.status.ok else f"the last step: {last.status}"
-
     def _look(self) -> None:
         """Log a change of the run's health, and store it for readers of the journal."""
-        ailing, why = self._ailing()
-        before, kind = self._told
-        if ailing == before:
-            return
-        self._unwell = why
-        self._told = ailing, "silent" if self.silent else "unwell" if why else "well"
-        self.journal.say_health(why)
-        if why:
-            self._tell(self._told[1], why)
-        elif kind == "unwell":  # "heard" has reported the end of a silence
-            self._tell("well", "recovered")
+        event = self.ailments.look()
+        if event is not None:
+            self.journal.say_health(self.ailments.ill[1])
+            if event[1]:
+                self._tell(*event)
 
     def _take(self) -> None:
         """Take the first waiting sample; it stays in the queue if the journal cannot keep it."""
@@ -587,21 +501,21 @@ class Live:
         self._step(taken)
 
     def _step(self, taken: Taken, *, again: bool = False) -> None:
-        self.busy = True
+        self.ailments.busy = True
         try:
             with interruptible(self._check):
                 estimate = self._estimate(taken)
                 if estimate is not None:
                     self._hand_on(estimate, again)
         finally:
-            self.busy = False
+            self.ailments.busy = False
 
     def _check(self) -> None:
         """Raise `Interrupted` once the run was to stop a while ago; called between substeps."""
         if self.stopping.is_set():
             now = self._clock()
             self._stopped_at = min(self._stopped_at, now)
-            if now - self._stopped_at >= (GRACE if self.busy else LAST_GRACE):
+            if now - self._stopped_at >= (GRACE if self.ailments.busy else LAST_GRACE):
                 raise Interrupted
 
     def _estimate(self, taken: Taken) -> Estimate | None:
@@ -620,8 +534,7 @@ class Live:
                 self._withdraw()
                 raise
             self._tell("refused", str(error))
-            self._refused += 1
-            self._refusal = str(error)
+            self.ailments.refused(str(error))
             self._withdraw()
         except RunError:  # of the journal
             raise
@@ -658,9 +571,9 @@ class Live:
 
     def _set_aside(self, t: float, why: str) -> None:
         """Withdraw a sample whose step fails, and report it; the run continues."""
-        self._failed += 1
-        self._failure = f"the sample at t = {t:g} was skipped: {why}"
-        self._tell("aside", self._failure)
+        failure = f"the sample at t = {t:g} was skipped: {why}"
+        self.ailments.failed(failure)
+        self._tell("aside", failure)
         self._counts["aside", ""] += 1
         self.journal.count("aside")
         self._withdraw()
@@ -669,12 +582,9 @@ class Live:
         """Hand an estimate to the sinks, and judge it at intervals."""
         if self.sinks and not again:
             self._untold.append(estimate)
-        if estimate.status.taken:
-            self._taken, self._refused = self._clock(), 0
-        self._failed = 0 if estimate.status.ok else self._failed + 1
+        self.ailments.stepped(estimate)
         if not estimate.status.ok:
-            self._failure = str(estimate.status)
-            self._tell(estimate.status.code, self._failure)
+            self._tell(estimate.status.code, str(estimate.status))
         self._tell_wild(estimate)
         self._steps += 1
         # Counted from the start of the run, so that a resumed run judges the same samples.
@@ -728,13 +638,3 @@ class Live:
             except (OSError, LivepdeError) as error:
                 self.sinks.remove(sink)
                 self._tell("sink", f"{type(sink).__name__} failed and was removed: {error}")
-
-    def _listen(self, heard: bool) -> None:
-        now = self._clock()
-        if heard:
-            if self.silent:
-                self._tell("heard", f"data source reconnected after {now - self._heard:.0f} s")
-            self._longest = max(self._longest, now - self._heard)
-            self._heard, self.silent = now, False
-        elif now - self._heard > self.silence:
-            self.silent = True
