@@ -20,6 +20,7 @@ import numpy as np
 
 from benchmarks.jobs import each
 from livepde.diagnostics.check_report import Check, Table
+from livepde.estimate import Estimate
 from livepde.fem import (
     Field,
     Inputs,
@@ -39,7 +40,6 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Points
 from livepde.plots import NORMAL_95
-from livepde.result import Estimate
 from livepde.runs import Outcome, unexplained
 from livepde.stepping import Advance, Alexander2, ForwardStage, Interval, advance
 

@@ -32,9 +32,9 @@ from benchmarks.jobs import each
 from livepde.cases import load
 from livepde.cases.case import Case, Prepared
 from livepde.diagnostics.check_report import Check, Table
+from livepde.estimate import Estimate
 from livepde.laws import Problem
 from livepde.readout import Marginal
-from livepde.result import Estimate
 from livepde.runs import Outcome
 
 Array = NDArray[Any]

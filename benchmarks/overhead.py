@@ -24,9 +24,9 @@ import numpy as np
 
 from benchmarks.processes import usual_environment
 from livepde.cases import Case, load
+from livepde.estimate import Estimate
 from livepde.fem import Channel, Inputs, Normal, interval
 from livepde.models import heat
-from livepde.result import Estimate
 from livepde.runs import JOURNAL, Check, Outcome, Table, drive
 from livepde.stepping import Advance, ImplicitEuler, simulate
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from benchmarks.progress import shown
 from livepde.errors import RunError
+from livepde.estimate import Estimate
 from livepde.fem import (
     Channel,
     Field,
@@ -40,7 +41,6 @@ from livepde.identifier import Identifier
 from livepde.laws import Jumps, SensitivityLaw
 from livepde.model import Model
 from livepde.observation import Points
-from livepde.result import Estimate
 from livepde.runs import Check, Journal, Outcome, Table, journal_of
 from livepde.runs.backlog import Retention
 from livepde.runs.database import log_of

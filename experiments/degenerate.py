@@ -28,6 +28,7 @@ import numpy as np
 from experiments.manufactured import Manufactured
 from livepde import paper, plots
 from livepde.diagnostics.check_report import Check, Table
+from livepde.estimate import Estimate
 from livepde.fem import Field, dot, grad, interval, linear
 from livepde.laws import ResidualDamping
 from livepde.linalg import Array
@@ -35,7 +36,7 @@ from livepde.observation import Subdomain
 from livepde.progress import watched
 from livepde.reproduce.experiment import failures
 from livepde.reproduce.seed_excited import q_true, u_true
-from livepde.result import Estimate, Result
+from livepde.result import Result
 from livepde.runs import Outcome
 from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin

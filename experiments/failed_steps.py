@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from livepde.result import Estimate
+from livepde.estimate import Estimate
 
 
 class FailedSteps:

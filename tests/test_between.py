@@ -31,7 +31,8 @@ from livepde.streams.intake import Habit, Intake, Policy
 from livepde.streams.join import join_tables
 from livepde.streams.oddities import sentinels, switches
 from livepde.streams.sources import Rows
-from livepde.streams.table import Column, JsonLines, Thinned, tabulated
+from livepde.streams.table import Column, JsonLines, tabulated
+from livepde.streams.thinned import Thinned
 
 REPORTS = Path(__file__).parent / "reports"
 NAN = math.nan

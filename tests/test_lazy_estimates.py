@@ -12,12 +12,12 @@ import pytest
 
 import livepde as lp
 from livepde.checkpoint import flatten
+from livepde.estimate import read_together
 from livepde.frames import interval_ends
 from livepde.laws import Belief
 from livepde.models import heat
 from livepde.readout import ScalarReadout
 from livepde.records import Record, RecordArrays, Snapshot
-from livepde.result import read_together
 
 
 def rod(unknown=None, law=None, validation=None, cells=30):

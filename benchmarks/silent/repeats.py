@@ -27,8 +27,8 @@ from livepde.cases.data import passwords_of
 from livepde.cases.live_case import LiveCase
 from livepde.diagnostics.check_report import Check
 from livepde.errors import CaseError, RunError
+from livepde.estimate import Estimate
 from livepde.linalg import Array
-from livepde.result import Estimate
 from livepde.runs import RunWriter
 from livepde.runs import open as open_run
 from livepde.runs.backlog import Sink

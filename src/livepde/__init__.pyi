@@ -21,6 +21,7 @@ from . import (
     streams,
 )
 from .errors import LivepdeError
+from .estimate import Estimate
 from .fem import (
     Channel,
     Field,
@@ -48,7 +49,7 @@ from .identifier import Identifier
 from .laws import GradientLaw, Jumps, Refit, SensitivityLaw
 from .model import Model
 from .observation import Averages, Combined, Full, Points, Subdomain
-from .result import Estimate, Result
+from .result import Result
 from .samples import Sample
 from .stepping import Advance, Alexander2, ImplicitEuler, simulate
 

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from livepde.estimate import Estimate
 from livepde.laws import Belief, FixedInterval, Problem, Status
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.records import INTERVAL_ENDS, SMOOTHED, Record, bare, interval_95
-from livepde.result import Estimate, Result
+from livepde.result import Result
 from livepde.stepping import End, Interval
 
 if TYPE_CHECKING:

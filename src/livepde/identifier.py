@@ -19,6 +19,7 @@ from livepde import checkpoint
 from livepde.checkpoint import Fingerprint, fingerprint
 from livepde.dates import stamp_of
 from livepde.errors import ConfigurationError, MissingInputError, RunError, SampleError
+from livepde.estimate import Estimate
 from livepde.fem import Inputs, Moment
 from livepde.forecast import Forecast, ahead, future_times, seen_rows
 from livepde.laws import AnyLaw, Belief, Report, SensitivityLaw, Status, numerical, stepped
@@ -27,7 +28,6 @@ from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.model import Model
 from livepde.observation import Observation
-from livepde.result import Estimate
 from livepde.samples import Channels, Readings, numbers
 from livepde.showing import listed, options_of
 from livepde.start import (

@@ -14,6 +14,7 @@ import numpy as np
 
 from livepde.dates import origin_at, since_1970
 from livepde.errors import ConfigurationError, LawError
+from livepde.estimate import Estimate
 from livepde.fem import Inputs
 from livepde.forecast import seen_rows
 from livepde.hindsight import Hindsight, LinearReadings
@@ -22,7 +23,7 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.records import Layout
-from livepde.result import Estimate, Result
+from livepde.result import Result
 from livepde.samples import Channels, Readings, Sample, is_tabular, sample_of
 from livepde.showing import Shown
 from livepde.stepping import Interval

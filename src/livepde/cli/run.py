@@ -27,10 +27,10 @@ from livepde.cases import Case, LiveCase, Prepared
 from livepde.cases.remedies import after_gaps, start_missed, with_settings
 from livepde.cli import options, printing
 from livepde.errors import ConfigurationError, DataError, LivepdeError
+from livepde.estimate import Estimate
 from livepde.identifier import Identifier
 from livepde.laws import SensitivityLaw
 from livepde.linalg import Array
-from livepde.result import Estimate
 from livepde.runs import JOURNAL, RECORD, Check, Driven, Journal, RunWriter, Sink, Table
 from livepde.runs.directory import attempted
 from livepde.runs.monitor import JsonLinesSink, Metrics, Monitor

@@ -14,9 +14,9 @@ from livepde.checkpoint import packed, unpacked
 from livepde.control.controllers import Known
 from livepde.control.reduction import Discrete, ReducedModel
 from livepde.errors import ConfigurationError, RunError, SampleError, TimeOrderError
+from livepde.estimate import Estimate
 from livepde.identifier import Identifier
 from livepde.linalg import Array
-from livepde.result import Estimate
 from livepde.samples import labelled, number, readings
 
 # Standard deviation of the isotropic process noise, relative to that of the channels.

@@ -14,9 +14,9 @@ from livepde import checkpoint
 from livepde.control.controllers import Controller, Decision, Known, Plan
 from livepde.control.estimators import Estimator, Kalman, Learned, Trust
 from livepde.errors import ConfigurationError, RunError, SampleError
+from livepde.estimate import Estimate
 from livepde.identifier import Identifier
 from livepde.linalg import Array
-from livepde.result import Estimate
 from livepde.samples import labelled, number, numbers
 
 Future: TypeAlias = Mapping[str, ArrayLike]

@@ -15,13 +15,13 @@ from livepde import checkpoint
 from livepde.diagnostics.check_report import Check, CheckReport
 from livepde.diagnostics.form_checks import largest, relative
 from livepde.errors import LawError, ObservationError
+from livepde.estimate import Estimate
 from livepde.fem import Inputs, Latent, Moment
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, Belief, Law, Problem, Report
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed, Split
-from livepde.result import Estimate
 from livepde.samples import Sample, sample_of
 from livepde.stepping import Interval, Scheme, Stage, StepFailed
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from livepde.errors import ConfigurationError, SampleError
+from livepde.estimate import Estimate
 from livepde.identifier import Identifier
-from livepde.result import Estimate
 
 
 class OnlineRegressor:

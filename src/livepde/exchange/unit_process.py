@@ -14,6 +14,7 @@ from livepde import checkpoint
 from livepde.cases import Case
 from livepde.cases.data import refuse_late
 from livepde.errors import ConfigurationError, LivepdeError
+from livepde.estimate import Estimate
 from livepde.frames import snapshot_of, vertex_order
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw
@@ -21,7 +22,6 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.records import STATUS_CODES
-from livepde.result import Estimate
 from livepde.samples import Sample, number
 from livepde.streams import Column
 from livepde.streams.table import channel_value

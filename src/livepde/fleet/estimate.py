@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from livepde.errors import ConfigurationError
+from livepde.estimate import Estimate, kept
 from livepde.fem import FunctionSpace
 from livepde.fleet.engines import Beliefs, Factors
 from livepde.frames import correlation_of, interval_ends, vertex_order
@@ -19,7 +20,6 @@ from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
 from livepde.model import Model
 from livepde.records import NOTE, STATUS_CODES, STATUS_FLAGS, Layout, Record, Snapshot
-from livepde.result import Estimate, kept
 from livepde.showing import listed
 
 if TYPE_CHECKING:

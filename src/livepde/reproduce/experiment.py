@@ -11,10 +11,11 @@ import numpy as np
 from livepde import plots
 from livepde.diagnostics.check_report import Check
 from livepde.errors import ConfigurationError
+from livepde.estimate import Estimate
 from livepde.identifier import Identifier
 from livepde.linalg import Array
 from livepde.progress import watched
-from livepde.result import Estimate, Result
+from livepde.result import Result
 from livepde.runs import Outcome
 from livepde.streams import Twin
 

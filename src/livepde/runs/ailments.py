@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from livepde.result import Estimate
+from livepde.estimate import Estimate
 from livepde.runs.feeds import Feed
 from livepde.runs.journal import Journal
 from livepde.streams.intake import Remark

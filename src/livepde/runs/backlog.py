@@ -10,7 +10,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from livepde.result import Estimate
+from livepde.estimate import Estimate
 from livepde.streams.intake import Ready
 
 

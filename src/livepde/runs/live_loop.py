@@ -13,9 +13,10 @@ from dataclasses import replace
 from typing import Any
 
 from livepde.errors import DataError, LivepdeError, RunError
+from livepde.estimate import Estimate
 from livepde.identifier import Identifier
 from livepde.laws import numerical
-from livepde.result import Estimate, Result
+from livepde.result import Result
 from livepde.runs.ailments import Ailments
 from livepde.runs.backlog import Backlog, Retention, Sink
 from livepde.runs.directory import attempted

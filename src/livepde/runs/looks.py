@@ -6,8 +6,8 @@ import json
 from dataclasses import dataclass, replace
 from typing import Any
 
+from livepde.estimate import Estimate
 from livepde.identifier import Identifier
-from livepde.result import Estimate
 from livepde.verdict import LEVELS, NOT_JUDGED, ModelErrors, Verdict
 
 JUDGED = 50  # samples between two looks at the verdict

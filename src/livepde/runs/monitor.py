@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from livepde import __version__
 from livepde.errors import RunError, optional
+from livepde.estimate import Estimate
 from livepde.library_messages import OneLine
-from livepde.result import Estimate
 from livepde.runs.backlog import Sink
 from livepde.runs.web import Address, Server
 from livepde.verdict import NUMBERS

@@ -16,7 +16,7 @@ from itertools import combinations, zip_longest
 from typing import TYPE_CHECKING, Any
 
 from livepde.errors import DataError, optional
-from livepde.result import Estimate
+from livepde.estimate import Estimate
 from livepde.streams.growing_file import LONGEST
 from livepde.streams.sources import Row, RowSource, drained, json_row
 

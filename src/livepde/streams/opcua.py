@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from livepde.errors import DataError, optional
-from livepde.result import Estimate
+from livepde.estimate import Estimate
 from livepde.streams.sources import Row, RowSource, drained
 
 __all__ = ["OpcuaServer", "OpcuaSink", "OpcuaSource"]

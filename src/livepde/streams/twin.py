@@ -16,11 +16,11 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from livepde.errors import ConfigurationError
+from livepde.estimate import Estimate
 from livepde.fem import Moment
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
-from livepde.result import Estimate
 from livepde.samples import Sample
 from livepde.stepping import Advance, Alexander2, Scheme, StepFailed, simulate
 

@@ -13,6 +13,7 @@ import scipy.sparse as sp
 from livepde.diagnostics.check_report import Check, CheckReport
 from livepde.diagnostics.theory.constants import Spaces
 from livepde.errors import ConfigurationError
+from livepde.estimate import Estimate
 from livepde.fem import Moment
 from livepde.laws.damping import (
     Constants,
@@ -26,7 +27,6 @@ from livepde.laws.damping import (
 )
 from livepde.linalg import Array
 from livepde.observation import Observed, Tikhonov
-from livepde.result import Estimate
 from livepde.streams import Twin
 
 Data = Literal["exact", "noisy", "smoothed"]

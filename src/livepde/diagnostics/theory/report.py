@@ -14,11 +14,11 @@ from livepde.diagnostics.theory import error_bounds
 from livepde.diagnostics.theory.constants import Spaces, constants
 from livepde.diagnostics.theory.excitation import Excitation, Spectrum, interpolation, link
 from livepde.errors import ConfigurationError, LivepdeError
+from livepde.estimate import Estimate
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier
 from livepde.laws.damping import Constants, Damping, Norms
 from livepde.linalg import Array
-from livepde.result import Estimate
 from livepde.samples import Channels, Sample, sample_of
 from livepde.streams import Twin
 
