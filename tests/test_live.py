@@ -91,6 +91,20 @@ def test_killed_at_any_moment_it_goes_on_as_if_nothing_had_happened(tmp_path):
     assert rest.journal.accepted == 150
 
 
+def test_a_session_without_samples_ends_as_the_one_before_it(tmp_path):
+    """It may have been killed at the end of its data, before it wrote results."""
+    write(tmp_path, 27)
+    found = []
+    for _ in range(2):
+        run = live(tmp_path)
+        run.resume()
+        run.run()
+        found.append(run.result.dataset())
+        run.journal.close()
+    assert json.loads(found[0].attrs["verdict"])["judged"]
+    assert found[0].identical(found[1])
+
+
 @pytest.mark.slow
 def test_one_writer_many_readers(tmp_path):
     write(tmp_path, 20)

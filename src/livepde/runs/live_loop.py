@@ -312,21 +312,20 @@ class Live:
 
     def _settled(self) -> None:
         """Keep the verdict and the fields of the final estimate."""
-        last = self.result.last
-        if last is not None:
-            try:
-                with interruptible(self._check):
-                    settled = self.identifier._settled(last)
-                    verdict = settled.verdict
-                last = settled
-                self.result._settle(last)
-                self._keep_verdict(replace(self.looks, verdict=verdict))
-            except Interrupted:
-                self._tell("unfinished", "the final fit was skipped, because the run was stopped")
-        if self.journal.estimated:
-            # Nothing was left to do where there is no last estimate: the fields stay the same.
-            final = last or self.identifier._settled(self.identifier.estimate())
-            self.journal.keep(self.result._snapshot(final))
+        if not self.journal.estimated:
+            return
+        # A session without samples ends like the one before it, which may not have come so far.
+        last = self.result.last or self.identifier.estimate()
+        try:
+            with interruptible(self._check):
+                settled = self.identifier._settled(last)
+                verdict = settled.verdict
+            last = settled
+            self.result._settle(last)
+            self._keep_verdict(replace(self.looks, verdict=verdict))
+        except Interrupted:
+            self._tell("unfinished", "the final fit was skipped, because the run was stopped")
+        self.journal.keep(self.result._snapshot(last))
 
     def _run(self) -> None:
         ended = False
