@@ -147,3 +147,20 @@ def test_the_independent_truth_converges():
     coarse = process.states(np.full(process.cells + 1, 3.0), times)
     fine = finer.states(np.full(finer.cells + 1, 3.0), times)[:, ::2]
     assert np.abs(coarse - fine).max() <= 1e-3 * np.abs(fine).max()
+
+
+@pytest.mark.parametrize(
+    "sensors",
+    [lp.Full(noise=0.01), lp.Subdomain(lambda x: x[0] < 0.75, noise=0.01), lp.Points([0.3, 0.6])],
+)
+def test_data_may_begin_after_the_first_sample(sensors):
+    """The law was stuck in failed steps: it went by the noise of no data."""
+    reaction = model(OPERATORS["reaction"][1], f=lambda x, t: 5.0 + 3.0 * np.sin(t) + 0.0 * x[0])
+    times = 0.1 * np.arange(1, 40)
+    truth = lp.Identifier(reaction, sensors, lp.GradientLaw(), q0=2.0, dt_max=0.1)
+    z = truth.forecast(times).z
+    z += 0.01 * np.random.default_rng(0).standard_normal(z.shape)
+    who = lp.Identifier(reaction, sensors, AUTO, dt_max=0.1, assimilate_from=0.35)
+    found = [who.step(t, values) for t, values in zip(times, z, strict=True)]
+    assert all(estimate.status.ok for estimate in found)
+    np.testing.assert_allclose(found[-1].q[:7], 2.0, atol=0.5)  # the prior is 1

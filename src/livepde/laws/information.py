@@ -355,11 +355,13 @@ class InformationMetric(MetricRule[Information]):
         A = after.forms.A_in.data("v", "q", after.moment, u=after.w, q=after.q)
         gain = self.normal(after.forms).gain(A, after.q, after.error(), self.probes)
         rough = gain.matrix[:, self.on_diagonal] @ (1.0 / self.diagonal)
+        seen = np.array([gain.trace.sum(), rough.sum()])
+        if not state.samples and not np.all(seen > 0.0):
+            return state  # no data yet, or none that depend on q: the next sample is the first
         force = np.stack([gain.force, Q.riesz(gain.force)])
         # The first sample has no change: by this factor both powers are the same.
         change = force - state.force if state.samples else math.sqrt(2.0) * force
         power = np.stack([self._powers(force), self._powers(change) / 2.0])
-        seen = np.array([gain.trace.sum(), rough.sum()])
         elapsed, told = state.elapsed + h, h * float(gain.trace.sum())
         given = state.given + told
         share = told / given if given > 0.0 else 0.0
