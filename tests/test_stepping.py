@@ -165,6 +165,8 @@ def test_number_of_substeps():
     assert lp.Advance(lp.ImplicitEuler(), dt_max=1.999).count(2.0) == 2
     # 0.1 + 0.2 != 0.3: rounding alone never adds a substep.
     assert lp.Advance(lp.ImplicitEuler(), dt_max=0.1).count(0.1 + 0.2) == 3
+    since_1970 = np.diff(1.7e9 + 0.1 * np.arange(50))
+    assert {*map(lp.Advance(lp.ImplicitEuler(), dt_max=0.05).count, since_1970)} == {2}
 
 
 def test_a_failing_substep_is_halved_and_grows_again():

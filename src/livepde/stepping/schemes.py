@@ -53,6 +53,10 @@ MOST_HALVINGS = 30
 # the square root of time, for the work of six more substeps.
 MOST_GRADES = 3
 
+# Share of a length that may be the rounding of its ends: seconds since 1970 have a resolution of
+# 2.4e-7 s.
+ROUNDING = 1e-5
+
 Stage: TypeAlias = Callable[[Array, float, float], Array]
 """(c, t, h) -> y with M (y - c)/h + R(t, y) = 0."""
 
@@ -178,17 +182,17 @@ class Advance:
         # The factor keeps rounding of the length from adding a substep when dt_max divides it.
         if self.stretches(length):
             return self.parts * LONG_SUBSTEPS
-        return self.parts * math.ceil(length / self.dt_max * (1 - 1e-12))
+        return self.parts * math.ceil(length / self.dt_max * (1 - ROUNDING))
 
     def stretches(self, length: float) -> bool:
         """Return whether an interval of that length has substeps longer than `dt_max`."""
-        return length * (1 - 1e-12) > MOST_SUBSTEPS * self.dt_max
+        return length * (1 - ROUNDING) > MOST_SUBSTEPS * self.dt_max
 
     def grade(self, t: float, h: float) -> int:
         """Return how often a substep h from t is halved because it is near the start."""
         since = t - self.start
         # The factor keeps rounding of the times from halving a step that is half of `since`.
-        longest = 0.5 * since * (1 + 1e-9)
+        longest = 0.5 * since * (1 + ROUNDING)
         if not self.halvings or longest >= h or not since >= 0.0:
             return 0
         return sum(longest < h / 2**k for k in range(MOST_GRADES))
