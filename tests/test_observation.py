@@ -278,6 +278,7 @@ def test_sensors_that_do_not_fit():
         (model, lambda: lp.observation.Matrix(np.eye(13), labels=["a"]), "1 labels for 13 rows"),
         (model, lambda: lp.observation.Matrix(np.full((1, 13), np.nan)), "not finite"),
         (model, lambda: lp.observation.Matrix(np.eye(13)[:2], labels=["a", "a"]), "must differ"),
+        (model, lambda: lp.Subdomain("core"), "omega must be a function of x, .*; got 'core'"),  # type: ignore[arg-type]
         (model, lambda: lp.Subdomain(lambda x: x[0] > 30), "no element .* with a free coefficient"),
         (model, lambda: lp.Subdomain(lambda x: x[0] == 0), "no element .* with a free coefficient"),
     ]

@@ -46,6 +46,14 @@ class Subdomain(Observation):
     omega: Predicate
     nodal = True
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not callable(self.omega):
+            raise ObservationError(
+                f"{type(self).__name__}: omega must be a function of x, as lambda x: x[0] < 0.5; "
+                f"got {self.omega!r}."
+            )
+
     def elements(self, state: FieldBlock) -> IntArray:
         """Return the elements that lie in omega."""
         inside = np.zeros(state.field.mesh.nelements, dtype=bool)
