@@ -329,6 +329,13 @@ def test_missing_values_are_those_of_the_case(rod, tmp_path):
     assert shown == pytest.approx(identifier.forecast(t)["T_30"][0] + 273.15)
 
 
+def test_a_channel_with_a_factor_has_no_stated_unit(rod):
+    process = recipe_of(load(rod, settings={"channels.T_10.factor": 0.01})).process
+    units = {item.name: item.unit for item in (*process.inputs, *process.outputs())}
+    assert units["T_10"] == units["T_10_model"] == ""
+    assert units["T_30"] == units["T_30_model"] == "degC"
+
+
 @pytest.mark.parametrize("key", ["late", "noise_column"])
 def test_what_a_unit_would_not_do_is_refused(rod, key):
     value = {"late": "10 s", "noise_column": "T_20"}[key]

@@ -190,7 +190,8 @@ def of_case(case: Case, origin: datetime | None = None) -> UnitProcess:
         if channel.noise_column is not None:
             text = "an exported unit has no input for the noise of each reading: leave it out."
             raise case.error(f"channels.{name}.noise_column", text)
-        unit = channel.unit or case.unit(name)
+        # With a factor, values of the data are in no unit that the case states.
+        unit = "" if channel.factor is not None else channel.unit or case.unit(name)
         column = replace(case.columns[name], names=(name,))
         columns = " and ".join(channel.sources)
         text = f"Channel of role {channel.role}, as column {columns} of the data."
