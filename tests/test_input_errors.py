@@ -84,6 +84,7 @@ MISTAKES = {
     "an encoding": (data("T_20", "Fühler", "cp1252"), RUN),
     "a workbook": (lambda: DATA.write_bytes(b"PK\x03\x04\x14"), RUN),
     "a word": (data("\n40,", "\nlater,"), RUN),
+    "text in a cell": (data("\n20,21.623,19.991", "\n20,21.623,OVER"), RUN),
     "a repeated row": (data("\n40,", "\n20,"), RUN),
     "rows out of order": (data("\n40,", "\n10,"), RUN),
     "no rows": (lambda: DATA.write_text(DATA.read_text().partition("\n")[0]), RUN),

@@ -241,3 +241,52 @@ def test_a_line_ends_at_its_end_and_nowhere_else(tmp_path, character):
     written = how_written(path)
     assert list(written.header) == ["time_s", f"T{character}5"]
     assert [list(row) for row in written.rows] == [["0", "20.5"], ["60", "21.0"]]
+
+
+# --- texts that mean a missing value -------------------------------------------------------------
+
+TEXTS = {"time_s": [0, 1, 2, 3], "c": ["<0.5", "OVER", "1.0", "---"], "d": [1, 2, "FAULT", 4]}
+
+
+def texts(folder: Path) -> Path:
+    path = folder / "texts.csv"
+    pd.DataFrame(TEXTS).to_csv(path, index=False)
+    return path
+
+
+def test_texts_of_a_column_are_named_together_with_the_key_that_states_them(tmp_path):
+    with pytest.raises(DataError, match=r"row 2, column 'c': got '<0.5'.*\['<0.5', 'OVER'\]"):
+        measured(texts(tmp_path), "s")
+    with pytest.raises(DataError, match=r"column 'd': got 'FAULT'.*\['<0.5', 'OVER', 'FAULT'\]"):
+        measured(texts(tmp_path), "s", missing=("<0.5", "OVER"))
+
+
+def test_a_stated_text_is_missing_in_every_source(tmp_path):
+    columns, clock = {"c": Column(("c",))}, Clock("time_s")
+    stated: dict = {"missing": ["<0.5", "OVER", 1.0]}
+    rows = pd.DataFrame(TEXTS).to_dict("records")
+    lines = [json.dumps(row) for row in rows]
+    path = tmp_path / "texts.jsonl"
+    path.write_text("\n".join(lines))
+    tables = [
+        read_csv(texts(tmp_path), columns, clock, **stated),
+        read_json_lines(path, columns, clock, **stated),
+    ]
+    for table in tables:
+        assert np.isnan(table.values).all()
+    for sample in JsonLines(lines, columns, clock, **stated):
+        assert math.isnan(sample.z["c"])
+    assert not any(Intake(columns, clock, **stated).take(row).remarks for row in rows)
+
+
+def test_init_writes_the_stated_texts_into_the_case(tmp_path):
+    args = ["init", str(tmp_path / "new"), "--data", str(texts(tmp_path))]
+    given = "data.missing=['<0.5', 'OVER', 'FAULT', '-1']"
+    told = CliRunner().invoke(app, [*args, "--set", given])
+    assert told.exit_code == 0, told.output
+    case = (tmp_path / "new" / "case.toml").read_text()
+    assert 'missing = ["<0.5", "OVER", "FAULT", -1.0]' in case
+    refused = CliRunner().invoke(
+        app, [*args[:1], str(tmp_path / "b"), *args[2:], "--set", given[:18]]
+    )
+    assert refused.exit_code != 0

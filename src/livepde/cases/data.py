@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 from zoneinfo import ZoneInfo
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from livepde.cases.case_channels import columns_of, interpolates
 from livepde.cases.case_content import CaseContent, check_options, load_code, own_code
@@ -25,6 +26,7 @@ from livepde.cases.schema import (
     FileSpec,
     NodesSpec,
 )
+from livepde.cases.values import MissingValue
 from livepde.dates import since_1970
 from livepde.errors import CaseError
 from livepde.runs.backlog import Backlog, Retention, Sink
@@ -79,6 +81,15 @@ def zone_named(name: str, where: str) -> tzinfo:
         return ZoneInfo(name)
     except (KeyError, OSError, ValueError):  # not found, a folder, not a name at all
         text = f"there is no time zone '{name}'; expected a name such as Europe/Berlin."
+        raise CaseError(f"{where}: {text}") from None
+
+
+def missing_in(given: Any, where: str) -> tuple[float | str, ...]:
+    """Return the numbers and texts that mean a missing value; raises `CaseError`."""
+    try:
+        return TypeAdapter(tuple[MissingValue, ...]).validate_python(given or ())
+    except ValidationError:
+        text = f'got {given!r}; expected a list such as [-9999, "OVER"].'
         raise CaseError(f"{where}: {text}") from None
 
 

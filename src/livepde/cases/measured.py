@@ -17,9 +17,10 @@ from livepde.cases.read import BLANK
 from livepde.errors import SampleError
 from livepde.linalg import Array
 from livepde.streams import Clock, Column, DataTable, read_csv
-from livepde.streams.clock import CALLED_TIME, date_formats, number_of
+from livepde.streams.cells import Missing, is_limit, is_missing, number_of
+from livepde.streams.clock import CALLED_TIME, date_formats
 from livepde.streams.csvfile import Written, how_written
-from livepde.streams.table import JSON_LINES, MISSING
+from livepde.streams.table import JSON_LINES
 from livepde.units import AT_THE_END, IN_BRACKETS, unit_in
 
 HOUR = re.compile(r"\d{1,2}:\d{2}(:\d{2}(\.\d+)?)?( ?[AaPp][Mm])?")
@@ -39,6 +40,7 @@ class Measured:
     samples: DataTable  # times, and the columns that contain numbers
     row_numbers: tuple[str, ...]  # columns that are not used
     texts: tuple[str, ...]  # columns without numbers, not used either
+    missing: tuple[float | str, ...] = ()  # stated to mean a missing value, of the first table
     more: tuple[Measured, ...] = ()  # tables that are joined to this one by time
 
     @property
@@ -98,16 +100,18 @@ def measured(
     time_format: str = "",
     skip: int | None = None,
     zone: tzinfo = UTC,
+    missing: tuple[float | str, ...] = (),
 ) -> Measured:
     """Read a CSV file of which nothing is known.
 
     `time_unit`: the unit of time of the equation. `time_format`: of dates; empty: found from the
     cells. `skip`: lines before the header; None: found from the lines. `zone`: of dates
-    without one.
+    without one. `missing`: numbers and texts that mean a missing value.
     """
     if table.suffix in (*JSON_LINES, ".parquet"):
         raise SampleError(f"{table}: expected a CSV file with a header.")
     written = how_written(table, skip=skip)
+    written = replace(written, rows=[_without(row, missing) for row in written.rows])
     kinds = _kinds(table, written, time_format)
     time = _times(table, written, kinds)
     dated = kinds[time[0]] == "date"
@@ -122,9 +126,15 @@ def measured(
         separator=written.separator,
         encoding=written.encoding,
         skip=written.skip,
+        missing=missing,
     )
     unit = time_unit and _unit_of_times(samples, time[0], time_unit)
-    return Measured(table, written, time, found, unit, samples, counted, texts)
+    return Measured(table, written, time, found, unit, samples, counted, texts, missing)
+
+
+def _without(row: Sequence[str], missing: Missing) -> list[str]:
+    """Return the cells of a row, empty where they mean a missing value."""
+    return ["" if is_missing(cell, missing) else cell for cell in row]
 
 
 def _sorted_out(
@@ -170,7 +180,7 @@ def _kinds(table: Path, written: Written, form: str) -> dict[str, str]:
 
 
 def _kind(cell: str, decimal: str, form: str) -> str:
-    if number_of(cell, decimal) is not None:
+    if number_of(cell, decimal) is not None or is_limit(cell, decimal):
         return "number"
     if Clock("").stamp(cell, form) is not None or Clock("").stamp(cell) is not None:
         return "date"
@@ -238,7 +248,7 @@ def _cells(name: str, written: Written) -> list[str]:
     """Return the first cells of a column that are not missing."""
     k = written.header.index(name)
     cells = (row[k].strip() for row in written.rows if k < len(row))
-    return [cell for cell in cells if cell.lower() not in MISSING]
+    return [cell for cell in cells if not is_missing(cell)]
 
 
 def _values(name: str, written: Written) -> Array:

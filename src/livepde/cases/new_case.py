@@ -109,7 +109,7 @@ def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
     # Noise is a standard deviation, a difference of temperatures: in K.
     noise = _open(equation.state.unit.replace("degC", "K"))
     data, told = _data(table, folder), list[str]()
-    if "missing" in data:
+    if len(data.get("missing", ())) > len(table.missing):
         told.append("missing: far outside the other values; check them")
     # Times that are numbers count from an event, which is at rest before the first row.
     first = min(one.samples.t[0] for one in table.tables)
@@ -189,7 +189,7 @@ def _data(table: Measured, folder: Path) -> dict[str, Any]:
     if others:
         own = [_unlike(other, first) for other in others]
         found["file"] = [first["file"], *(o if len(o) > 1 else o["file"] for o in own)]
-    if missing := _missing(table):
+    if missing := [*table.missing, *_missing(table)]:
         found["missing"] = missing
     return found
 

@@ -27,6 +27,7 @@ from livepde.cases.values import (
     Expected,
     Identifier,
     Instant,
+    MissingValue,
     Name,
     NonNegativeInt,
     NonzeroFloat,
@@ -191,7 +192,7 @@ class DataSpec(Spec):
     t0: Instant | None = None
     assimilate_from: Instant | None = None
     every: PositiveInt = 1
-    missing: tuple[float, ...] = ()
+    missing: tuple[MissingValue, ...] = ()
 
     @model_validator(mode="after")
     def _one_source(self) -> DataSpec:

@@ -13,6 +13,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, GetJsonSchemaHandle
 from pydantic_core import CoreSchema
 
 from livepde.diagnostics.check_report import Bound, Sense
+from livepde.streams.cells import number_of
 
 
 def _quantity(value: Any) -> Any:
@@ -56,6 +57,15 @@ def _number(value: Any) -> Any:
     if isinstance(value, bool):
         raise ValueError("expected a number")  # noqa: TRY004 (pydantic collects ValueErrors only)
     return value
+
+
+def _missing(value: Any) -> Any:
+    """Return a number that is written as text as the number that it is in a table."""
+    text = value.strip() if isinstance(value, str) else ""
+    number = number_of(value)
+    if not text and number is None:
+        raise ValueError('expected a number, or text such as "OVER"')
+    return text if number is None else number
 
 
 def options_of(kind: type) -> BeforeValidator:
@@ -120,6 +130,7 @@ def _flat(value: Any) -> Any:
 
 Quantity: TypeAlias = Annotated[float | str, BeforeValidator(_quantity)]
 Number: TypeAlias = Annotated[float, BeforeValidator(_number)]
+MissingValue: TypeAlias = Annotated[float | str, BeforeValidator(_missing)]
 PositiveFloat: TypeAlias = Annotated[Number, Field(gt=0)]
 
 

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from livepde.cases import new_case
-from livepde.cases.data import zone_named
+from livepde.cases.data import missing_in, zone_named
 from livepde.cases.measured import Measured, measured
 from livepde.cases.read import blanks_in, filled, parse, read_toml, toml_value
 from livepde.cli.options import names_in, option
@@ -87,7 +87,9 @@ def init(
         case = folder / "case.toml"
         changes = parse(settings or [])
         zone = zone_named(str(changes.get("data.zone") or "UTC"), "--set data.zone")
+        missing = missing_in(changes.pop("data.missing", None), "--set data.missing")
         how: dict[str, Any] = {"time_format": time_format, "skip": skip, "zone": zone}
+        how["missing"] = missing
         first, *others = (measured(file, found.time_unit, **how) for file in data)
         read = reduce(Measured.joined, others, first)
         files = new_case.files_for(read, folder, found)

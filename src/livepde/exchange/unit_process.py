@@ -24,6 +24,7 @@ from livepde.observation import Observed
 from livepde.records import STATUS_CODES
 from livepde.samples import Sample, number
 from livepde.streams import Column
+from livepde.streams.cells import Missing
 from livepde.streams.table import channel_value
 from livepde.units import conversion
 
@@ -56,7 +57,7 @@ class Port(Variable):
 
     column: Column  # conversion of values to the unit of the model
 
-    def taken(self, value: float, missing: frozenset[float]) -> float:
+    def taken(self, value: float, missing: Missing) -> float:
         """Return a value in the unit of the model; NaN if it is missing or invalid."""
         given = number(value, f"input '{self.name}'")
         found = channel_value(self.column, {self.name: given}, missing)
@@ -90,8 +91,7 @@ class UnitProcess:
     # Function that returns the identifier started by a first sample; it may raise `LivepdeError`
     begin: Callable[[Sample], Identifier]
     second: float = 1.0  # one second in the model's unit of time
-    # Numbers that denote a missing sample, in addition to NaN
-    missing: frozenset[float] = frozenset()
+    missing: Missing = frozenset()  # numbers that mean a missing sample, besides NaN
     covariance: bool = True  # true if the law provides standard deviations
     experiment: DataTimes | None = None  # times of the case's own data, if it has any
 

@@ -21,11 +21,10 @@ import numpy as np
 
 from livepde.errors import SampleError
 from livepde.linalg import Array
+from livepde.streams.cells import COMMA, NO_POINT, has_decimal_comma, number_of
 
 Instant: TypeAlias = float | str | date | datetime
 CALLED_TIME = re.compile(r"(t|time|timestamp|date|datetime|elapsed|zeit|temps)\b|.*time", re.I)
-COMMA = "if that is a decimal comma, set decimal = ','."
-NO_POINT = "with decimal = ',', a point is not a decimal mark."
 FIRST_CELLS = 5  # of a column, in one of which a format of dates has to fit
 MOST = 0.8  # share of cells that a format of dates has to fit
 ORDERS = ("%d-%m-%Y", "%m-%d-%Y", "%Y-%m-%d", "%d-%m-%y", "%m-%d-%y", "%y-%m-%d", "%d-%b-%Y")
@@ -37,7 +36,6 @@ FORMATS = tuple(  # of dates that loggers and spreadsheets write, except ISO
     for mark, hour in product("/-. ", HOURS)
     for order in (ORDERS if mark != "." else POINTED)
 )
-POINT = str.maketrans(",.", ".,")  # so that a point where commas are decimals is no number
 
 
 @dataclass(frozen=True)
@@ -203,23 +201,6 @@ def _parsed(cell: Any, form: str) -> Any:
         return cell
     text = cell.strip()
     return datetime.strptime(text, form) if form else datetime.fromisoformat(text)
-
-
-def number_of(cell: Any, decimal: str = ".") -> float | None:
-    """Return a number or a number as text, None if it is neither."""
-    try:
-        if isinstance(cell, str):
-            if "_" in cell:  # which Python reads as 1000 in 1_000
-                return None
-            cell = cell if decimal == "." else cell.translate(POINT)
-        return None if isinstance(cell, bool) else float(cell)
-    except (TypeError, ValueError, OverflowError):
-        return None
-
-
-def has_decimal_comma(cell: Any) -> bool:
-    """Return whether a cell is a number if its comma is one of decimals."""
-    return isinstance(cell, str) and "," in cell and number_of(cell, ",") is not None
 
 
 def date_formats(cells: Sequence[str]) -> list[str]:

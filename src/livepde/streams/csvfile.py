@@ -19,14 +19,15 @@ import numpy as np
 from livepde.errors import DataError, SampleError
 from livepde.linalg import Array
 from livepde.streams import table
-from livepde.streams.clock import (
+from livepde.streams.cells import (
     POINT,
-    Clock,
-    date_formats,
+    Missing,
+    cell_number,
     has_decimal_comma,
+    is_missing,
     number_of,
-    read_times,
 )
+from livepde.streams.clock import Clock, date_formats, read_times
 
 T = TypeVar("T")
 
@@ -69,7 +70,7 @@ def read_csv(
     clock: Clock,
     *,
     every: int = 1,
-    missing: Iterable[float] = (),
+    missing: Missing = (),
     separator: str = ",",
     encoding: str = UTF_8,
     skip: int = 0,
@@ -83,7 +84,7 @@ def read_csv(
     every
         Number of rows of which one is kept.
     missing
-        Numbers that mean a missing sample (-9999). Empty cells and NaN always do.
+        Numbers and texts that mean a missing sample (-9999, OVER). Empty cells and NaN always do.
     separator
         Field separator, as "," or ";".
     encoding
@@ -116,7 +117,7 @@ def read_csv(
     def numbers(name: str, use: Any) -> Array:
         chosen = use.tolist()
         texts, places = [cells[name][k] for k in chosen], [rows[k] for k in chosen]
-        return _numbers(texts, places, f"{path}", name, decimals[name])
+        return _numbers(texts, places, f"{path}", name, decimals[name], missing)
 
     def where(k: int) -> str:
         return f"{path}, row {rows[k]}, column '{clock.name}'"
@@ -164,7 +165,7 @@ def are_labels(cells: Sequence[str]) -> bool:
     return bool(texts) and not any(
         not text.isprintable()
         or text[0].isdigit()
-        or text.lower() in table.MISSING
+        or is_missing(text)
         or number_of(text, ",") is not None
         for text in texts
     )
@@ -269,7 +270,7 @@ def _time_formats(
     """Return the formats of the first named column that may hold dates; none without one."""
     for k, name in enumerate(header):
         texts = [row[k].strip() for row in rows if k < len(row)]
-        texts = [text for text in texts if text.lower() not in table.MISSING]
+        texts = [text for text in texts if not is_missing(text)]
         if not name or not texts or number_of(texts[0], decimal) is not None:
             continue
         if formats := tuple(filter(None, date_formats(texts))):  # not of ISO dates
@@ -424,7 +425,12 @@ def _not_text(path: Path, separator: str, encoding: str, clock: Clock, skip: int
 
 
 def _numbers(
-    cells: Sequence[str], rows: Sequence[int], where: str, name: str, decimal: str
+    cells: Sequence[str],
+    rows: Sequence[int],
+    where: str,
+    name: str,
+    decimal: str,
+    missing: Missing,
 ) -> Array:
     """Return a column of text as numbers; its row is looked for only if one is wrong."""
     try:
@@ -438,7 +444,7 @@ def _numbers(
     if np.isinf(found).any():
         found = np.array(
             [
-                table.cell_number(cell, f"{where}, row {row}, column '{name}'", decimal)
+                cell_number(cell, f"{where}, row {row}, column '{name}'", decimal, missing, cells)
                 for cell, row in zip(cells, rows, strict=True)
             ]
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, InitVar, dataclass, field, replace
 from datetime import datetime
 from itertools import chain, pairwise
@@ -18,6 +18,7 @@ from typing import Any, Literal, Protocol, TypeAlias
 from livepde.dates import origin_at, since_1970
 from livepde.errors import DataError, SampleError
 from livepde.stepping import Between
+from livepde.streams.cells import Missing
 from livepde.streams.clock import FAR, ChannelTimes, Clock, is_naive, present, usual_of
 from livepde.streams.gaps import BEYOND, RECENT, Series, decided
 from livepde.streams.table import Column, channel_value, row_time, without_noise
@@ -164,7 +165,7 @@ class Intake:
     clock: Clock  # conversion of the time column
     policy: Policy = field(default_factory=Policy)  # for rows out of order
     _: KW_ONLY
-    missing: Collection[float] = ()  # numbers that mean a missing value
+    missing: Missing = ()  # numbers and texts that mean a missing value
     origin: float | None = None  # t = 0 in seconds since 1970, of dates; None: the first row's time
     dates: bool | None = None  # whether times are dates; None: as in the first row
     last: float = -math.inf  # time of the last sample, also of an earlier session

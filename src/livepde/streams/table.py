@@ -6,7 +6,7 @@ import difflib
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
 from datetime import UTC, datetime
@@ -21,16 +21,8 @@ from livepde.errors import DataError, SampleError, TimeOrderError, optional
 from livepde.linalg import Array, IntArray, Mask
 from livepde.samples import Sample
 from livepde.stepping import Between
-from livepde.streams.clock import (
-    COMMA,
-    NO_POINT,
-    Clock,
-    has_decimal_comma,
-    is_naive,
-    number_of,
-    read_times,
-    with_second_passes,
-)
+from livepde.streams.cells import Missing, cell_number, has_decimal_comma, number_of
+from livepde.streams.clock import Clock, is_naive, read_times, with_second_passes
 from livepde.streams.thinned import Thinned
 
 HOUR = 3600.0  # seconds by which clocks are set back in autumn
@@ -39,7 +31,6 @@ STREAM = "standard input"
 MOST = 12  # names that are listed
 # Endings of files that are data: a case may name any other file, whose columns are not listed.
 SHOWN = (".csv", ".txt", ".tsv", ".tab", ".dat", ".asc", ".log", ".jsonl", ".ndjson", ".parquet")
-MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--", "---", "#n/a", "#nv"})
 
 
 @dataclass(frozen=True)
@@ -120,7 +111,7 @@ def read_json_lines(
     clock: Clock,
     *,
     every: int = 1,
-    missing: Iterable[float] = (),
+    missing: Missing = (),
 ) -> DataTable:
     """Read channels from a file of JSON lines, one object with column -> value for each moment.
 
@@ -156,7 +147,7 @@ def read_json_lines(
 
     def numbers(name: str, use: Any) -> Array:
         texts = ((rows[k].get(name), f"{places[k]}, '{name}'", decimals[name]) for k in use)
-        return np.array([cell_number(*text) for text in texts])
+        return np.array([cell_number(*text, missing) for text in texts])
 
     where = (str(path), places.__getitem__)
     return to_table(times, written, numbers, columns, clock, every, missing, where)
@@ -169,7 +160,7 @@ def tabulated(
     clock: Clock,
     *,
     every: int = 1,
-    missing: Iterable[float] = (),
+    missing: Missing = (),
     where: str = "data",
 ) -> DataTable:
     """Return a table of channels from columns in memory.
@@ -247,7 +238,7 @@ def to_table(
     columns: Mapping[str, Column],
     clock: Clock,
     every: int,
-    missing: Iterable[float],
+    missing: Missing,
     where: tuple[str, Callable[[int], str]],
 ) -> DataTable:
     """Return the channels between start and stop.
@@ -267,7 +258,7 @@ def to_table(
     # Rows that are left out may hold a switch, or a part of a mean.
     stride = rows.stride(every)
     use = _chosen(times, dates, clock, stride, where)
-    holes = tuple(float(number) for number in missing)
+    holes = tuple(one for one in missing if not isinstance(one, str))
 
     def scaled(column: Column, of: IntArray) -> Array:
         parts = [numbers(name, of) for name in column.names]
@@ -391,7 +382,7 @@ class JsonLines:
     clock: Clock
     _: KW_ONLY
     every: int = 1
-    missing: Collection[float] = ()
+    missing: Missing = ()
     origin: datetime | None = field(default=None, init=False)
 
     def __iter__(self) -> Iterator[Sample]:
@@ -478,13 +469,11 @@ def row_time(
 
 
 def channel_value(
-    column: Column, row: Mapping[str, Any], missing: Collection[float], where: str = "row"
+    column: Column, row: Mapping[str, Any], missing: Missing, where: str = "row"
 ) -> float:
     """Return the value of a channel in a row, NaN if it is missing."""
-    numbers = []
-    for name in column.names:
-        value = cell_number(row.get(name), f"{where}, '{name}'", column.decimal)
-        numbers.append(math.nan if value in missing else value)
+    places = ((name, f"{where}, '{name}'") for name in column.names)
+    numbers = [cell_number(row.get(n), place, column.decimal, missing) for n, place in places]
     # NaN if one of the columns is missing.
     return column.factor * sum(numbers) / len(numbers) + column.offset
 
@@ -498,25 +487,6 @@ def _object(line: str, where: str) -> dict[str, Any]:
     if not isinstance(row, dict):
         raise SampleError(f"{where}: got {row!r}; expected an object, column -> value.")
     return row
-
-
-def cell_number(value: Any, where: str, decimal: str = ".") -> float:
-    """Return a float, NaN if it is missing."""
-    if value is None or (isinstance(value, str) and value.strip().lower() in MISSING):
-        return math.nan
-    number = number_of(value, decimal)
-    if number is None:
-        remedy = "expected a number (leave it empty if it is missing)."
-        if decimal == "." and has_decimal_comma(value):
-            remedy = COMMA
-        elif decimal != "." and number_of(value) is not None:
-            remedy = NO_POINT
-        raise SampleError(f"{where}: got {value!r}; {remedy}")
-    if math.isinf(number):
-        raise SampleError(
-            f"{where}: got {value!r}; a channel must be finite (leave it empty if it is missing)."
-        )
-    return number
 
 
 def _disorder(where: str, t: float, last: float, clock: Clock | None) -> TimeOrderError:
@@ -587,7 +557,7 @@ def read_parquet(
     clock: Clock,
     *,
     every: int = 1,
-    missing: Iterable[float] = (),
+    missing: Missing = (),
 ) -> DataTable:
     """Read channels from a Parquet file; only the columns that are needed.
 

@@ -1,0 +1,102 @@
+"""Numbers in the cells of tables, and texts that mean a missing value."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Collection, Iterable
+from typing import Any, TypeAlias
+
+from livepde.errors import SampleError
+
+Missing: TypeAlias = Collection[float | str]
+"""Numbers and texts of a table that mean a missing value."""
+
+MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--", "---", "#n/a", "#nv"})
+LIMIT = re.compile(r"\s*[<>≤≥]\s*(.+?)\s*")  # <0.5: below or above the range of an instrument
+COMMA = "if that is a decimal comma, set decimal = ','."
+NO_POINT = "with decimal = ',', a point is not a decimal mark."
+POINT = str.maketrans(",.", ".,")  # so that a point where commas are decimals is no number
+MOST = 5  # texts that are listed
+
+
+def number_of(cell: Any, decimal: str = ".") -> float | None:
+    """Return a number or a number as text, None if it is neither."""
+    try:
+        if isinstance(cell, str):
+            if "_" in cell:  # which Python reads as 1000 in 1_000
+                return None
+            cell = cell if decimal == "." else cell.translate(POINT)
+        return None if isinstance(cell, bool) else float(cell)
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
+def has_decimal_comma(cell: Any) -> bool:
+    """Return whether a cell is a number if its comma is one of decimals."""
+    return isinstance(cell, str) and "," in cell and number_of(cell, ",") is not None
+
+
+def is_limit(cell: str, decimal: str = ".") -> bool:
+    """Return whether a text is a limit that a reading was below or above, such as <0.5."""
+    found = LIMIT.fullmatch(cell)
+    return found is not None and number_of(found[1], decimal) is not None
+
+
+def is_missing(cell: Any, missing: Missing = ()) -> bool:
+    """Return whether a cell is empty, or a text that means a missing value.
+
+    >>> is_missing(" NaN"), is_missing("OVER"), is_missing("OVER", ["OVER"])
+    (True, False, True)
+    """
+    if not isinstance(cell, str):
+        return cell is None
+    text = cell.strip()
+    return text.lower() in MISSING or text in missing
+
+
+def cell_number(
+    value: Any,
+    where: str,
+    decimal: str = ".",
+    missing: Missing = (),
+    others: Iterable[Any] = (),
+) -> float:
+    """Return a float, NaN if it is missing.
+
+    `missing`: texts, and numbers, that mean a missing value. `others`: further cells of the column,
+    whose texts an error lists as well.
+    """
+    if is_missing(value, missing):
+        return math.nan
+    number = number_of(value, decimal)
+    if number is None:
+        remedy = _remedy(value, decimal, [value, *others], missing)
+        raise SampleError(f"{where}: got {value!r}; {remedy}")
+    if math.isinf(number):
+        raise SampleError(
+            f"{where}: got {value!r}; a channel must be finite (leave it empty if it is missing)."
+        )
+    return math.nan if number in missing else number
+
+
+def _remedy(value: Any, decimal: str, cells: Iterable[Any], missing: Missing) -> str:
+    """Return the end of a sentence about a cell that is not a number."""
+    if decimal == "." and has_decimal_comma(value):
+        return COMMA
+    if decimal != "." and number_of(value) is not None:
+        return NO_POINT
+    if not isinstance(value, str):
+        return "expected a number (leave it empty if it is missing)."
+    texts = dict.fromkeys(
+        cell.strip()
+        for cell in cells
+        if isinstance(cell, str) and not is_missing(cell, missing)
+        if number_of(cell, decimal) is None and "'" not in cell
+    )
+    stated = [one for one in missing if isinstance(one, str)]
+    key = f"data.missing={[*stated, *list(texts)[:MOST]]}"
+    return (
+        f'expected a number. If such text means a missing value, add --set "{key}", or this key '
+        "to the case."
+    )
