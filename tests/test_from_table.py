@@ -111,7 +111,7 @@ def test_the_column_with_a_unit_of_time_goes_before_one_that_counts(here):
         ("T_1,T_2\n20,20\n20,21\n19,20\n", "no column contains times: expected dates, or numbers"),
         (",T\n2025-04-01,20\n2025-04-02,20\n", "Column 1 has no name: give it one."),
         ("time_s,note\n0,a\n1,b\n", "no column but the times, 'time_s', contains numbers"),
-        ("at,T\n12:00,20\n12:10,20\n", "'at' has times of day: add a column of days."),
+        ("at,T\n12:00,20\n11:10,20\n", "'at' has times of day: add a column of days."),
         ("time_s,T\n0,20\n20,20\n10,20\n", "row 4, column 'time_s': the time is earlier"),
         ("time_s,T\n0,20\n20,ERR\n40,20\n", "row 3, column 'T': got 'ERR'"),
     ],

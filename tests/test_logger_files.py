@@ -290,3 +290,97 @@ def test_init_writes_the_stated_texts_into_the_case(tmp_path):
         app, [*args[:1], str(tmp_path / "b"), *args[2:], "--set", given[:18]]
     )
     assert refused.exit_code != 0
+
+
+# --- elapsed times, and numbers that count from a date -------------------------------------------
+
+
+def init_of(folder: Path, times: list[str], name: str, *options: str) -> tuple[str, str]:
+    """Return what `livepde init` prints of a table with these times, and its line of data."""
+    rows = "".join(f"{time},{20 + k % 3}\n" for k, time in enumerate(times))
+    (folder / "log.csv").write_text(f"{name},c\n{rows}")
+    given = ["init", str(folder / "new"), "--data", str(folder / "log.csv"), *options]
+    told = CliRunner().invoke(app, given)
+    if told.exit_code:
+        return str(told.exception), ""
+    lines = (folder / "new" / "case.toml").read_text().splitlines()
+    return " ".join(told.output.split()), next(line for line in lines if line.startswith("data ="))
+
+
+def test_elapsed_times_are_read_beyond_a_day(tmp_path):
+    times = ["0:00:00", "10:00:00", "26:00:30", "103:00:30.5"]
+    said, line = init_of(tmp_path, times, "Elapsed [min]")
+    assert "4 rows from 0 to 370830" in said
+    assert "times are read as h:mm:ss." in said
+    assert line.endswith('time = "Elapsed [min]", time_format = "h:mm:ss" }')
+
+
+def test_two_parts_of_an_elapsed_time_are_not_guessed(tmp_path):
+    times = ["0:00", "0:30", "70:10"]
+    said, _ = init_of(tmp_path, times, "t")
+    assert "if '0:00' is an elapsed time, set --time-format 'h:mm' or 'mm:ss'; if" in said
+    said, _ = init_of(tmp_path, times, "t", "--time-format", "mm:ss")
+    assert "from 0 to 4210" in said
+
+
+def test_times_of_day_that_begin_again_are_no_elapsed_times(tmp_path):
+    said, _ = init_of(tmp_path, ["22:00:00", "23:00:00", "0:00:00"], "clock")
+    assert "'clock' has times of day: add a column of days" in said
+
+
+@pytest.mark.parametrize(
+    ("wrong", "form", "remedy"),
+    [
+        ("0:75:00", "h:mm:ss", "expected an elapsed time as time_format has it, 'h:mm:ss'"),
+        ("0:05:00", "", "if it is an elapsed time, set time_format = 'h:mm:ss'"),
+    ],
+)
+def test_an_elapsed_time_that_is_not_read_leads_to_the_format(wrong, form, remedy):
+    with pytest.raises(DataError, match=remedy):
+        tabulated([wrong], {"a": [1.0]}, COLUMNS, Clock("t", format=form))
+
+
+@pytest.mark.parametrize(
+    ("first", "step", "unit", "from_"),
+    [
+        (45752.5, 1 / 24, "d since 1899-12-30", "2025-04-05 12:00:00"),
+        (1743854400, 3600, "s since 1970-01-01T00:00Z", "2025-04-05 12:00:00"),
+        (1743854400000, 3600000, "ms since 1970-01-01T00:00Z", "2025-04-05 12:00:00"),
+    ],
+)
+def test_numbers_that_count_from_a_date_are_dates(tmp_path, first, step, unit, from_):
+    times = [repr(first + step * k) for k in range(5)]
+    said, line = init_of(tmp_path, times, "Date/Time")
+    assert f"5 rows from {from_} to 2025-04-05 16:00:00" in said
+    assert f"times are read as {unit}." in said
+    assert f'time_unit = "{unit}"' in line
+
+
+def test_a_stated_unit_is_not_replaced_by_a_date(tmp_path):
+    times = [repr(45752.5 + k) for k in range(5)]
+    said, line = init_of(tmp_path, times, "time", "--set", "data.time_unit=s")
+    assert "5 rows from 45752.5 to 45756.5, 1 s apart" in said
+    assert 'time_unit = "s"' in line
+    said, _ = init_of(tmp_path / "new", times, "time", "--set", "data.time_unit=d since noon")
+    assert "got 'since noon'; expected a date, as in 'd since 1899-12-30'" in said
+
+
+def test_day_numbers_of_local_clocks_that_are_set_back_are_told_apart():
+    noon = datetime(1899, 12, 30)
+    clock = Clock("t", 86400.0, zone=BERLIN, since=noon)
+    days = [(datetime.fromisoformat(text) - noon) / timedelta(days=1) for text in local(30, 12)]
+    table = tabulated(days, {"a": np.arange(12.0)}, COLUMNS, clock)
+    assert table.t == pytest.approx(1800.0 * np.arange(12))
+
+
+def test_a_case_runs_with_day_numbers(tmp_path):
+    times = [repr(45752.5 + k / 48) for k in range(30)]
+    init_of(tmp_path, times, "time")
+    case = tmp_path / "new" / "case.toml"
+    filled = {"mesh.from": "0", "mesh.to": "1", "law.noise": "0.1", "channels.c.at": "0.5"}
+    filled |= {f"unknowns.alpha.{key}": "1e-6" for key in ("prior", "std")}
+    settings = [part for key, value in filled.items() for part in ("--set", f"{key}={value}")]
+    start = ["--set", "data.start=2025-04-05 13:00"]
+    told = CliRunner().invoke(app, ["check", str(case), *settings, *start])
+    assert "28 samples" in told.output, told.output
+    assert "2025-04-05 13:00" in told.output

@@ -93,16 +93,33 @@ def missing_in(given: Any, where: str) -> tuple[float | str, ...]:
         raise CaseError(f"{where}: {text}") from None
 
 
+def since_when(unit: str, where: str) -> tuple[str, datetime | None]:
+    """Return a unit of times, and the date since which it counts; raises `CaseError`.
+
+    >>> since_when("d since 1899-12-30", "data.time_unit")
+    ('d', datetime.datetime(1899, 12, 30, 0, 0))
+    """
+    unit, since, origin = unit.partition(" since ")
+    try:
+        return unit.strip(), datetime.fromisoformat(origin.strip()) if since else None
+    except ValueError:
+        text = f"got 'since {origin}'; expected a date, as in 'd since 1899-12-30'."
+        raise CaseError(f"{where}: {text}") from None
+
+
 def clock_of(case: CaseContent, data: DataSpec | None = None) -> Clock:
     """Return how times are read, by default those of `[data]`."""
     data, unit = data or case.spec.data, case.equation.time_unit
-    rule = conversion(data.time_unit or unit, unit, case.where("data.time_unit"))
+    where = case.where("data.time_unit")
     second = conversion("s", unit, case.where("data.time")).factor if unit else 1.0
+    stated, since = since_when(data.time_unit or unit, where)
+    factor = conversion(stated, unit if since is None else "s", where).factor
+    factor *= 1.0 if since is None else second
     start, stop = _instant(case, data.start, "start"), _instant(case, data.stop, "stop")
     zone = zone_named(case.spec.data.zone, case.where("data.zone"))
     return Clock(
         data.times[0],
-        rule.factor,
+        factor,
         start,
         stop,
         second,
@@ -112,6 +129,7 @@ def clock_of(case: CaseContent, data: DataSpec | None = None) -> Clock:
         hour="".join(data.times[1:]),
         margin=max([0.0, *delays(case).values()]),
         doubt="" if data.time_unit else other_time_unit(data.times[0], unit),
+        since=since,
     )
 
 

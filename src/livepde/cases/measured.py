@@ -10,21 +10,30 @@ from datetime import UTC, datetime, timedelta, tzinfo
 from functools import partial
 from pathlib import Path
 from statistics import mode
+from typing import Any
 
 import numpy as np
 
+from livepde.cases.data import since_when
 from livepde.cases.read import BLANK
 from livepde.errors import SampleError
 from livepde.linalg import Array
 from livepde.streams import Clock, Column, DataTable, read_csv
 from livepde.streams.cells import Missing, is_limit, is_missing, number_of
-from livepde.streams.clock import CALLED_TIME, date_formats
+from livepde.streams.clock import CALLED_TIME, ELAPSED, date_formats, elapsed_formats
 from livepde.streams.csvfile import Written, how_written
 from livepde.streams.table import JSON_LINES
-from livepde.units import AT_THE_END, IN_BRACKETS, unit_in
+from livepde.units import AT_THE_END, IN_BRACKETS, conversion, unit_in
 
-HOUR = re.compile(r"\d{1,2}:\d{2}(:\d{2}(\.\d+)?)?( ?[AaPp][Mm])?")
+HOUR = re.compile(r"\d+:\d{2}(:\d{2}(\.\d+)?)?( ?[AaPp][Mm])?")
 ROW_NUMBER = re.compile(r"(id|idx|index|n|no|nr|num|number|row|rec|record|sample|#)\.?", re.I)
+# Units of times that count from a date, and their least number: that of the year 2000.
+COUNTED = {
+    "ms since 1970-01-01T00:00Z": 946684800e3,
+    "s since 1970-01-01T00:00Z": 946684800.0,
+    "d since 1899-12-30": 36526.0,  # of Excel
+}
+LATEST = 2.7  # times the least number: the year 2051, or 2169 of Excel
 VALUES = {"number", "date"}  # kinds of cells that a header does not have
 
 
@@ -41,6 +50,7 @@ class Measured:
     row_numbers: tuple[str, ...]  # columns that are not used
     texts: tuple[str, ...]  # columns without numbers, not used either
     missing: tuple[float | str, ...] = ()  # stated to mean a missing value, of the first table
+    counted: str = ""  # unit and date since which times count that are numbers; empty: none
     more: tuple[Measured, ...] = ()  # tables that are joined to this one by time
 
     @property
@@ -71,6 +81,11 @@ class Measured:
         return replace(self, more=(*self.more, other))
 
     @property
+    def is_of_numbers(self) -> bool:
+        """Whether times are numbers whose unit a case states."""
+        return self.samples.origin is None and self.time_format not in ELAPSED
+
+    @property
     def steps(self) -> Array:
         """Intervals between the samples."""
         return np.diff(self.samples.t)
@@ -86,7 +101,8 @@ class Measured:
             told += f", {np.median(steps):g} {unit}".rstrip() + " apart"
         if len(steps) and steps.max() > 1.01 * steps.min():
             told += f" (median), {steps.min():g} to {steps.max():g}"
-        return told
+        known = self.counted or (self.time_format if self.time_format in ELAPSED else "")
+        return f"{told}; times are read as {known}" if known else told
 
 
 def _moment(t: float, origin: datetime | None) -> str:
@@ -101,12 +117,14 @@ def measured(
     skip: int | None = None,
     zone: tzinfo = UTC,
     missing: tuple[float | str, ...] = (),
+    stated: str = "",
 ) -> Measured:
     """Read a CSV file of which nothing is known.
 
     `time_unit`: the unit of time of the equation. `time_format`: of dates; empty: found from the
     cells. `skip`: lines before the header; None: found from the lines. `zone`: of dates
-    without one. `missing`: numbers and texts that mean a missing value.
+    without one. `missing`: numbers and texts that mean a missing value. `stated`: the unit of the
+    times; empty: found from their name and their numbers.
     """
     if table.suffix in (*JSON_LINES, ".parquet"):
         raise SampleError(f"{table}: expected a CSV file with a header.")
@@ -114,22 +132,37 @@ def measured(
     written = replace(written, rows=[_without(row, missing) for row in written.rows])
     kinds = _kinds(table, written, time_format)
     time = _times(table, written, kinds)
-    dated = kinds[time[0]] == "date"
-    found = _format(table, written, time, time_format) if dated else ""
-    columns, counted, texts = _sorted_out(kinds, time, written)
+    clock, unit = _clock(table, written, time, kinds[time[0]], time_format, stated)
+    columns, row_numbers, texts = _sorted_out(kinds, time, written)
     if not columns:
         raise SampleError(f"{table}: no column but the times, '{time[0]}', contains numbers.")
     samples = read_csv(
         table,
         columns,
-        Clock(time[0], zone=zone, format=found, decimal=written.decimal, hour="".join(time[1:])),
+        replace(clock, zone=zone),
         separator=written.separator,
         encoding=written.encoding,
         skip=written.skip,
         missing=missing,
     )
-    unit = time_unit and _unit_of_times(samples, time[0], time_unit)
-    return Measured(table, written, time, found, unit, samples, counted, texts, missing)
+    counted, steps = (unit, "s") if clock.since else ("", unit)
+    steps = time_unit and (steps or BLANK)
+    return Measured(
+        table, written, time, clock.format, steps, samples, row_numbers, texts, missing, counted
+    )
+
+
+def _clock(
+    table: Path, written: Written, time: tuple[str, ...], kind: str, form: str, stated: str
+) -> tuple[Clock, str]:
+    """Return how times are read, and their unit, perhaps with a date; empty if it is unknown."""
+    dated = kind in ("date", "hour")
+    form = _format(table, written, time, form) if dated else ""
+    unit = "s" if dated else stated or _unit_of_times(written, time[0])
+    each, since = since_when(unit, f"{table}: time_unit")
+    factor = conversion(each, "s", f"{table}: time_unit").factor if since else 1.0
+    known: dict[str, Any] = {"format": form, "decimal": written.decimal, "since": since}
+    return Clock(time[0], factor, hour="".join(time[1:]), **known), unit
 
 
 def _without(row: Sequence[str], missing: Missing) -> list[str]:
@@ -147,9 +180,15 @@ def _sorted_out(
     return columns, counted, tuple(name for name in kinds if name not in (*time, *numbers))
 
 
-def _unit_of_times(samples: DataTable, name: str, unit: str) -> str:
-    """Return the unit of a column of times; dates are read as seconds since the first one."""
-    return "s" if samples.origin else unit_in(name, unit, IN_BRACKETS, AT_THE_END) or BLANK
+def _unit_of_times(written: Written, name: str) -> str:
+    """Return the unit of a column of numbers, perhaps with the date since which they count."""
+    if found := unit_in(name, "s", IN_BRACKETS, AT_THE_END):
+        return found
+    values, named = _values(name, written), CALLED_TIME.match(name)
+    for unit, least in COUNTED.items() if named else ():
+        if ((values >= least) & (values < LATEST * least)).all():
+            return unit
+    return ""
 
 
 def _kinds(table: Path, written: Written, form: str) -> dict[str, str]:
@@ -196,7 +235,7 @@ def _times(table: Path, written: Written, kinds: Mapping[str, str]) -> tuple[str
     complete = [name for name in dates if ":" in "".join(_cells(name, written))]
     if dates and hours and not complete:
         return dates[0], hours[0]
-    found = [*complete, *dates, *_most_like_times(numbers, written)]
+    found = [*complete, *dates, *_most_like_times(numbers, hours, written)]
     if found:
         return (found[0],)
     more = ""
@@ -210,15 +249,22 @@ def _times(table: Path, written: Written, kinds: Mapping[str, str]) -> tuple[str
     )
 
 
-def _most_like_times(numbers: Sequence[str], written: Written) -> list[str]:
-    """Return columns of numbers that may be times, those with the surest signs first."""
+def _most_like_times(numbers: Sequence[str], hours: Sequence[str], written: Written) -> list[str]:
+    """Return columns that may be times, those with the surest signs first.
+
+    `hours`: columns such as 0:10:00, which are times if they are elapsed times. Besides times of
+    day, numbers are times only if their name says so.
+    """
     timed = [name for name in numbers if unit_in(name, "s", IN_BRACKETS, AT_THE_END)]
     values = {name: _values(name, written) for name in numbers}
     rising = [name for name, found in values.items() if (found[:-1] < found[1:]).all()]
     both = [name for name in timed if name in rising]
+    named = [*both, *filter(CALLED_TIME.match, rising)]
+    if hours:
+        return [*named, *(name for name in hours if elapsed_formats(_cells(name, written)))]
     # Row numbers increase, too: they are times only if nothing else is.
     others = [name for name in rising if not _counts_rows(name, written)]
-    return [*both, *filter(CALLED_TIME.match, rising), *others, *rising, *timed]
+    return [*named, *others, *rising, *timed]
 
 
 def _format(table: Path, written: Written, time: tuple[str, ...], given: str) -> str:
@@ -226,9 +272,14 @@ def _format(table: Path, written: Written, time: tuple[str, ...], given: str) ->
     if given:
         return given
     cells = [" ".join(parts) for parts in zip(*(_cells(n, written) for n in time), strict=False)]
-    formats = date_formats(cells)
+    formats = elapsed_formats(cells) or date_formats(cells)
     if len(formats) == 1:
         return formats[0]
+    if formats and formats[0] in ELAPSED:
+        raise SampleError(
+            f"{table}, column '{time[0]}': if '{cells[0]}' is an elapsed time, set --time-format "
+            f"{' or '.join(map(repr, formats))}; if it is a time of day, add a column of days."
+        )
     if not formats:
         raise SampleError(
             f"{table}, column '{time[0]}': got '{cells[0]}'; set --time-format, such as "

@@ -111,6 +111,8 @@ def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
     data, told = _data(table, folder), list[str]()
     if len(data.get("missing", ())) > len(table.missing):
         told.append("missing: far outside the other values; check them")
+    if table.counted:
+        told.append("time_unit: found from the numbers; check the dates above")
     # Times that are numbers count from an event, which is at rest before the first row.
     first = min(one.samples.t[0] for one in table.tables)
     if equation.spacing == "geometric" and table.samples.origin is None and first > 0.0:
@@ -216,8 +218,8 @@ def _written(table: Measured, folder: Path) -> dict[str, Any]:
     file = path if path.is_absolute() else beside(path, folder)
     found: dict[str, Any] = {"file": file.as_posix(), "skip": written.skip}
     found["time"] = table.time[0] if len(table.time) == 1 else list(table.time)
-    if table.samples.origin is None and table.time_unit:
-        found["time_unit"] = table.time_unit
+    if unit := table.counted or (table.time_unit if table.is_of_numbers else ""):
+        found["time_unit"] = unit
     found |= {"time_format": table.time_format, "separator": written.separator}
     return found | {"decimal": written.decimal, "encoding": written.encoding}
 

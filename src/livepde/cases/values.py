@@ -14,6 +14,7 @@ from pydantic_core import CoreSchema
 
 from livepde.diagnostics.check_report import Bound, Sense
 from livepde.streams.cells import number_of
+from livepde.streams.clock import ELAPSED
 
 
 def _quantity(value: Any) -> Any:
@@ -106,12 +107,15 @@ def _encoding(value: str) -> str:
 
 
 def _time_format(value: str) -> str:
+    if value in ELAPSED:
+        return value
     moment = datetime(2001, 2, 3, 4)
     with suppress(ValueError, re.error):  # the latter of a part that stands twice
         # A complete format returns the date that was written with it.
         if datetime.strptime(moment.strftime(value), value).date() == moment.date():
             return value
-    raise ValueError("expected year, month, day and time, as '%d.%m.%Y %H:%M'")
+    known = f"or of an elapsed time: {', '.join(ELAPSED)}"
+    raise ValueError(f"expected year, month, day and time, as '%d.%m.%Y %H:%M', {known}")
 
 
 def _flat(value: Any) -> Any:

@@ -89,7 +89,7 @@ def init(
         zone = zone_named(str(changes.get("data.zone") or "UTC"), "--set data.zone")
         missing = missing_in(changes.pop("data.missing", None), "--set data.missing")
         how: dict[str, Any] = {"time_format": time_format, "skip": skip, "zone": zone}
-        how["missing"] = missing
+        how |= {"missing": missing, "stated": str(changes.get("data.time_unit") or "")}
         first, *others = (measured(file, found.time_unit, **how) for file in data)
         read = reduce(Measured.joined, others, first)
         files = new_case.files_for(read, folder, found)

@@ -25,6 +25,8 @@ from livepde.streams.cells import COMMA, NO_POINT, has_decimal_comma, number_of
 
 Instant: TypeAlias = float | str | date | datetime
 CALLED_TIME = re.compile(r"(t|time|timestamp|date|datetime|elapsed|zeit|temps)\b|.*time", re.I)
+# Formats of elapsed times, which are numbers: seconds of each part. 48:00:00 is two days.
+ELAPSED = {"h:mm:ss": (3600.0, 60.0, 1.0), "h:mm": (3600.0, 60.0), "mm:ss": (60.0, 1.0)}
 FIRST_CELLS = 5  # of a column, in one of which a format of dates has to fit
 MOST = 0.8  # share of cells that a format of dates has to fit
 ORDERS = ("%d-%m-%Y", "%m-%d-%Y", "%Y-%m-%d", "%d-%m-%y", "%m-%d-%y", "%y-%m-%d", "%d-%b-%Y")
@@ -58,7 +60,9 @@ class Clock:
     zone
         Time zone of dates that name none.
     format
-        Format of dates as text, as "%d.%m.%Y %H:%M"; empty: ISO format.
+        Format of dates as text, as "%d.%m.%Y %H:%M"; empty: ISO format. Or a format of `ELAPSED`.
+    since
+        Date from which numbers count, so that they are dates; None: numbers are no dates.
     decimal
         Decimal mark of numbers as text: "." or ",".
     margin
@@ -79,6 +83,7 @@ class Clock:
     hour: str = ""
     margin: float = 0.0
     doubt: str = ""
+    since: datetime | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -108,6 +113,21 @@ class Clock:
         if first is None or again is None:
             return 0.0
         return (first - again).total_seconds() * self.second
+
+    def moment(self, cell: Any, dates: bool) -> float | None:
+        """Return a cell as a number; of dates in seconds since 1970. None if it is neither."""
+        if self.format in ELAPSED:
+            return elapsed(cell, self.format)
+        if not dates:
+            return number_of(cell, self.decimal)
+        if self.since is None:
+            return self.stamp(cell, self.format)
+        count = number_of(cell, self.decimal)
+        try:
+            seconds = math.nan if count is None else count * self.factor / self.second
+            return self.stamp(self.since + timedelta(seconds=seconds))
+        except (ValueError, OverflowError):
+            return None
 
     def stamp(self, value: Any, form: str = "") -> float | None:
         """Return seconds since 1970 of a date or a date as text, None if it is neither."""
@@ -144,20 +164,21 @@ def read_times(
     Raises `SampleError`: a time that cannot be read, with the likely remedy.
     """
     dates = _are_dates(cells, clock, before)
-    if clock.doubt and not dates:
+    if clock.doubt and not dates and clock.format not in ELAPSED:
         raise SampleError(
             f"{where(0)} '{clock.name}': the name states the unit '{clock.doubt}', which is not "
             f"that of the model: set time_unit = '{clock.doubt}', or the unit of these times."
         )
     times = np.empty(len(cells))
     for k, cell in enumerate(cells):
-        value = clock.stamp(cell, clock.format) if dates else number_of(cell, clock.decimal)
+        value = clock.moment(cell, dates)
         if value is None or not math.isfinite(value):
             raise SampleError(
                 f"{where(k)} '{clock.name}': got {cell!r}; {_remedy(cell, clock, dates)}"
             )
         times[k] = value
-    return times * (clock.second if dates else clock.factor), dates
+    in_seconds = dates or clock.format in ELAPSED
+    return times * (clock.second if in_seconds else clock.factor), dates
 
 
 def with_second_passes(
@@ -188,6 +209,8 @@ def with_second_passes(
 
 def is_naive(cell: Any, clock: Clock) -> bool:
     """Return whether a cell is a date without a zone."""
+    if clock.since is not None:
+        return clock.since.tzinfo is None
     try:
         cell = _parsed(cell, clock.format)
     except ValueError:
@@ -201,6 +224,35 @@ def _parsed(cell: Any, form: str) -> Any:
         return cell
     text = cell.strip()
     return datetime.strptime(text, form) if form else datetime.fromisoformat(text)
+
+
+def elapsed(cell: Any, form: str) -> float | None:
+    """Return the seconds of an elapsed time, None if it does not have the format.
+
+    >>> elapsed("26:00:30", "h:mm:ss"), elapsed("0:07.5", "mm:ss"), elapsed("0:75", "h:mm")
+    (93630.0, 7.5, None)
+    """
+    parts = str(cell).strip().split(":")
+    whole = [part.isdecimal() for part in parts[:-1]]
+    last = number_of(parts[-1]) if parts[-1][:1].isdecimal() else None
+    if len(parts) != len(ELAPSED[form]) or not all(whole) or last is None:
+        return None
+    numbers = [*map(float, parts[:-1]), last]
+    if max(numbers[1:]) >= 60.0:
+        return None
+    return sum(n * seconds for n, seconds in zip(numbers, ELAPSED[form], strict=True))
+
+
+def elapsed_formats(cells: Sequence[str]) -> list[str]:
+    """Return the formats of elapsed times that all cells have, if they never go back.
+
+    >>> elapsed_formats(["0:00:00", "26:00:30"]), elapsed_formats(["0:10", "0:20"])
+    (['h:mm:ss'], ['h:mm', 'mm:ss'])
+    """
+    read = {form: [elapsed(cell, form) for cell in cells] for form in ELAPSED}
+    times = {form: np.array(found, dtype=float) for form, found in read.items()}  # None is NaN
+    # A comparison with NaN is false.
+    return [form for form, x in times.items() if (np.diff(x, prepend=0.0) >= 0.0).all()]
 
 
 def date_formats(cells: Sequence[str]) -> list[str]:
@@ -257,6 +309,8 @@ def guessed_format(text: str) -> str:
 def _are_dates(cells: list[Any], clock: Clock, before: bool | None) -> bool:
     """Return whether times are dates: by the first; if it is neither, by those before, or most."""
     first = cells[0]
+    if clock.since is not None or clock.format in ELAPSED:
+        return clock.since is not None
     if not isinstance(first, str):
         return isinstance(first, date)
     if clock.format:
@@ -273,13 +327,18 @@ def _are_dates(cells: list[Any], clock: Clock, before: bool | None) -> bool:
 def _remedy(cell: Any, clock: Clock, dates: bool) -> str:
     if clock.decimal == "." and not clock.format and has_decimal_comma(cell):
         return COMMA
-    if not dates:
+    if clock.format in ELAPSED:
+        return f"expected an elapsed time as time_format has it, {clock.format!r}."
+    if not dates or clock.since is not None:
         if clock.decimal != "." and number_of(cell) is not None:
             return NO_POINT
         return "expected a number, as in the other rows."
     if clock.format:
         return f"expected a date as time_format has it, {clock.format!r}."
     expected = "expected a date and time such as 2025-04-01 12:00"
+    if isinstance(cell, str) and (forms := elapsed_formats([cell])):
+        known = " or ".join(map(repr, forms))
+        return f"{expected}; if it is an elapsed time, set time_format = {known}."
     format = guessed_format(cell) if isinstance(cell, str) else ""
     return expected + (f"; set time_format, perhaps {format!r}." if format else ".")
 

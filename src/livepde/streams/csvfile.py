@@ -27,7 +27,7 @@ from livepde.streams.cells import (
     is_missing,
     number_of,
 )
-from livepde.streams.clock import Clock, date_formats, read_times
+from livepde.streams.clock import ELAPSED, Clock, date_formats, elapsed, read_times
 
 T = TypeVar("T")
 
@@ -272,6 +272,8 @@ def _time_formats(
         texts = [row[k].strip() for row in rows if k < len(row)]
         texts = [text for text in texts if not is_missing(text)]
         if not name or not texts or number_of(texts[0], decimal) is not None:
+            continue
+        if any(elapsed(texts[0], form) is not None for form in ELAPSED):
             continue
         if formats := tuple(filter(None, date_formats(texts))):  # not of ISO dates
             return formats
