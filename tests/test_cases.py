@@ -64,6 +64,9 @@ def result_of(path, **options):
         ("295.25 K", "degC", 22.1),
         ("10 %", "", 0.1),
         ("0.01 1/day", "1/s", 0.01 / 86400),
+        ("36 m3/h", "m^3/s", 0.01),
+        ("2 kJ m-3 K-1", "J/(m^3 K)", 2000.0),
+        ("6 cm2/min", "m^2/s", 1e-5),
     ],
 )
 @pytest.mark.slow
@@ -89,6 +92,7 @@ def test_deviations_of_temperatures_are_differences():
     [
         ("20 h", "m"), ("20 hx", "s"), ("5", "s"), ("h", "s"), ("3 m", ""), ("5 m^", "m"),
         ("5 m/(s", "m"), ("1 $", "m"), ("3 import os", "m"), ("", "m"), ("1 2", "m"),
+        ("1 m999", "m"), ("1 m2^3", "m"), ("1 m3/h", "m/s"),
     ],
 )  # fmt: skip
 def test_wrong_quantities_name_the_key(value, unit):

@@ -67,7 +67,7 @@ RUN = ("run", "mine/case.toml")
 MISTAKES = {
     "a column": (case('column = "T_10"', 'column = "T10"'), RUN),
     "a key": (case("prior =", "priro ="), RUN),
-    "a unit": (case('"5e-5 m^2/s"', '"5e-5 m2/s"'), RUN),
+    "a unit": (case('"5e-5 m^2/s"', '"5e-5 sqm/s"'), RUN),
     "a unit in a name": (minutes, RUN),
     "a unit in the name of a channel": (fahrenheit, RUN),
     "another kind of unit": (case('time_unit = "s"', 'time_unit = "m"'), RUN),

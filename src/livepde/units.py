@@ -124,37 +124,55 @@ def conversion(given: str, unit: str, where: str) -> Affine:
     """Return how values in the unit `given` become values in the model's unit."""
     if given == unit:
         return Affine()
-    if (given, unit) in USUAL:
-        return Affine(*USUAL[given, unit])
+    if (usual := USUAL.get((with_powers(given), unit))) is not None:
+        return Affine(*usual)
     check_unit(given, where)
     registry = pint_registry()
     import pint
 
     try:
-        parsed = registry.parse_units(given)
+        parsed = parsed_unit(registry, given)
         zero, one, two = (registry.Quantity(k, parsed).to(unit).magnitude for k in (0.0, 1.0, 2.0))
     except pint.UndefinedUnitError as error:
         raise CaseError(
             f"{where}: '{error.args[0] if error.args else given}' is not a unit that is known; "
-            f"{_expected(unit, given)}."
+            f"{_expected(unit)}."
         ) from None
     except pint.DimensionalityError:
         raise CaseError(
-            f"{where}: '{given}' cannot be converted to '{unit or '1'}'; {_expected(unit, given)}."
+            f"{where}: '{given}' cannot be converted to '{unit or '1'}'; {_expected(unit)}."
         ) from None
     except (pint.PintError, *NOT_A_UNIT):
-        raise CaseError(f"{where}: '{given}' is not a unit; {_expected(unit, given)}.") from None
+        raise CaseError(f"{where}: '{given}' is not a unit; {_expected(unit)}.") from None
     # Units as decibels are logarithmic: three points do not lie on a line.
     if not math.isclose(two - one, one - zero):
-        raise CaseError(f"{where}: '{given}' has no linear scale; {_expected(unit, given)}.")
+        raise CaseError(f"{where}: '{given}' has no linear scale; {_expected(unit)}.")
     return Affine(float(one - zero), float(zero))
+
+
+def with_powers(unit: str) -> str:
+    """Return a unit with the sign of its powers.
+
+    >>> with_powers("m3/h"), with_powers("W m-2 K-1"), with_powers("m^2/s**0.5")
+    ('m^3/h', 'W m^-2 K^-1', 'm^2/s**0.5')
+    """
+    return re.sub(r"(?<=[A-Za-z])(?=-?\d)", "^", unit)
+
+
+def parsed_unit(registry: Any, unit: str) -> Any:
+    """Return a unit as pint reads it, whose powers may lack their sign."""
+    import pint
+
+    with suppress(pint.PintError, *NOT_A_UNIT):
+        return registry.parse_units(unit)
+    return registry.parse_units(with_powers(unit))
 
 
 def unit_in(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
     """Return the unit in the name of a column; empty if none can be converted to `unit`."""
     for given in filter(None, (pattern.search(name) for pattern in patterns)):
-        powers = re.sub(r"(?<=[A-Za-z])(?=\d)", "^", given[1])  # m3/h is m^3/h
-        for text in (given[1], powers, powers.replace("_", "/")):  # L_s is L/s
+        powers = with_powers(given[1])
+        for text in (powers, given[1], powers.replace("_", "/")):  # L_s is L/s
             with suppress(CaseError):
                 conversion(text, unit, name)
                 return text
@@ -196,7 +214,7 @@ def in_si(unit: str) -> SI | None:
 
     try:
         check_unit(unit, "a unit")
-        parsed = registry.parse_units(unit)
+        parsed = parsed_unit(registry, unit)
         zero, one, two = (registry.Quantity(k, parsed).to_base_units() for k in (0.0, 1.0, 2.0))
     except (pint.PintError, CaseError, *NOT_A_UNIT):
         return None
@@ -215,7 +233,7 @@ def check_unit(unit: str, where: str) -> None:
     """Refuse a unit that is too long, or that raises a power to a power."""
     if len(unit) > UNIT:
         raise CaseError(f"{where}: a unit has at most {UNIT} characters; got {len(unit)}.")
-    flat = re.sub(rf"\s*({POWER}|[()])\s*", r"\1", unit)
+    flat = re.sub(rf"\s*({POWER}|[()])\s*", r"\1", with_powers(unit))
     if re.search(rf"{POWER}[-+(]*[0-9]{{3,}}", flat) or _towers(flat):
         raise CaseError(
             f"{where}: '{unit}' is not a unit: powers are numbers below 100, and none is raised to "
@@ -243,13 +261,9 @@ def _towers(unit: str) -> bool:
     return False
 
 
-def _expected(unit: str, given: str) -> str:
+def _expected(unit: str) -> str:
     if not unit:
         return "expected no unit: remove it"
-    if re.search(r"[A-Za-z][0-9]", given):
-        return (
-            f"write powers as in '{unit}'" if "^" in unit else f"expected a unit such as '{unit}'"
-        )
     others = next((kind for kind in KINDS if unit in kind), (unit,))
     return (
         f"expected a unit such as {' or '.join(filter(None, (', '.join(others[:-1]), others[-1])))}"

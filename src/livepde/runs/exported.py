@@ -23,7 +23,7 @@ from livepde.dates import instants, since
 from livepde.errors import ConfigurationError, RunError
 from livepde.records import STATUS_CODES, field_names, interval_95, scalars
 from livepde.runs.directory import Run, plain, write_dataset
-from livepde.units import NOT_A_UNIT, pint_registry
+from livepde.units import NOT_A_UNIT, parsed_unit, pint_registry
 
 CONVENTIONS = "CF-1.11"
 BESIDE = {  # end of a name -> what such a variable says of the one without it
@@ -101,7 +101,7 @@ def udunits(unit: str) -> str | None:
 
     registry = pint_registry()
     try:
-        found = to_units_container(registry.parse_units(unit))
+        found = to_units_container(parsed_unit(registry, unit))
     except NOT_A_UNIT:
         return None
     parts = {name: float(str(power)) for name, power in found.items()}
