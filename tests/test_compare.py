@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 from dataclasses import replace
 
@@ -654,3 +655,59 @@ def test_a_setting_adds_an_unknown_only_as_a_whole(tmp_path):
     assert "source" in cases.load(path, settings=whole).model.parameter_space.labels
     with pytest.raises(CaseError, match="to add it, set all of it"):
         cases.load(path, settings={"unknowns.sorce.std": "1e-3 K/s"})
+
+
+# --- what an equation leaves out while a process begins ------------------------------------------
+
+RESPONSE = """
+equation = "borehole"
+initial = "10 degC"
+options = { H = "100 m", T0 = "10 degC" }
+mesh = { from = "65 mm", to = "10 m", cells = 10, spacing = "geometric" }
+data = { file = "test.csv", time_unit = "h" }
+unknowns.k = { prior = "2 W/(m K)", std = "1 W/(m K)" }
+unknowns.R_b = { prior = "0.1 m K/W", std = "0.1 m K/W" }
+law.noise = "0.1 K"
+channels.Q = { role = "input", column = "Q" }
+channels.T = { role = "sensor", column = "T", quantity = "fluid" }
+"""
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "level", "told"),
+    [
+        (0, 72, "caution", 'grouted_borehole".*: `data.assimilate_from="27 h"`. Check the clock'),
+        (0, 50, "caution", 'grouted_borehole"` contains. Check'),  # 27 h is more than half of it
+        (30, 72, "do not trust", 'grouted_borehole"` contains. Check'),  # begins later already
+        (0, 72, "trusted", "^Check the clock"),
+    ],
+)
+def test_a_misfit_of_a_response_test_names_the_stored_heat(tmp_path, begin, end, level, told):
+    (tmp_path / "test.csv").write_text(
+        "time,Q,T\n" + "".join(f"{t},5000,{15 + 0.1 * t}\n" for t in range(end + 1))
+    )
+    (tmp_path / "case.toml").write_text(RESPONSE)
+    settings = {"data.assimilate_from": f"{begin} h"}
+    prepared = cases.load(tmp_path / "case.toml", settings=settings).prepare()
+    misfit = Finding("misfit", "caution", "Model misfit.", "T", remedy="Check the clock.")
+    once = with_settings(prepared, Verdict(level, (misfit,)))
+    assert re.search(told, once.findings[0].remedy)
+    assert with_settings(prepared, once) == once
+    later = [
+        one
+        for one in proposed(prepared, VariantRun(Variant("as stated")))
+        if one.name == "later start"
+    ]
+    assert [one.settings for one in later] == (
+        [('data.assimilate_from="27 h"',)] if (begin, end) == (0, 72) else []
+    )
+
+
+def test_a_variant_that_other_readings_make_usable_is_named():
+    base = VariantRun(Variant("as stated"), verdict={"level": "do not trust"}, log_evidence=0.0)
+    later = replace(
+        base, variant=Variant("later start"), verdict={"level": "caution"}, readings={"T": 3}
+    )
+    assert "'later start' has the verdict 'caution' with its readings." in conclusions(
+        base, [later]
+    )

@@ -17,6 +17,7 @@ from livepde.linalg import Array
 from livepde.samples import by_name
 from livepde.streams import DataTable
 from livepde.streams.oddities import switches
+from livepde.units import conversion
 from livepde.verdict import Cause, Finding, Severity, Verdict, channel_setting
 from livepde.verdict.directions import stated_positions, usual_shifts
 from livepde.verdict.sentences import ESTIMATED, FINDINGS, LIKELY, amount_of, estimating
@@ -31,6 +32,7 @@ KEYS = {kind: key for kind, (_, key) in ESTIMATED.items()}
 SIZED = ("boundary", "channel", "drift", "flux", "lag", "loss", "source", "transfer")
 STATED = ("factor", "late")  # keys of a channel whose stated value a cause does not replace
 MISSED = 5.0  # times the noise that the first readings may miss a stated start
+DOUBTED = ("caution", "do not trust")  # levels of a verdict
 JUMPED = "Jumps are allowed already: check the model and the data for another cause."
 NO_SETTING = "No key of this case does that."
 
@@ -47,10 +49,41 @@ def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
         more = f" {NO_SETTING}" if cause.kind in SIZED else ""
         return replace(cause, setting="", remedy=f"{plain}{more}".strip())
 
+    omitted = _omitted(prepared) if verdict.level in DOUBTED else ""
+
     def settled(finding: Finding) -> Finding:
-        return replace(finding, causes=tuple(map(named, finding.causes)))
+        finding = replace(finding, causes=tuple(map(named, finding.causes)))
+        if finding.what != "misfit" or not omitted or omitted in finding.remedy:
+            return finding
+        own = finding.remedy or (finding.causes[0].remedy if finding.causes else "")
+        return replace(finding, remedy=f"{omitted} {own}".strip())
 
     return replace(verdict, findings=tuple(map(settled, verdict.findings)))
+
+
+def _omitted(prepared: Prepared) -> str:
+    """Return what the equation leaves out at the beginning, and what to do; empty if nothing."""
+    text, later = prepared.case.equation.omits, later_start(prepared)
+    return f"{text} Or begin later: `{later}`." if text and later else text
+
+
+def later_start(prepared: Prepared) -> str:
+    """Return the setting of a start after which what the equation leaves out has faded.
+
+    Empty if nothing is left out, or if that takes more than half of the record.
+    """
+    case, table = prepared.case, prepared.raw
+    if case.equation.settles is None or not isinstance(table, DataTable):
+        return ""
+    priors = {
+        name: prior_of(case, name) for name in case.spec.unknowns if name in case.equation.unknowns
+    }
+    after = case.equation.settles({**case.options, **priors}, float(case.mesh.p[0].min()))
+    begin, end = prepared.t0, float(table.t[-1])
+    if not prepared.assimilate_from < begin + after < 0.5 * (begin + end):
+        return ""
+    hours = conversion(case.equation.time_unit, "h", "a later start").factor * (begin + after)
+    return f"data.assimilate_from={toml_value(f'{hours:.2g} h')}"
 
 
 def after_gaps(verdict: Verdict, inputs: Iterable[Finding]) -> Verdict:
@@ -74,7 +107,7 @@ def start_missed(prepared: Prepared, verdict: Verdict) -> list[Finding]:
     noise, law = prepared.identifier.observed.noise, prepared.case.law
     if isinstance(law, SensitivityLaw) and isinstance(law.noise, int | float):
         noise = np.array([law.noise])
-    doubted = verdict.level in ("caution", "do not trust")
+    doubted = verdict.level in DOUBTED
     if not (settings and doubted) or noise is None or missed <= MISSED * np.median(noise):
         return []
     unit = prepared.case.equation.state.unit

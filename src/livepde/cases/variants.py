@@ -18,7 +18,14 @@ from livepde.cases.case_channels import columns_of
 from livepde.cases.data import clock_of, delays
 from livepde.cases.process import unread_without
 from livepde.cases.read import parse, settings_in, toml_key, toml_value
-from livepde.cases.remedies import first_miss, freed, switching, usual_shift, with_settings
+from livepde.cases.remedies import (
+    first_miss,
+    freed,
+    later_start,
+    switching,
+    usual_shift,
+    with_settings,
+)
 from livepde.dates import since_1970
 from livepde.errors import CaseError, ModelError
 from livepde.plots.style import modes_told
@@ -376,7 +383,7 @@ def _worse_sensors(one: VariantRun, base: VariantRun) -> list[str]:
 def conclusions(base: VariantRun, others: Sequence[VariantRun]) -> list[str]:
     """Return sentences on the recommendation, and on what other variants disagree about."""
     best = recommended(base, others)
-    remarks = _remarks(base, [one for one in others if not one.error])
+    remarks = _remarks(base, best, [one for one in others if not one.error])
     text = _recommendation(base, best)
     if math.isnan(base.log_evidence):
         text = (
@@ -425,7 +432,7 @@ def _equals(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
     )
 
 
-def _remarks(base: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
+def _remarks(base: VariantRun, best: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
     """Iterate over variants with better evidence and worse predictions, and refuted ones."""
     for one in others:
         if one.gained(base) > GAINED and (worse := _worse_sensors(one, base)):
@@ -438,6 +445,10 @@ def _remarks(base: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
         yield f"The data contradict {refuted}: lower evidence than the case."
     if names := _names_of(one for one in others if math.isnan(one.gained(base))):
         yield f"The evidence of {names} is missing or counts other readings: it is not compared."
+    if best.level not in USABLE:
+        for one in others:
+            if one.level in USABLE and math.isnan(one.gained(base)):
+                yield f"'{one.variant.name}' has the verdict '{one.level}' with its readings."
 
 
 def _names_of(runs: Iterable[VariantRun]) -> str:
@@ -481,6 +492,8 @@ def _candidates(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     for name in switching(case, prepared.raw) if isinstance(prepared.raw, DataTable) else ():
         # Lines between the rows of a switch look like many other errors, too.
         yield Variant(f"{name} held", (channel_setting(name, "between", '"hold"'),))
+    if later := later_start(prepared):
+        yield Variant("later start", (later,))
     for cause in base.causes:
         name = NAMES.get(cause.kind, cause.kind + " of {}").format(cause.subject)
         yield Variant(name, settings_in(cause.setting))

@@ -119,6 +119,11 @@ class Equation:
         Unknowns of which a case needs at least one -> the inputs and options that belong to it.
     components
         Names of the components of u; empty if it has one.
+    omits
+        What the equation leaves out while the process begins, and the equation that contains it.
+    settles
+        Function (values of unknowns and options, left end of the mesh) -> time after which that
+        has faded; None: unknown.
     dimension
         Of the mesh that `livepde init` writes: 1 an interval, 2 a rectangle.
     """
@@ -143,6 +148,8 @@ class Equation:
     spacing: Literal["uniform", "geometric"] = "uniform"
     alternatives: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     components: tuple[str, ...] = ()
+    omits: str = ""
+    settles: Callable[[Mapping[str, float], float], float] | None = None
     dimension: Literal[1, 2] = 1
 
     def about(self, unknowns: Collection[str] = ()) -> dict[str, Any]:
