@@ -62,7 +62,6 @@ def test_a_table_of_a_german_excel(here, encoding):
             "role": "sensor",
             "column": "Tiefe 5 cm [°C]",
             "at": "5 cm",
-            "unit": "°C",
         },
         "Fühler": {"role": "sensor", "column": "Fühler (0,2 m)", "at": "0.2 m"},
     }

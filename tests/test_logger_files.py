@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import tomllib
 from collections.abc import Callable
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -350,7 +351,7 @@ def test_an_elapsed_time_that_is_not_read_leads_to_the_format(wrong, form, remed
 )
 def test_numbers_that_count_from_a_date_are_dates(tmp_path, first, step, unit, from_):
     times = [repr(first + step * k) for k in range(5)]
-    said, line = init_of(tmp_path, times, "Date/Time")
+    said, line = init_of(tmp_path, times, "Excel Date/Time")
     assert f"5 rows from {from_} to 2025-04-05 16:00:00" in said
     assert f"times are read as {unit}." in said
     assert f'time_unit = "{unit}"' in line
@@ -384,3 +385,57 @@ def test_a_case_runs_with_day_numbers(tmp_path):
     told = CliRunner().invoke(app, ["check", str(case), *settings, *start])
     assert "28 samples" in told.output, told.output
     assert "2025-04-05 13:00" in told.output
+
+
+# --- units in the names of columns ---------------------------------------------------------------
+
+
+def channels_of(folder: Path, equation: str, *columns: str, time: str = "time [s]") -> dict:
+    """Return the channels of the case that `livepde init` writes for columns of these names."""
+    rows = [",".join([str(k), *[str(20 + k % 3)] * len(columns)]) for k in range(9)]
+    (folder / "log.csv").write_text("\n".join([",".join([time, *columns]), *rows]))
+    given = ["init", str(folder / "new"), "--data", str(folder / "log.csv")]
+    told = CliRunner().invoke(app, [*given, "--equation", equation])
+    assert told.exit_code == 0, told.output
+    return tomllib.loads((folder / "new" / "case.toml").read_text())
+
+
+def test_the_only_column_in_the_unit_of_a_missing_input_is_this_input(tmp_path):
+    case = channels_of(tmp_path, "borehole", "T [°C]", "P [kW]", "Batt [V]")
+    power = {"role": "input", "column": "P [kW]", "unit": "kW"}
+    assert case["channels"]["Q"] == power
+    assert "Q" not in case.get("inputs", {})
+    assert case["channels"]["Batt"]["unit"] == "? V"
+    assert "unit" not in case["channels"]["T"]  # °C is the unit of the model
+
+
+def test_of_two_columns_in_its_unit_none_is_guessed(tmp_path):
+    case = channels_of(tmp_path, "borehole", "T [C]", "P1 [kW]", "P2 [kW]")
+    assert case["inputs"]["Q"] == "? W"
+    assert case["channels"]["P1"]["unit"] == "? kW"
+
+
+def test_a_column_in_the_unit_of_a_flux_is_a_flux(tmp_path):
+    case = channels_of(tmp_path, "conduction", "T (C)", "q in (W/m²)", "q out [kW/m2]")
+    found = case["channels"]["q_in"]
+    assert (found["quantity"], found.get("unit")) == ("flux", None)
+    assert case["channels"]["q_out"]["unit"] == "kW/m2"
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [("T_air_degF", "degF"), ("T [F]", "degF"), ("T/K", "K"), ("T (C)", None), ("I/mA", "? mA"),
+     ("in/out", None), ("T_K", None)],
+)  # fmt: skip
+def test_the_unit_in_a_name_is_found(tmp_path, name, unit):
+    case = channels_of(tmp_path, "heat", name, time="time/h")
+    assert case["data"]["time_unit"] == "h"
+    (channel,) = case["channels"].values()
+    assert channel.get("unit") == unit
+
+
+def test_a_first_row_of_elapsed_time_and_limits_is_no_second_header(tmp_path):
+    (tmp_path / "log.csv").write_text("t;c\n0:00:00;<0.5\n0:00:10;1,5\n0:00:20;2,5\n")
+    with pytest.raises(DataError, match=r"row 2, column 'c': got '<0\.5'"):
+        measured(tmp_path / "log.csv", "s")
+    assert len(measured(tmp_path / "log.csv", "s", missing=("<0.5",)).samples) == 3

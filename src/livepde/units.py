@@ -31,12 +31,18 @@ NOT_A_UNIT = (
     ValueError,
 )
 IN_BRACKETS = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]\s*$")  # T [degC], time (min)
+AFTER_SLASH = re.compile(r"^[^\s/]+\s*/\s*([^\s/]+)$")  # Ewe/V, T / K; not flow m3/h
 AT_THE_END = re.compile(r"(?:_|^(?=\w{3}))([A-Za-z]+)$")  # time_s, minutes
 # power_kW, T_30cm degF, T_1 degF; not T_1 cm, which is a place
 AFTER_A_WORD = re.compile(r"(?:(?<=[^\W\d])[_ ]|(?<=\d)[_ ](?=deg))(deg[CF]|[kM]W|[mc]m|ft)$")
+OF_TIMES = (IN_BRACKETS, AFTER_SLASH, AT_THE_END)  # where the name of a column states their unit
 OF_TIME = re.compile(r"[mu]?s|sec|min|hr?|d|(second|minute|hour|day|week|year)s?", re.I)
 QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
 
+
+# A temperature in C or F is no charge or capacity.
+SCALES = {"C": "degC", "F": "degF", "deg C": "degC", "deg F": "degF"}
+TEMPERATURES = ("degC", "degF", "K")
 
 BASE = {
     "[mass]": "kg",
@@ -122,6 +128,8 @@ def convert(value: float | str, unit: str, where: str, *, difference: bool = Fal
 @cache
 def conversion(given: str, unit: str, where: str) -> Affine:
     """Return how values in the unit `given` become values in the model's unit."""
+    if unit in TEMPERATURES:
+        given = SCALES.get(given, given)
     if given == unit:
         return Affine()
     if (usual := USUAL.get((with_powers(given), unit))) is not None:
@@ -168,6 +176,15 @@ def parsed_unit(registry: Any, unit: str) -> Any:
     return registry.parse_units(with_powers(unit))
 
 
+def converts(given: str, unit: str) -> bool:
+    """Return whether numbers in a unit can be converted to another one."""
+    try:
+        conversion(given, unit, given)
+    except CaseError:
+        return False
+    return bool(given and unit)
+
+
 def unit_in(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
     """Return the unit in the name of a column; empty if none can be converted to `unit`."""
     for given in filter(None, (pattern.search(name) for pattern in patterns)):
@@ -175,7 +192,7 @@ def unit_in(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
         for text in (powers, given[1], powers.replace("_", "/")):  # L_s is L/s
             with suppress(CaseError):
                 conversion(text, unit, name)
-                return text
+                return SCALES.get(text, text) if unit in TEMPERATURES else text
     return ""
 
 
@@ -185,10 +202,10 @@ def other_time_unit(name: str, unit: str) -> str:
     >>> other_time_unit("time_min", "s"), other_time_unit("t [s]", "s")
     ('min', '')
     """
-    stated = (pattern.search(name) for pattern in (IN_BRACKETS, AT_THE_END))
+    stated = (pattern.search(name) for pattern in OF_TIMES)
     if not (unit and any(found and OF_TIME.fullmatch(found[1]) for found in stated)):
         return ""  # before pint is loaded
-    return other_unit(name, unit, IN_BRACKETS, AT_THE_END)
+    return other_unit(name, unit, *OF_TIMES)
 
 
 def other_unit(name: str, unit: str, *patterns: re.Pattern[str]) -> str:

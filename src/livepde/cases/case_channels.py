@@ -22,7 +22,7 @@ from livepde.observation.sensors import POSITION, shift_names
 from livepde.samples import Sample, by_name, noise_channel
 from livepde.stepping import Between
 from livepde.streams import Column
-from livepde.units import AFTER_A_WORD, IN_BRACKETS, conversion, other_unit
+from livepde.units import AFTER_A_WORD, AFTER_SLASH, IN_BRACKETS, conversion, other_unit
 
 # The first sample interpolated, under two names; or as if it were exact, and the lines between.
 EXACT = "interpolate-exact"
@@ -63,7 +63,7 @@ def _check_stated(case: CaseContent, name: str, unit: str) -> None:
     if channel.unit or channel.factor is not None:
         return
     for column in channel.sources:
-        if given := other_unit(column, unit, IN_BRACKETS, AFTER_A_WORD):
+        if given := other_unit(column, unit, IN_BRACKETS, AFTER_SLASH, AFTER_A_WORD):
             raise case.error(
                 f"channels.{name}.unit",
                 f"the name of the column '{column}' states the unit '{given}', which is not that "

@@ -23,7 +23,7 @@ from livepde.streams.cells import Missing, is_limit, is_missing, number_of
 from livepde.streams.clock import CALLED_TIME, ELAPSED, date_formats, elapsed_formats
 from livepde.streams.csvfile import Written, how_written
 from livepde.streams.table import JSON_LINES
-from livepde.units import AT_THE_END, IN_BRACKETS, conversion, unit_in
+from livepde.units import OF_TIMES, conversion, unit_in
 
 HOUR = re.compile(r"\d+:\d{2}(:\d{2}(\.\d+)?)?( ?[AaPp][Mm])?")
 ROW_NUMBER = re.compile(r"(id|idx|index|n|no|nr|num|number|row|rec|record|sample|#)\.?", re.I)
@@ -34,7 +34,8 @@ COUNTED = {
     "d since 1899-12-30": 36526.0,  # of Excel
 }
 LATEST = 2.7  # times the least number: the year 2051, or 2169 of Excel
-VALUES = {"number", "date"}  # kinds of cells that a header does not have
+DATED = re.compile(r"^t\b|time|date|datum|zeit|temps", re.I)
+VALUES = {"number", "date", "hour"}  # kinds of cells that a header does not have
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,9 +183,9 @@ def _sorted_out(
 
 def _unit_of_times(written: Written, name: str) -> str:
     """Return the unit of a column of numbers, perhaps with the date since which they count."""
-    if found := unit_in(name, "s", IN_BRACKETS, AT_THE_END):
+    if found := unit_in(name, "s", *OF_TIMES):
         return found
-    values, named = _values(name, written), CALLED_TIME.match(name)
+    values, named = _values(name, written), DATED.search(name)
     for unit, least in COUNTED.items() if named else ():
         if ((values >= least) & (values < LATEST * least)).all():
             return unit
@@ -219,7 +220,7 @@ def _kinds(table: Path, written: Written, form: str) -> dict[str, str]:
 
 
 def _kind(cell: str, decimal: str, form: str) -> str:
-    if number_of(cell, decimal) is not None or is_limit(cell, decimal):
+    if number_of(cell, decimal) is not None or is_limit(cell):
         return "number"
     if Clock("").stamp(cell, form) is not None or Clock("").stamp(cell) is not None:
         return "date"
@@ -255,7 +256,7 @@ def _most_like_times(numbers: Sequence[str], hours: Sequence[str], written: Writ
     `hours`: columns such as 0:10:00, which are times if they are elapsed times. Besides times of
     day, numbers are times only if their name says so.
     """
-    timed = [name for name in numbers if unit_in(name, "s", IN_BRACKETS, AT_THE_END)]
+    timed = [name for name in numbers if unit_in(name, "s", *OF_TIMES)]
     values = {name: _values(name, written) for name in numbers}
     rising = [name for name, found in values.items() if (found[:-1] < found[1:]).all()]
     both = [name for name in timed if name in rising]

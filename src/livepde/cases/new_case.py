@@ -7,7 +7,7 @@ import re
 import string
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import groupby
 from pathlib import Path
@@ -23,7 +23,7 @@ from livepde.errors import RunError
 from livepde.linalg import Array
 from livepde.models import EQUATIONS, Equation, Variable
 from livepde.streams.oddities import sentinels, switches
-from livepde.units import IN_BRACKETS, unit_in
+from livepde.units import AFTER_SLASH, IN_BRACKETS, Affine, conversion, converts, in_si, unit_in
 
 SCHEMA_FILE = "livepde.schema.json"  # beside a case that `livepde init` writes
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -66,6 +66,7 @@ PLACE = re.compile(r"(?<![\d.,-])(\d+(?:[.,]\d+)?)[ _]?(mm|cm|m|ft)(?![A-Za-z\d/
 FRACTION = re.compile(r"\d+\.\d+")  # T_0.05
 # Q_W, T_5cm degF, T_1 degF
 SUFFIX = re.compile(r"(?:(?<=\w)_|(?<=[^\W\d]) |(?<=\d) (?=deg))(?P<unit>[A-Za-z]\w*)$")
+LAST = re.compile(r"_(?P<unit>[A-Za-z][A-Za-z0-9]*)$")  # T_air_degF
 NO_UNITS = {*string.ascii_letters, "in"}  # at the end of a sensor's name: T_K, T_in
 NUMBERED = re.compile(r"(.*?)(\d+)")  # u_17
 PLACES = "places.csv"  # the table of positions that is written beside the case
@@ -301,6 +302,9 @@ def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
             found.append(_input(table, entry, name, inputs.pop(entry).unit))
         else:
             found.append(_sensor(equation, label, name, values))
+    found = [_by_unit(table, item, found, inputs) for item in found]
+    for item in found:
+        inputs.pop(item.name, None)
     there = {item.name for item in found if not item.is_sensor}
     chosen = equation.alternatives.get(_alternative(equation, there), ())
     lacking = [
@@ -309,6 +313,23 @@ def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
         if not variable.optional or name in chosen
     ]
     return [*_in_families(equation, found), *lacking]
+
+
+def _by_unit(
+    table: Measured, item: FoundChannel, others: list[FoundChannel], inputs: Mapping[str, Variable]
+) -> FoundChannel:
+    """Return a column as the input that it may be: the only one, and only it, of this unit."""
+
+    def fits(one: FoundChannel, variable: Variable) -> bool:
+        unit = str(one.given.get("unit", ""))
+        return unit.startswith(BLANK) and converts(unit.removeprefix(BLANK).strip(), variable.unit)
+
+    needed = {name: variable for name, variable in inputs.items() if not variable.optional}
+    names = [name for name, variable in needed.items() if fits(item, variable)]
+    if len(names) != 1 or sum(fits(other, needed[names[0]]) for other in others) != 1:
+        return item
+    found = _input(table, names[0], item.columns[0], needed[names[0]].unit)
+    return replace(found, told=f"{found.told}, by its unit")
 
 
 def _labels(columns: Iterable[str]) -> list[str]:
@@ -344,7 +365,9 @@ def _input_of(column: str, inputs: Mapping[str, Variable]) -> str:
 
 def _stated(name: str, unit: str) -> str:
     """Return the unit that the name of a column states; empty if it is the model's, or none."""
-    found = unit_in(name, unit, IN_BRACKETS) or unit_in(IN_BRACKETS.sub("", name), unit, SUFFIX)
+    found = unit_in(name, unit, IN_BRACKETS, AFTER_SLASH) or unit_in(
+        IN_BRACKETS.sub("", name), unit, SUFFIX
+    )
     stated = IN_BRACKETS.search(name)
     if not found and stated and unit:  # without a unit of the model all numbers are as they are
         found = f"{BLANK} {stated[1]}"
@@ -369,18 +392,32 @@ def _sensor(equation: Equation, key: str, name: str, values: Array) -> FoundChan
         given["of"] = equation.components[0]
         told.append(f"of {' or '.join(equation.components)}")
     unit = _unit_of_sensor(name, equation.state.unit)
-    given |= {"unit": unit} if unit not in ("", equation.state.unit) else {}
+    stated = unit.removeprefix(BLANK).strip()
+    flux = equation.fluxes.flux if equation.fluxes and equation.conductivity else ""
+    if unit.startswith(BLANK) and flux and converts(stated, flux):
+        given["quantity"] = "flux"
+        told.append('flux along x, at an end: at = "left" or "right"')
+        given |= {"unit": stated} if conversion(stated, flux, name) != Affine() else {}
+        return FoundChannel(key, given, (name,), ", ".join(told))
+    model = equation.state.unit
+    same = converts(unit, model) and conversion(unit, model, name) == Affine()  # °C
+    given |= {"unit": unit} if unit and not same else {}
     return FoundChannel(key, given, (name,), ", ".join(told))
 
 
 def _unit_of_sensor(name: str, unit: str) -> str:
     """Return the unit that the name of a sensor's column states; empty if it states none."""
-    stated, suffix = IN_BRACKETS.search(name), SUFFIX.search(name)
+    stated = IN_BRACKETS.search(name)
     if stated and not PLACE.fullmatch(stated[1].strip()):
         return unit_in(name, unit, IN_BRACKETS) or (f"{BLANK} {stated[1]}" if unit else "")
-    if not stated and suffix and suffix["unit"] not in NO_UNITS:
-        return unit_in(name, unit, SUFFIX)  # T_in_degF
-    return ""
+    if slash := AFTER_SLASH.search(name):
+        known = in_si(slash[1]) is not None
+        return unit_in(name, unit, AFTER_SLASH) or (f"{BLANK} {slash[1]}" if unit and known else "")
+    if stated:
+        return ""
+    suffixes = ((pattern, pattern.search(name)) for pattern in (SUFFIX, LAST))
+    named = (one for one, suffix in suffixes if suffix and suffix["unit"] not in NO_UNITS)
+    return next(filter(None, (unit_in(name, unit, pattern) for pattern in named)), "")
 
 
 def _in_families(equation: Equation, found: list[FoundChannel]) -> list[FoundChannel]:

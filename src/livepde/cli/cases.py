@@ -134,12 +134,14 @@ def _channel_row(
 ) -> tuple[Any, ...]:
     """Return columns, role, name, unit, range and number of missing values of a channel."""
     role, given = item.given["role"], item.given.get("unit", "")
-    state = equation.inputs[item.name] if role == "input" else equation.state
+    model = (equation.inputs[item.name] if role == "input" else equation.state).unit
+    if item.given.get("quantity") == "flux" and equation.fluxes is not None:
+        model = equation.fluxes.flux
     block = np.array([read.columns[name] for name in item.columns])
     first, *rest = item.columns or ("?",)
     columns = f"{first} ... {rest[-1]}" if rest else first
     *ends, gaps = extent(block)
-    return columns, role, item.name, given or state.unit, *ends, gaps if item.columns else ""
+    return columns, role, item.name, given or model, *ends, gaps if item.columns else ""
 
 
 def equations(

@@ -37,10 +37,10 @@ def has_decimal_comma(cell: Any) -> bool:
     return isinstance(cell, str) and "," in cell and number_of(cell, ",") is not None
 
 
-def is_limit(cell: str, decimal: str = ".") -> bool:
+def is_limit(cell: str) -> bool:
     """Return whether a text is a limit that a reading was below or above, such as <0.5."""
     found = LIMIT.fullmatch(cell)
-    return found is not None and number_of(found[1], decimal) is not None
+    return found is not None and number_of(found[1].replace(",", ".")) is not None
 
 
 def is_missing(cell: Any, missing: Missing = ()) -> bool:
