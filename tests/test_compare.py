@@ -19,7 +19,7 @@ from factories import short_rod
 from benchmarks.first_hour import FOLDER
 from livepde import cases
 from livepde.cases.case import with_members
-from livepde.cases.read import apply, filled, parse, read_toml
+from livepde.cases.read import _with, apply, filled, parse, read_toml
 from livepde.cases.remedies import NO_SETTING, freed, with_settings
 from livepde.cases.variants import (
     LastEstimate,
@@ -655,6 +655,15 @@ def test_a_setting_adds_an_unknown_only_as_a_whole(tmp_path):
     assert "source" in cases.load(path, settings=whole).model.parameter_space.labels
     with pytest.raises(CaseError, match="to add it, set all of it"):
         cases.load(path, settings={"unknowns.sorce.std": "1e-3 K/s"})
+
+
+def test_a_key_that_is_new_among_dotted_keys_has_its_own_line():
+    text = 'unknowns.alpha = { prior = 1 }  # told\noptions.C = 2\nlaw = { noise = 1 }\n'
+    given = {"unknowns.loss": {"prior": 3}, "options.H": 4, "unknowns.alpha.prior": 5}
+    for key, value in given.items():
+        once = _with(text, key.split("."), value)
+        assert read_toml(once, "") == apply(read_toml(text, ""), {key: value}, "")
+        assert once.count("# told\n") == 1
 
 
 # --- what an equation leaves out while a process begins ------------------------------------------

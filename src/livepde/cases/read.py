@@ -478,5 +478,6 @@ def _with(text: str, path: Sequence[str], value: Any) -> str:
     if value is None:
         here.pop(name, None)
     else:
-        here[name] = tomlkit.parse(toml_line("x", value))["x"]
+        # With the end of its line: a key that is new among dotted ones has none otherwise.
+        here[name] = tomlkit.parse(f"{toml_line('x', value)}\n")["x"]
     return tomlkit.dumps(document)
