@@ -18,6 +18,7 @@ from benchmarks.first_hour import TABLES, save
 from benchmarks.user_jobs.data import JOBS
 from benchmarks.wrong_channels import Fault, with_fault
 from livepde.cases.case import load
+from livepde.laws.column_errors import UNITS, units_of
 from livepde.verdict import Cause, Finding, Verdict
 
 LENGTH, CELLS, FINE = 0.1, 120, 10
@@ -374,3 +375,9 @@ def test_columns_that_were_right_for_long_are_not_wrong_from_the_start(since: in
         identifier.step(*sample)
     first = float(identifier._state.trial[0, 0, 0])
     assert first == 0.0 if since == 60 else first >= STEP * since
+
+
+def test_a_flux_is_in_no_unit_of_temperature():
+    named = {unit: {UNITS[k].name for k in units_of(unit, scaled=True)} for unit in ("K", "W/m^2")}
+    assert named == {"K": {"", "degC", "degF", "K"}, "W/m^2": {""}}
+    assert all(UNITS[k].name for k in units_of("degC", scaled=False))

@@ -379,6 +379,13 @@ def test_a_cause_that_no_setting_frees_says_so(tmp_path):
     assert with_settings(prepared, once) == once
 
 
+@pytest.mark.parametrize(("unit", "there"), [("degF", True), ("W/m^2", False)])
+def test_a_column_is_not_read_in_the_unit_of_another_quantity(tmp_path, unit, there):
+    prepared = cases.load(short_rod(tmp_path)).prepare()
+    setting = f'channels.T_10.unit="{unit}"'
+    assert freed(prepared, Cause("unit", "T_10", "", setting=setting)) == (setting,) * there
+
+
 def test_exchanged_columns_are_exchanged_by_settings(tmp_path):
     """The law names channels; their columns have other names."""
     path = short_rod(tmp_path)

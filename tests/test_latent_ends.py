@@ -169,3 +169,13 @@ law.kind = "sensitivity"
     )
     unknowns = cases.load(path).model.parameter_space.unknowns
     assert [unknowns[name].within for name in ("alpha", "source")] == [4.0, 10.0]
+
+
+def test_an_interval_at_a_bound_is_the_half_within():
+    rng = np.random.default_rng(1)
+    given = [(t, z + NOISE * rng.standard_normal(2)) for t, z in stream(np.linspace(0.5, 3.0, 40))]
+    last = run(source(lp.Scalar(lp.Normal(0.0, 0.1), within=5.0)), given, u0=0.0).last
+    assert last is not None and last.verdict.errors is not None  # noqa: PT018  for the types
+    one = last.verdict.errors["v"]
+    assert one.value == one.high == pytest.approx(0.5)
+    assert one.low < one.plain_low < one.high

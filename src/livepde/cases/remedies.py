@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from livepde.cases.process import prior_of
 from livepde.cases.read import settings_in, toml_key, toml_value
+from livepde.errors import CaseError
 from livepde.laws import SensitivityLaw
 from livepde.linalg import Array
 from livepde.samples import by_name
@@ -220,13 +221,28 @@ def usual_shift(prepared: Prepared, name: str) -> float:
 
 
 def _stated(case: Case, cause: Cause) -> tuple[str, ...]:
-    """Return the settings of a cause; none that would replace what the case states."""
+    """Return the settings of a cause; none that would replace what the case states.
+
+    None either with a unit of another quantity: the law does not know the unit of each input.
+    """
     channel, settings = case.spec.channels.get(cause.subject), settings_in(cause.setting)
     keys = [setting.partition("=")[0].rpartition(".")[2] for setting in settings]
+    if channel is not None and keys == ["unit"] and not _convertible(case, cause.subject, settings):
+        return ()
     taken = [key for key in keys if key in STATED and getattr(channel, key, None) is not None]
     # A case needs a sensor: the only one cannot be left out.
     only = "role" in keys and list(case.roles("sensor")) == [cause.subject]
     return () if taken or only else settings
+
+
+def _convertible(case: Case, name: str, settings: Sequence[str]) -> bool:
+    """Return whether a channel can be read in the unit of a setting."""
+    (channel,) = tomllib.loads("\n".join(settings))["channels"].values()
+    try:
+        conversion(channel["unit"], case.unit(name), name)
+    except CaseError:
+        return False
+    return True
 
 
 def _exchanged(prepared: Prepared, cause: Cause) -> tuple[str, ...]:

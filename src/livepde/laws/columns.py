@@ -12,15 +12,14 @@ and the cost falls by (g r)^2 / (2 (g g - h H^-1 h)). The most promising errors 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, combinations
-from typing import NamedTuple
 
 import numpy as np
 
 from livepde.fem import Channel
+from livepde.laws.column_errors import UNITS, Error, cause_of, units_of
 from livepde.laws.filter_state import FilterState, unaccompanied
 from livepde.laws.gate import Gate, near_most, near_neighbours
 from livepde.laws.history import intervals_since
@@ -31,9 +30,8 @@ from livepde.laws.sensitivity_state import MOST_TRIED, SensitivityState, Sensiti
 from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.linalg.member_arrays import changed
-from livepde.verdict import Cause, channel_setting
+from livepde.verdict import Cause
 from livepde.verdict.directions import boundary_lifts
-from livepde.verdict.sentences import clause, estimating, table_of, width
 
 FEWEST_ROWS, FEWEST_READINGS = 20, 40
 MOST_WORK = 4e8  # coefficients of states that all passes may compute
@@ -57,56 +55,6 @@ MOST_FOLLOWED, MOST_STEPS = 300, 20_000
 SOME, NAMED = 0.1, 3
 LAGS = 16  # passes of a search for a longer lag, at most
 SLIGHT_LAG = 0.02  # share that a lag of one sample has to explain before longer ones are tried
-TEMPERATURES = ("degC", "degF", "K")
-
-
-class Unit(NamedTuple):
-    """A unit that a column may have."""
-
-    # The unit, and the expected one; empty if they are not known.
-    name: str
-    expected: str
-    # Of the conversion of its values.
-    factor: float
-    constant: float
-    # How many times too large or too small its values are; NaN where only their sign is turned.
-    times: float = np.nan
-
-
-UNITS: tuple[Unit, ...] = (
-    Unit("degF", "degC", 1.0 / 1.8, -32.0 / 1.8),
-    Unit("degC", "degF", 1.8, 32.0),
-    Unit("K", "degC", 1.0, -273.15),
-    Unit("degC", "K", 1.0, 273.15),
-    Unit("", "", -1.0, 0.0),  # counted in the other direction
-    *(
-        Unit("", "", power, 0.0, times)
-        for times in (10.0, 100.0, 1000.0, 60.0, 3600.0, 3.6)
-        for power in (1.0 / times, times)
-    ),
-)
-
-
-@dataclass(frozen=True)
-class Error:
-    """An error of a column, or of two."""
-
-    kind: str  # "offset", "gain", "lag", "unit" or "exchange"
-    names: tuple[str, ...]  # the columns
-    # Of an offset in the unit of the column, of a gain as a factor less one, of a lag in time.
-    size: float = 0.0
-    unit: int = 0  # number in `UNITS`
-
-    @property
-    def numbers(self) -> int:
-        """How many numbers of it are free."""
-        return int(self.kind in ("offset", "gain", "lag"))
-
-    @property
-    def correction(self) -> tuple[float, float]:
-        """Factor and constant with which the values of a gain, or in a unit, are right."""
-        unit = UNITS[self.unit]
-        return (1.0 / (1.0 + self.size), 0.0) if self.numbers else (unit.factor, unit.constant)
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,6 +187,12 @@ class Columns:
             return observed.unit
         return dict(zip(observed.names, observed.units, strict=True)).get(name, "")
 
+    def cause(self, error: Error, share: float) -> Cause:
+        """Return an error that explains a share of the misfit as a cause."""
+        problem, first = self.work.filter.problem, error.names[0]
+        of_sensor, time_unit = first in problem.observed.names, problem.model.time_unit
+        return cause_of(error, share, self.unit(first), time_unit, of_sensor=of_sensor)
+
     @property
     def pairs(self) -> Iterator[tuple[str, str]]:
         """Columns that may have been exchanged: of another kind they have nothing in common."""
@@ -349,7 +303,7 @@ def likely_columns(columns: Columns, least: float) -> list[Cause]:
     close = min(CLOSE, SLIGHT * noise / misfit)
     kept = search.explaining(tried, close, lambda cost: 1.0 - (2.0 * cost - noise) / misfit)
     kept.sort(key=lambda item: close * item[1].numbers - item[0])
-    return [_cause(columns, error, share) for share, error in kept if share > 0.0]
+    return [columns.cause(error, share) for share, error in kept if share > 0.0]
 
 
 class _Trials:
@@ -432,7 +386,8 @@ class _Trials:
         values = self.columns.column(name)
         middle = float(values.mean())
         there = np.isfinite(base.one.residuals)
-        for number, (_, _, factor, constant, _) in enumerate(UNITS):
+        for number in units_of(self.columns.unit(name), scaled=True):
+            _, _, factor, constant, _ = UNITS[number]
             # values - offset, then divided by 1 + gain: to first order in the change of the column.
             change = (factor * middle + constant) - middle
             g = -change * slopes["offset"]
@@ -448,12 +403,10 @@ class _Trials:
 
     def _sensor_units(self, base: _Fit, name: str) -> Iterator[tuple[float, Error]]:
         """Iterate over the same of a sensor: the trajectory is the same."""
-        expected = self.columns.unit(name)
-        for number, unit in enumerate(UNITS):
-            # A case may have stated the wrong one of two units of temperature.
-            if unit.name in TEMPERATURES or expected not in TEMPERATURES:
-                error = Error("unit", (name,), unit=number)
-                yield base.cost - _Fit.about(self._seen(base, error)).cost, error
+        # A case may have stated the wrong one of two units of temperature.
+        for number in units_of(self.columns.unit(name), scaled=False):
+            error = Error("unit", (name,), unit=number)
+            yield base.cost - _Fit.about(self._seen(base, error)).cost, error
 
     def _seen(self, base: _Fit, error: Error) -> Passed:
         """Return the same trajectory as other sensors show it, with the noise of their columns."""
@@ -563,7 +516,7 @@ def _likely_filtered(columns: Columns, least: float) -> list[Cause]:
     lags = sorted(lags, key=lambda lag: -lag.of(lag.first))[: TRIED["lag"]]
     kept += [lag.best for lag in lags if lag.of(lag.first) > SLIGHT_LAG]
     kept = sorted((one for one in kept if one[0] > SOME), key=lambda one: -one[0])[:NAMED]
-    return [_cause(columns, error, found) for found, error in kept]
+    return [columns.cause(error, found) for found, error in kept]
 
 
 @dataclass(frozen=True, eq=False)
@@ -642,49 +595,3 @@ def _noise(residuals: Array) -> float:
         if len(r) > 1:
             total += len(r) * 0.5 * float((np.diff(r) ** 2).mean())
     return total
-
-
-def _cause(columns: Columns, error: Error, share: float) -> Cause:
-    kind, first, size, unit = error.kind, error.names[0], error.size, columns.unit(error.names[0])
-    problem, (factor, _) = columns.work.filter.problem, error.correction
-    time_unit, of_sensor = problem.model.time_unit, first in problem.observed.names
-    variant, positive = kind, size > 0
-    more: dict[str, object] = {"other": error.names[-1], "table": table_of(first)}
-    if kind == "unit":
-        variant, positive = _unit_variant(error), factor < 1.0
-        other = UNITS[error.unit]
-        more |= {"unit": other.name, "expected": other.expected, "factor": other.times}
-        more |= {"correction": f"{factor:.6g}"}
-    text, remedy = clause(
-        variant, first, size, time_unit if kind == "lag" else unit, positive=positive, **more
-    )
-    if kind == "offset" and of_sensor:
-        remedy = estimating(kind, first, width(size, unit))
-    setting = _setting(error, variant, time_unit, of_sensor=of_sensor)
-    known = float("nan") if error.kind in ("unit", "exchange") else size
-    return Cause(error.kind, first, text, float(min(share, 1.0)), remedy, setting, known)
-
-
-def _setting(error: Error, variant: str, time_unit: str, *, of_sensor: bool) -> str:
-    """Return the settings of a case that correct a column; empty if there are none."""
-    first, size, factor = error.names[0], error.size, f"{error.correction[0]:.6g}"
-    if error.kind == "exchange":
-        pairs = (error.names, error.names[::-1])
-        return "; ".join(channel_setting(one, "column", json.dumps(other)) for one, other in pairs)
-    keys = {
-        "gain": ("factor", factor),
-        "lag": ("late", f'"{size:.4g} {time_unit}"' if time_unit else f"{size:.4g}"),
-        "unit": ("unit", f'"{UNITS[error.unit].name}"'),
-        "factor": ("factor", factor),
-        "sign": ("factor", factor),
-    }
-    if of_sensor:
-        keys["offset"] = ("offset", f"{2.0 * abs(size):.2g}")
-    return channel_setting(first, *keys[variant]) if variant in keys else ""
-
-
-def _unit_variant(error: Error) -> str:
-    """Return whether a column is in a unit that is known, has another sign, or another factor."""
-    if UNITS[error.unit].name:
-        return "unit"
-    return "sign" if error.correction[0] < 0.0 else "factor"

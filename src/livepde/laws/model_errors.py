@@ -310,8 +310,12 @@ def _allowed(
     for name, item in latent.parts.items():
         if isinstance(item.unknown, Scalar) and item.unknown.corrects:  # an input
             own.add(name)
-    known = filter_.estimate(x)[0]
-    both = (known, *ends, known - QUANTILE * std, known + QUANTILE * std)
+    known = reduction.bounded(filter_.estimate(x)[0])
+    # An interval about a value beyond a bound is one about the bound: the half within it is left.
+    middle = 0.5 * (ends[0] + ends[1])
+    beyond = reduction.bounded(middle) - middle
+    wide = (ends[0] + beyond, ends[1] + beyond)
+    both = (known, *wide, known - QUANTILE * std, known + QUANTILE * std)
     value, low_end, high_end, plain_low, plain_high = (
         latent.value(reduction.bounded(one)) for one in both
     )
