@@ -26,6 +26,7 @@ from livepde.cases.remedies import (
     usual_shift,
     with_settings,
 )
+from livepde.cases.set_aside import with_errors_of_set_aside
 from livepde.dates import since_1970
 from livepde.errors import CaseError, ModelError
 from livepde.plots.style import modes_told
@@ -292,7 +293,8 @@ def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun
     labels, fields = scalars(data), prepared.case.model.parameter_space.fields
     raw = prepared.raw
     sampled = sampling_findings(data, None if raw is None else lambda: (raw.t, raw.values))
-    found = with_settings(prepared, verdict(data).with_findings(sampled))
+    found = with_errors_of_set_aside(prepared, data, verdict(data).with_findings(sampled))
+    found = with_settings(prepared, found)
     errors = found.errors
     modes = [modes_told(data, name)[1] for name in fields if f"{name}_modes" in data]
     used = data["time"].values >= prepared.assimilate_from

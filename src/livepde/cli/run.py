@@ -25,6 +25,7 @@ from rich.markup import escape
 from livepde import __version__, runs
 from livepde.cases import Case, LiveCase, Prepared
 from livepde.cases.remedies import after_gaps, start_missed, with_settings
+from livepde.cases.set_aside import with_errors_of_set_aside
 from livepde.cli import options, printing
 from livepde.errors import ConfigurationError, DataError, LivepdeError
 from livepde.estimate import Estimate
@@ -313,6 +314,7 @@ def _judged(prepared: Prepared, driven: Driven, dataset: xr.Dataset) -> Verdict:
     inputs = runs.input_findings(journal, prepared.case.roles("boundary", "input"))
     found = [*runs.sampling_findings(dataset, readings), *runs.clock_findings(journal), *inputs]
     verdict = after_gaps(runs.verdict(dataset).with_findings(found), inputs)
+    verdict = with_errors_of_set_aside(prepared, dataset, verdict)
     return with_settings(prepared, verdict.with_findings(start_missed(prepared, verdict)))
 
 
