@@ -224,6 +224,23 @@ def test_causes_that_the_data_cannot_distinguish_widen_the_intervals():
     assert recommended(base, [first, agreed, refuted]) is first
 
 
+def test_a_usable_variant_that_explains_the_data_worse_is_not_trusted():
+    base = ended("as stated", 0.0, math.nan)
+    usable, other = ended("usable", 60.0, math.nan), ended("other", 55.0, math.nan)
+    useless = Verdict.of([Finding("held", "do not trust", "Held.")]).to_dict()
+    ahead = replace(ended("ahead", 500.0, math.nan), verdict=useless)
+    best = recommended(base, [usable, ahead, other])
+    assert (best.variant, best.level, best.better) == (usable.variant, "caution", ("ahead",))
+    notes = conclusions(base, [usable, ahead, other])
+    assert "verdict 'caution'" in notes[0]
+    assert "The data fit 'ahead' better, by up to 440 of log evidence" in notes[1]
+    near = replace(ahead, log_evidence=62.0)
+    assert recommended(base, [usable, near]) is usable
+    alone = recommended(base, [ahead])
+    assert (alone.variant, alone.level, alone.better) == (base.variant, "caution", ("ahead",))
+    assert "the case, unchanged. No usable variant" in conclusions(base, [ahead])[0]
+
+
 def test_an_unknown_that_depends_on_the_variant_is_named():
     near, far = LastEstimate(1.0, 0.1, 0.8, 1.2), LastEstimate(2.0, 0.1, 1.8, 2.2)
     base = ended("as stated", 10.0, 1.0, estimates={"k": near, "c": near})
@@ -621,13 +638,14 @@ def test_the_loss_of_a_column_is_its_decay(tmp_path):
 def test_estimates_of_a_recommended_variant_that_is_not_trusted_are_not_to_be_used():
     unusable = Verdict.of([Finding("misfit", "do not trust", "It misfits.")]).to_dict()
     estimate = {"k": LastEstimate(1.0, 0.1, 0.8, 1.2)}
-    base = ended("as stated", 10.0, math.nan, estimates=estimate)
+    sound = ended("as stated", 10.0, math.nan, estimates=estimate)
+    base = replace(sound, verdict=unusable)
     best = replace(ended("best", 50.0, math.nan, estimates=estimate), verdict=unusable)
     said = " ".join(conclusions(base, [best]))
     assert "Recommended: 'best'" in said
     assert "Do not use its estimates: no variant explains the data." in said
     assert "All variants agree" not in said
-    usable = replace(best, verdict=base.verdict)
+    usable = replace(best, verdict=sound.verdict)
     assert "All variants agree" in " ".join(conclusions(base, [usable]))
 
 

@@ -114,12 +114,17 @@ class VariantRun:
     unknowns: int = 0  # numbers, and modes of fields
     # Variants that fit as well with other values; the intervals contain theirs.
     rivals: tuple[str, ...] = ()
+    # Variants with strong evidence against this one, of which none is usable, the best first.
+    better: tuple[str, ...] = ()
 
     @property
     def level(self) -> str:
-        """Level of the verdict, at most "caution" with rivals; "failed" of a run that failed."""
+        """Level of the verdict; "failed" of a run that failed.
+
+        It is at most "caution" where other variants fit as well or better.
+        """
         level = "failed" if self.error else str(self.verdict["level"])
-        return "caution" if self.rivals and level == "trusted" else level
+        return "caution" if (self.rivals or self.better) and level == "trusted" else level
 
     @property
     def failed(self) -> bool:
@@ -189,6 +194,7 @@ class VariantRun:
             "validation_error": _known(self.validation_error),
             "unknowns": self.unknowns,
             "rivals": list(self.rivals),
+            "better": list(self.better),
             "estimates": {
                 name: {key: _known(value) for key, value in vars(one).items()}
                 for name, one in self.estimates.items()
@@ -352,9 +358,11 @@ def recommended(base: VariantRun, others: Sequence[VariantRun]) -> VariantRun:
     """Return the variant with the best evidence that predicts the validation sensors no worse.
 
     Among variants of similar evidence it is the one with the fewest unknowns, and a usable one goes
-    first. It is the case itself if none has strong evidence against it, or if their fits fail and
-    its own does not. Variants of similar evidence that exclude its estimates are its rivals: which
-    one is right the data cannot tell, as a scale of one of two sensors.
+    first. It is the case itself if none has strong evidence against it, or if none of those can be
+    used and it can. Variants of similar evidence that exclude its estimates are its rivals: which
+    one is right the data cannot tell, as a scale of one of two sensors. Variants that cannot be
+    used may yet explain the data better: then the recommended one is not trusted, as it lacks
+    something, too.
     """
     strong = [
         (gained, one)
@@ -364,12 +372,17 @@ def recommended(base: VariantRun, others: Sequence[VariantRun]) -> VariantRun:
     ]
     if not strong:
         return base
-    usable = [(gained, one) for gained, one in strong if one.level in USABLE] or strong
+    usable = [(gained, one) for gained, one in strong if one.level in USABLE]
+    if not usable:
+        usable = [(0.0, base)] if base.level in USABLE else strong
     best, _ = max(usable, key=itemgetter(0))
     near = [(one.unknowns, -gained, one) for gained, one in usable if gained > best - GAINED]
     chosen: VariantRun = min(near, key=itemgetter(0, 1))[-1]
     rivals = [one for *_, one in near if one.apart(chosen)]
-    return chosen.beside(rivals) if rivals else chosen
+    ahead = sorted(strong, key=itemgetter(0), reverse=True)
+    better = tuple(one.variant.name for gained, one in ahead if gained > best + GAINED)
+    found = chosen.beside(rivals) if rivals else chosen
+    return replace(found, better=better) if better else found
 
 
 def _worse_sensors(one: VariantRun, base: VariantRun) -> list[str]:
@@ -395,15 +408,17 @@ def conclusions(base: VariantRun, others: Sequence[VariantRun]) -> list[str]:
         remarks = iter(())
     failed = _names_of(one for one in others if one.error)
     why = [f"Not compared, because they failed: {failed}."] if failed else []
-    return [text, *_equals(best, others), *why, *remarks, *_disagreements(best, [base, *others])]
+    equals = (*_equals(best, others), *_better(best, base, others))
+    return [text, *equals, *why, *remarks, *_disagreements(best, [base, *others])]
 
 
 def _recommendation(base: VariantRun, best: VariantRun) -> str:
-    if best is base:
+    if best.variant == base.variant:
         which = " that predicts the validation sensors as well" if base.validation else ""
+        usable = "usable " if best.better else ""
         return (
-            f"Recommended: the case, unchanged. No variant{which} gains more than {GAINED:g} of "
-            "log evidence."
+            f"Recommended: the case, unchanged. No {usable}variant{which} gains more than "
+            f"{GAINED:g} of log evidence."
         )
     text = (
         f"Recommended: '{best.variant.name}'. Its log evidence is {best.gained(base):.4g} larger "
@@ -431,6 +446,20 @@ def _equals(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
         f"These data cannot distinguish it from {names}, with other values of {differ}. The "
         "intervals of the recommended variant contain theirs. A run of it alone has narrower "
         "intervals: find out which variant is right before you use them."
+    )
+
+
+def _better(best: VariantRun, base: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
+    """Iterate over the sentence on variants that explain the data better, but cannot be used."""
+    if not best.better:
+        return
+    names = ", ".join(f"'{name}'" for name in best.better)
+    first = next(one for one in others if one.variant.name == best.better[0])
+    more = first.gained(base) - best.gained(base)
+    yield (
+        f"The data fit {names} better, by up to {more:.4g} of log evidence, but those estimates "
+        f"cannot be used (verdict '{first.level}'). The recommended variant is thus not the whole "
+        "explanation: look for another cause before you use its estimates."
     )
 
 

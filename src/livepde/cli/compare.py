@@ -116,7 +116,7 @@ def compare(
     found += _all(run, chosen, jobs, as_json)
     best = recommended(base, found)
     notes = conclusions(base, found)
-    found = [best if one.variant == best.variant else one for one in found]
+    base, *found = (best if one.variant == best.variant else one for one in (base, *found))
     if write is not None:
         notes.append(_written(write, case, settings, best.variant, data, allow_code))
     if figure is not None:
