@@ -235,8 +235,8 @@ def _lacking(log: Array, sensors: int, most: int) -> str:
 
 def _most_rows(work: SensitivityWork, columns: int, inputs: int) -> int:
     """Return how many samples all passes can afford, with so many columns and inputs of them."""
-    # At two places: three errors of each input, and all exchanges with an input.
-    passes = 2 * inputs * (3 + columns) + PASSES * ROUNDS * sum(TRIED.values())
+    # At two places: errors of each input, a search for its lag, and all exchanges with an input.
+    passes = 2 * inputs * (3 + columns + LAGS) + PASSES * ROUNDS * sum(TRIED.values())
     most = MOST_TRIED
     if work.filter.moves:  # units, exchanges, and lags of one sample and of more
         passes = columns * (5 + columns // 2) + LAGS * TRIED["lag"]
@@ -355,6 +355,9 @@ class _Trials:
             each += [("gain", STEP), ("lag", columns.interval)]
         slopes: dict[str, Array] = {}
         for kind, step in each:
+            if kind == "lag" and name in self.columns.inputs and self.columns.whole(name):
+                yield self._switched_late(base, name)
+                continue
             g = self._change(base, Error(kind, (name,), step))
             if g is None:
                 continue
@@ -367,6 +370,20 @@ class _Trials:
                 yield from self._units(base, name, slopes)
             else:
                 yield from self._sensor_units(base, name)
+
+    def _switched_late(self, base: _Fit, name: str) -> tuple[float, Error]:
+        """Return how late an input is that is held, and by how much that lowers the cost.
+
+        A switch has no derivative in time that would say how far it is to go.
+        """
+        columns = self.columns
+
+        def gained(error: Error) -> float:
+            one = columns.samples(error).about(base.one.xi)
+            return -np.inf if one is None else base.cost - _Fit.about(one).cost
+
+        longest = int(LONGEST * columns.state.log.shape[1])
+        return _Lag(name, columns.interval, longest, gained).best
 
     def _bounded(self, kind: str, name: str, theta: float) -> float:
         columns = self.columns

@@ -404,15 +404,19 @@ def _trial(
     """Return the fields of the samples for trials of columns of one member, after one more.
 
     Where constant unknowns are fitted, the samples of the fit serve as well, unless a disturbance
-    comes early: it may be a wrong column, and then the state after it is wrong, too.
+    comes that may be a wrong column: then the state after it is wrong, too. It is one if it comes
+    early, or where an input switches, which shows that it is late at its switches alone.
     """
     before, start = state.trial, state.trial_start
     if not before.shape[1]:
         before = state.log[:, int(state.window[0]) :]
         if work.fits:
-            if not (disturbed and before.shape[1] <= EARLY):
+            late = before.shape[1] > EARLY and not work.filter.problem.control.held
+            if late or not disturbed:
                 return {}
-            start = state.start
+            before, start = before[:, : work.tried], state.start
+            if before.shape[1] == work.tried:
+                return {"trial": before, "trial_start": start}
     full = before.shape[1] >= work.tried
     if full or (before.shape[1] and not before[0, -1, 0] < span.t1):  # or it is taken again
         return {}
