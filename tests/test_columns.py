@@ -27,12 +27,18 @@ PLACES = {"TC2": 0.02, "TC3": 0.05, "TC4": 0.08}
 
 
 @cache
-def bar(seed: int) -> tuple[float, dict[str, Any]]:
-    """Return the diffusivity of a bar, and its five columns: finite volumes, Crank-Nicolson."""
+def bar(seed: int, long: float = 0.0) -> tuple[float, dict[str, Any]]:
+    """Return the diffusivity of a bar, and its five columns: finite volumes, Crank-Nicolson.
+
+    `long`: the length over which TC3 averages.
+    """
     rng = np.random.default_rng(seed)
     alpha = 1e-6 * np.exp(0.4 * rng.standard_normal())
     periods, sizes = rng.uniform(900.0, 2500.0, 2), rng.uniform(5.0, 15.0, 2)
     phases = rng.uniform(0.0, 6.0, 2)
+
+    at = np.array([*PLACES.values()])[:, None] + np.zeros(40)
+    at[1] += long * ((np.arange(40) + 0.5) / 40 - 0.5)
 
     def end(k: int, t: Any) -> Any:
         wave = np.sin(2 * np.pi * t / periods[k] + phases[k]) - np.sin(phases[k])
@@ -49,7 +55,7 @@ def bar(seed: int) -> tuple[float, dict[str, Any]]:
     u, shown, times = np.full(CELLS, 20.0), [], STEP * np.arange(COUNT)
     for t in h * np.arange(FINE * (COUNT - 1) + 1):
         if len(shown) * STEP <= t + 1e-9:
-            shown.append(np.interp(list(PLACES.values()), x, u))
+            shown.append(np.interp(at, x, u).mean(axis=1))
         b = np.zeros(CELLS)
         b[0], b[-1] = (2 * alpha / width**2 * end(k, t + 0.5 * h) for k in range(2))
         u = solver.solve(right @ u + h * b)
@@ -380,6 +386,19 @@ def test_columns_that_were_right_for_long_are_not_wrong_from_the_start(since: in
         identifier.step(*sample)
     first = float(identifier._state.trial[0, 0, 0])
     assert first == 0.0 if since == 60 else first >= STEP * since
+
+
+@pytest.mark.slow
+def test_a_sensor_that_averages_over_a_length_is_named_and_the_interval_allows_for_it():
+    alpha, columns = bar(2, 0.02)
+    verdict = run(columns).last.verdict
+    (misfit,) = (finding for finding in verdict.findings if finding.what == "misfit")
+    first = misfit.causes[0]
+    assert (first.kind, first.subject) == ("averaging", "TC3")
+    assert 0.01 < first.size < 0.02
+    assert first.setting.startswith("channels.TC3.at=; channels.TC3.along=[[0.0")
+    one = verdict.errors.unknowns[0]
+    assert one.low < alpha < one.plain_low
 
 
 def test_a_flux_is_in_no_unit_of_temperature():

@@ -396,6 +396,18 @@ def test_a_cause_that_no_setting_frees_says_so(tmp_path):
     assert with_settings(prepared, once) == once
 
 
+def test_a_sensor_that_averages_is_read_along_a_line(tmp_path):
+    path = short_rod(tmp_path)
+    given = "channels.T_10.at=; channels.T_10.along=[[0.08], [0.12]]"
+    settings = freed(cases.load(path).prepare(), Cause("averaging", "T_10", "", setting=given))
+    observed = cases.load(path, settings=parse(settings)).prepare().identifier.observed
+    u = observed.state.interpolate(lambda x: x[0] ** 2)
+    mean = (observed.G @ u)[observed.names.index("T_10")]
+    assert mean == pytest.approx(0.1**2 + 0.04**2 / 12.0, rel=0.01)
+    uncertain = cases.load(path, settings=parse(["channels.T_10.at_std='1 cm'"])).prepare()
+    assert freed(uncertain, Cause("averaging", "T_10", "", setting=given)) == ()
+
+
 @pytest.mark.parametrize(("unit", "there"), [("degF", True), ("W/m^2", False)])
 def test_a_column_is_not_read_in_the_unit_of_another_quantity(tmp_path, unit, there):
     prepared = cases.load(short_rod(tmp_path)).prepare()

@@ -27,7 +27,14 @@ from livepde.verdict import (
     discretised,
 )
 from livepde.verdict.assess import FACTOR, LONGEST, _possible
-from livepde.verdict.directions import GAIN, LAG, ScoreDirection
+from livepde.verdict.directions import (
+    AVERAGED,
+    GAIN,
+    LAG,
+    LONGEST_AVERAGE,
+    ScoreDirection,
+    sensor_averages,
+)
 from livepde.verdict.findings import flat
 from livepde.verdict.ledger import Ledger, summed
 
@@ -560,6 +567,22 @@ def test_a_sensor_is_inside_the_body_and_not_beyond_the_next_one():
     assert possible(places["c"], 0.09 / step)
     assert not possible(places["c"], 0.11 / step)
     assert not possible(places["c"], -0.11 / step)
+
+
+def test_a_sensor_averages_over_a_length_inside_the_body():
+    model = driven_rod({"a": lp.Normal(1.0, 0.5)}, lambda t: t, lp.interval(0.0, 2.0, 400))
+    observed = observe(model, lp.Points({"a": 0.06, "b": 1.0}, noise=0.1))
+    parabola = model.state_space.interpolate(lambda x: x[0] ** 2)
+    length = AVERAGED * 2.0
+    np.testing.assert_allclose(
+        sensor_averages(model, observed) @ parabola, length**2 / 12.0, rtol=0.05
+    )
+    found = Dictionary(model, observed, np.full(2, 0.1), [], dearer=False).directions
+    near, middle = (one for one in found if one.kind == "averaging")
+    assert (near.most, middle.most) == pytest.approx((0.12, LONGEST_AVERAGE * 2.0))
+    assert possible(near, 0.9 * (0.12 / length) ** 2)
+    assert not possible(near, 1.1 * (0.12 / length) ** 2)
+    assert not possible(near, -0.1)
 
 
 @pytest.mark.parametrize(("converged", "kept"), [(True, 1), (False, 2)])

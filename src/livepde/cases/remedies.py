@@ -30,7 +30,7 @@ WIDE = 2.0  # prior standard deviation of what is freed, over the size that was 
 KEYS = {kind: key for kind, (_, key) in ESTIMATED.items()}
 """Kind of error of a sensor -> its key in a case; all sensors share one prior of each."""
 # Errors with a size that a fit could find.
-SIZED = ("boundary", "channel", "drift", "flux", "lag", "loss", "source", "transfer")
+SIZED = ("averaging", "boundary", "channel", "drift", "flux", "lag", "loss", "source", "transfer")
 STATED = ("factor", "late")  # keys of a channel whose stated value a cause does not replace
 MISSED = 5.0  # times the noise that the first readings may miss a stated start
 DOUBTED = ("caution", "do not trust")  # levels of a verdict
@@ -228,6 +228,8 @@ def _stated(case: Case, cause: Cause) -> tuple[str, ...]:
     channel, settings = case.spec.channels.get(cause.subject), settings_in(cause.setting)
     keys = [setting.partition("=")[0].rpartition(".")[2] for setting in settings]
     if channel is not None and keys == ["unit"] and not _convertible(case, cause.subject, settings):
+        return ()
+    if "along" in keys and not (channel is not None and channel.is_fixed):
         return ()
     taken = [key for key in keys if key in STATED and getattr(channel, key, None) is not None]
     # A case needs a sensor: the only one cannot be left out.

@@ -357,6 +357,12 @@ class ChannelSpec(Spec):
         return (self.at, self.each, self.positions) != (None, None, None)
 
     @property
+    def is_fixed(self) -> bool:
+        """Whether the channel measures a scalar state at a position that is certain."""
+        own = (self.at_std, self.component, self.quantity)
+        return self.at is not None and own == (None, None, None)
+
+    @property
     def is_flux(self) -> bool:
         """Whether the channel measures a flux, and not the state."""
         return self.quantity == FLUX

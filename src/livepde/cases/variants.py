@@ -56,6 +56,7 @@ NAMES = {  # kind of cause -> name of the variant
     "offset": "offset of {}",
     "gain": "gain of {}",
     "position": "position of {}",
+    "averaging": "length of {}",
     "jump": "jumps of {}",
     "source": "source",
     "loss": "loss",

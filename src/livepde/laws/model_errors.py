@@ -28,7 +28,10 @@ from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
 from livepde.model import Model
 from livepde.verdict.directions import (
+    AVERAGED,
+    LONGEST_AVERAGE,
     SHIFT,
+    sensor_averages,
     sensor_shifts,
     stated_positions,
 )
@@ -55,6 +58,7 @@ BESIDE = (("source",), ("common",), ("sensors",))
 TIMES = (1.0 / 30.0, 1.0 / 6.0, 2.0, math.inf)  # correlation times over the length of the run
 MOST_GAIN = 0.3  # standard deviation of the scale of a sensor that is plausible
 FARTHEST = 0.1  # the same of its place, over the length of the domain
+RESPONSE = 1.0 / 30.0  # of the run: time constant of a slow sensor, as the shortest of `TIMES`
 FEWEST = 20  # readings
 SAME_ERROR = 1e-3  # relative difference of two errors of a sensor that are one
 NEAR = 0.03  # posterior standard deviations within which a trajectory is that of the best fit
@@ -78,8 +82,7 @@ def _sensor_columns(
     # A sensor that moves may have no place at first.
     seen = np.isfinite(predicted)
     change = predicted - predicted[seen.argmax(axis=0), np.arange(sensors)]
-    for column, level in zip(change.T, predicted.T, strict=True):
-        column[:] = beyond_rounding(column, level)
+    change = _beyond_rounding(change, predicted)
     rate = np.gradient(change, times, axis=0) if count > 1 else np.zeros_like(predicted)
     problem = samples.filter.problem
     each: list[tuple[Array, float | Array]] = [
@@ -88,6 +91,12 @@ def _sensor_columns(
         (change, MOST_GAIN),
         (-rate, math.inf),
     ]
+    slow = _slow(times, predicted, RESPONSE * max(float(np.ptp(times)), 1e-300))
+    each.append((_beyond_rounding(slow - predicted, predicted), math.inf))
+    if problem.model.mesh.dim() == 1:
+        mean = (sensor_averages(problem.model, problem.observed) @ np.column_stack(states)).T
+        longest = (LONGEST_AVERAGE / AVERAGED) ** 2
+        each.append((_beyond_rounding(mean, predicted), longest))
     common = [(change, MOST_GAIN), (-rate, math.inf)]
     for slope, step, depths in _misplaced(problem, states):
         each.append((slope, FARTHEST / SHIFT * step))
@@ -99,6 +108,26 @@ def _sensor_columns(
             yield own, float(np.broadcast_to(most, sensors)[k])
     for effect, most in common:
         yield effect, most
+
+
+def _slow(times: Array, values: Array, constant: float) -> Array:
+    """Return values at times as sensors of first order with a time constant show them.
+
+    Between two samples, values are straight lines. NaN stays where it is.
+    """
+    found = values.copy()
+    for k in range(1, len(times)):
+        h = (times[k] - times[k - 1]) / constant
+        rise = (values[k] - values[k - 1]) / h
+        now = values[k] - rise + math.exp(-h) * (found[k - 1] - values[k - 1] + rise)
+        found[k] = np.where(np.isfinite(now), now, values[k])
+    return found
+
+
+def _beyond_rounding(values: Array, terms: Array) -> Array:
+    """Return `beyond_rounding` of each column."""
+    each = zip(values.T, np.broadcast_to(terms, values.shape).T, strict=True)
+    return np.column_stack([beyond_rounding(own, of) for own, of in each])
 
 
 def _misplaced(
@@ -114,10 +143,8 @@ def _misplaced(
     every = np.column_stack(states)
     for axis, matrix in enumerate(shifts):
         size = abs(matrix)
-        slope = (matrix @ every).T / step
         terms = (size @ np.abs(every)).T / step
-        for k in range(len(step)):
-            slope[:, k] = beyond_rounding(slope[:, k], terms[:, k])
+        slope = _beyond_rounding((matrix @ every).T / step, terms)
         vertices = np.asarray(problem.model.mesh.p)[axis]
         at = np.zeros(len(step)) if positions is None else np.nan_to_num(positions[:, axis])
         yield slope, step, (at - float(vertices.min()), at - float(vertices.max()))

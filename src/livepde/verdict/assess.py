@@ -260,6 +260,8 @@ def _possible(
         "transfer",
     ):  # one that is known is an unknown of the model, and has no cause
         return size > 0.0
+    if direction.kind == "averaging":  # over a length that is positive
+        return size > 0.0 and amount <= direction.most
     if direction.kind in ("gain", "channel"):
         return 1.0 / FACTOR <= 1.0 + amount <= FACTOR
     if direction.kind == "lag":
@@ -294,6 +296,8 @@ def _amount(direction: ScoreDirection, size: float, at: Position) -> float:
     }
     if direction.kind in process:
         return size * process[direction.kind]
+    if direction.kind == "averaging":  # what it does grows with the square of the length
+        return math.sqrt(max(size, 0.0)) * direction.size
     if direction.kind in ("offset", "drift"):  # by the noise that was found, where that is so
         return size * OFFSET * float(at.noise[list(at.sensors).index(direction.subject)])
     return size * direction.size
@@ -316,6 +320,11 @@ def _setting(direction: ScoreDirection, size: float, at: Position) -> str:
         return channel_setting(
             direction.subject, "factor", f"{1.0 + _amount(direction, size, at):.4g}"
         )
+    if direction.kind == "averaging":
+        half = 0.5 * _amount(direction, size, at)
+        ends = f"[[{direction.at - half:.6g}], [{direction.at + half:.6g}]]"
+        along = channel_setting(direction.subject, "along", ends)
+        return f"{channel_setting(direction.subject, 'at', '')}; {along}"
     if direction.kind == "drift":
         return channel_setting(direction.subject, "role", '"ignored"')
     if direction.kind == "jump":

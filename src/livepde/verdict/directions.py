@@ -38,6 +38,9 @@ DRIFT = 64.0  # ... a drift in so many samples
 GAIN = 0.1  # of the change of a sensor since the start
 LAG = 3.0  # samples
 SHIFT = 0.02  # of the length of the domain, as the cells near a sensor measure it
+AVERAGED = 0.04  # of the length of the domain: a sensor that averages over it, as a long probe
+LONGEST_AVERAGE = 0.2  # of the length of the domain, over which a sensor may average
+POINTS = 8  # of the average
 JUMP = 0.3  # prior standard deviations of an unknown
 MOST_JUMPS = 8  # coordinates of unknowns that may jump
 MOST_SUMS = 12_000  # numbers in one kind of sum
@@ -241,7 +244,8 @@ def stride(seen: int) -> int:
 class ScoreDirection:
     """A possible cause with an amplitude of one."""
 
-    kind: str  # "offset", "drift", "gain", "lag", "position", "jump", or that of a `Term`
+    # "offset", "drift", "gain", "lag", "position", "averaging", "jump", or that of a `Term`
+    kind: str
     subject: str = ""  # name of the sensor, channel, boundary or unknown
     size: float = np.nan  # the amplitude in its unit; NaN where that is not known beforehand
     unit: str = ""  # of the size
@@ -250,7 +254,7 @@ class ScoreDirection:
     # next one
     least: float = -np.inf
     most: float = np.inf
-    at: float = np.nan  # coordinate of the sensor along the axis; NaN if it is not a position
+    at: float = np.nan  # coordinate of the sensor along the axis; NaN if it does not matter
 
 
 # Amplitudes of errors of sensors that are the same at each sample, in units of the noise
@@ -320,9 +324,12 @@ class Dictionary:
             "position": (step, (model.length_unit,) * sensors, shifts),
             "gain": (np.full(sensors, GAIN), none, 1),
             "drift": (OFFSET * noise, units, 1),
+            "averaging": (AVERAGED / SHIFT * step, (model.length_unit,) * sensors, 1),
         }
         if not shifts:
             del amplitudes["position"]
+        if shifts != 1:  # on a line only: over which direction it is elsewhere nobody knows
+            del amplitudes["averaging"]
         while amplitudes and sensors * sum(axes for *_, axes in amplitudes.values()) > room:
             kind, _ = amplitudes.popitem()
             self.left_out.append(f"{kind} of single sensors: there are {sensors}")
@@ -339,17 +346,26 @@ class Dictionary:
                 for axis in range(axes)
                 for name, one, unit in zip(observed.names, size.tolist(), of, strict=True)
             ]
-            self._add(kind, _within_reach(model, observed, found) if kind == "position" else found)
+            if kind == "position":
+                found = _within_reach(model, observed, found)
+            elif kind == "averaging":
+                found = _inside(model, observed, found)
+            self._add(kind, found)
         self.own: IntArray = np.arange(len(self.directions)) % observed.size  # sensors
-        self.axes = len(shifts) if "position" in amplitudes else 0  # along which sensors may be off
+        # Axes along which sensors may be off, and one more on which they may average.
+        places = shifts if "position" in amplitudes else []
+        self.shifted = observed.size * len(places)
+        if "averaging" in amplitudes:
+            places = [*places, sensor_averages(model, observed)]
+        self.axes = len(places)
         if self.axes:
             # The coefficients of the state that matter, and the matrices of all axes on them.
-            rows = sp.csc_array(sp.vstack(shifts))
+            rows = sp.csc_array(sp.vstack(places))
             self._used = np.flatnonzero(np.diff(rows.indptr))
             self._moved = row_product(sp.csr_array(rows[:, self._used]))
 
     def moved(self, u: Array) -> Array:
-        """Return changes of readings by shifts of sensors, (members, axes * sensors)."""
+        """Return changes of readings by shifts and averages, (members, axes * sensors)."""
         return self._moved(u.take(self._used, axis=1))
 
     def _add(self, part: str, directions: list[ScoreDirection]) -> None:
@@ -371,7 +387,9 @@ class Dictionary:
         jump is at most a prior standard deviation.
         """
         found = np.full(len(self), np.inf)
-        for kind, most in (("gain", gain / GAIN), ("position", reach / SHIFT), ("jump", 1 / JUMP)):
+        each = {"gain": gain / GAIN, "position": reach / SHIFT, "jump": 1.0 / JUMP}
+        each["averaging"] = (LONGEST_AVERAGE / AVERAGED) ** 2
+        for kind, most in each.items():
             found[self.parts.get(kind, slice(0, 0))] = most
         return found
 
@@ -385,12 +403,13 @@ class Dictionary:
         `noise`: shape (members, samples, sensors).
         `change`, `late`: predictions less the first ones, and predictions a sample earlier less
         those of now, (members, samples, sensors).
-        `moved`: changes by shifts of the sensors, (members, samples, axes * sensors).
+        `moved`: changes by shifts and averages, (members, samples, axes * sensors).
         `answers`: readings due to missing terms, (members, samples, terms, sensors).
         """
         found = np.empty((*noise.shape, len(self)))
         found[...] = self._constant
-        each = {"lag": LAG * late, "position": moved, "gain": GAIN * change}
+        each = {"lag": LAG * late, "gain": GAIN * change}
+        each |= {"position": moved[..., : self.shifted], "averaging": moved[..., self.shifted :]}
         if self._changing.size:
             own = self.own[self._changing]  # each changes the readings of one sensor
             parts = [each[kind] for kind in self.kinds if kind in each]
@@ -422,6 +441,17 @@ def _within_reach(
         most = min(float(high[k] - at[sensor, k]), float(reach[sensor]))
         bounded.append(replace(one, least=least, most=most, at=float(at[sensor, k])))
     return bounded
+
+
+def _inside(model: Model, observed: Observed, found: list[ScoreDirection]) -> list[ScoreDirection]:
+    """Return the directions of averages on a line, bounded by its ends."""
+    at, (vertices,) = stated_positions(observed), np.asarray(model.mesh.p)
+    if at is None:
+        return found
+    low, high = float(vertices.min()), float(vertices.max())
+    most = np.minimum(2.0 * np.minimum(at - low, high - at), LONGEST_AVERAGE * (high - low))
+    each = zip(found, at[:, 0].tolist(), most[:, 0].tolist(), strict=True)
+    return [replace(one, least=0.0, most=longest, at=x) for one, x, longest in each]
 
 
 def _leaves(observed: Observed) -> list[Observed]:
@@ -494,3 +524,20 @@ def sensor_shifts(model: Model, observed: Observed) -> tuple[list[sp.csr_array],
         scale = sp.diags_array(step / np.where(width > 0.0, width, np.inf))
         found.append(sp.csr_array(scale @ (ends[1] - ends[0])))
     return found, step
+
+
+def sensor_averages(model: Model, observed: Observed) -> sp.csr_array:
+    """Return how readings on a line change if sensors average over `AVERAGED` of it, (k, n).
+
+    The change grows with the square of the length. Zero for sensors without a position.
+    """
+    at = stated_positions(observed)
+    if at is None:
+        return sp.csr_array((observed.size, observed.state.dim))
+    (vertices,) = np.asarray(model.mesh.p)
+    low, high = float(vertices.min()), float(vertices.max())
+    off = AVERAGED * (high - low) * ((np.arange(POINTS) + 0.5) / POINTS - 0.5)
+    # At an end the average is over a shorter length.
+    half = np.minimum(at - low, high - at)
+    rows = [_rows_at(observed, at + np.clip(x, -half, half)) for x in off.tolist()]
+    return sp.csr_array(sum(rows[1:], rows[0]) / POINTS - _rows_at(observed, at))

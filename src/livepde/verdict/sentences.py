@@ -302,6 +302,10 @@ LIKELY: dict[str, Sentence] = {
         "Check the clock, the averaging and the response time of {name}.",
     ),
     "position": Sentence("{name} may be {amount} {where}", "Check the position of {name}."),
+    "averaging": Sentence(
+        "{name} may average over {amount}",
+        "Check the length of {name}. For a mean along a line, use `along` instead of `at`.",
+    ),
     "jump": Sentence("{name} may have changed during the run", JUMPS),
     "boundary": Sentence(
         "{name} may be {amount} too {side}",
