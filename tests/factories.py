@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from skfem import (
     ElementHex1,
     ElementLineHermite,
@@ -35,6 +36,14 @@ from livepde.stepping import ForwardStage, advance
 def few(count: int, *axes: Iterable[Any]) -> list[tuple[Any, ...]]:
     """Return some of all combinations, always the same ones."""
     return random.Random(0).sample(list(combinations(*axes)), count)
+
+
+def usual(values: Iterable[Any], *, often: int = 1) -> list[Any]:
+    """Return values of a parameter, all but the first few of which are long tests."""
+    return [
+        value if k < often else pytest.param(value, marks=pytest.mark.long)
+        for k, value in enumerate(values)
+    ]
 
 
 def turns(first: Iterable[Any], second: Iterable[Any], third: Sequence[Any]) -> list[Any]:

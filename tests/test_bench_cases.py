@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import livepde as lp
 from benchmarks import cases as bench
 from benchmarks.__main__ import app
 from livepde.cases.new_case import write_template
@@ -111,19 +110,3 @@ def test_frozen_at_the_prior(project):
     run = bench.run_job(bench.Job(project, settings=settings))
     assert run.prior <= run.numbers["rmse"] * 1.05
     assert run.numbers["alpha.error"] < 0.03
-
-
-def test_only_some(project):
-    code, output = call("--only", "rod", "--folder", str(project.parent))
-    assert "five seeds" in output
-    assert code == 0  # as every command without --json
-    with pytest.raises(lp.errors.ConfigurationError, match="did you mean 'rod'"):
-        call("--only", "rodd")
-
-
-def test_no_cases(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(lp.errors.CaseError, match="add --folder DIR"):
-        call()
-    with pytest.raises(lp.errors.CaseError, match="there are no case files"):
-        call("--folder", str(tmp_path))

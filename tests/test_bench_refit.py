@@ -8,17 +8,15 @@ from scipy.optimize import minimize
 
 import livepde as lp
 from benchmarks.refit.estimator import Fit
-from benchmarks.refit.jumps import AT, PROCESSES, JumpTrial
+from benchmarks.refit.jumps import PROCESSES
 from benchmarks.refit.objective import LOST, Objective
 from benchmarks.refit.problems import PROBLEMS
-from benchmarks.refit.process import LostError, stages_of
+from benchmarks.refit.process import LostError
 from benchmarks.refit.reference import Reference, reference
 from benchmarks.refit.report import outcome
-from benchmarks.refit.trial import Trial, with_outliers
-from benchmarks.refit.unknowns import Belief, Coordinates, Unknown, drawn
+from benchmarks.refit.trial import Trial
 from livepde.fem import Inputs, Moment
 from livepde.laws.reduction import Reduction
-from livepde.stepping import advance
 
 SMALL = 0.15  # of the noise, root mean square: what truth and lean model may differ by
 
@@ -65,25 +63,6 @@ def test_derivatives_of_the_residual(name):
     expected = [(objective.residual(a + s) - objective.residual(a - s)) / 2e-5 for s in steps]
     tolerance = 1e-6 * np.abs(expected).max()
     np.testing.assert_allclose(objective.jacobian(a), np.transpose(expected), atol=tolerance)
-
-
-@pytest.mark.parametrize(
-    ("times", "longest"),
-    [(np.linspace(0.0, 2.0, 9), np.inf), (np.array([0.0, 28.0, 28.75, 30.0]), 0.5)],
-)
-def test_steps_are_those_of_livepde(times, longest):
-    expected = []
-
-    def stage(c, t, h):
-        expected.append((t, h))
-        return c
-
-    control = lp.Advance(lp.ImplicitEuler(), longest, start=0.0)
-    for t0, t1 in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
-        advance(control, stage, np.zeros(1), t0, t1)
-    starts, lengths, last = stages_of(times, longest)
-    np.testing.assert_allclose(np.column_stack([starts + lengths, lengths]), expected, rtol=1e-12)
-    np.testing.assert_allclose((starts + lengths)[last], times[1:], rtol=1e-12)
 
 
 def test_the_field_has_the_prior_of_livepde():
@@ -140,26 +119,6 @@ def test_priors_are_honest_and_those_of_a_seed(name):
     assert not np.array_equal(problem.readings(3)[1:], problem.readings(4)[1:])
 
 
-def test_priors_that_a_user_has_reported_are_among_them():
-    assert PROBLEMS["column"].priors(0) == {"D": Belief(0.1, 0.1), "v": Belief(0.7, 0.5)}
-    priors = PROBLEMS["column-offset"].priors(1)
-    assert (priors["D"], priors["v"]) == (Belief(0.01, 0.01), Belief(0.1, 0.1))
-
-
-@pytest.mark.parametrize("kind", ["log", "logit", "normal"])
-def test_coordinates_are_those_of_livepde_s_priors(kind):
-    unknown = Unknown(0.4, kind)
-    prior = unknown.declared(Belief(0.2, 0.1))
-    coordinates = Coordinates.of({"p": unknown}, {"p": Belief(0.2, 0.1)})
-    assert coordinates.centre[0] == pytest.approx(prior.latent_mean)
-    assert coordinates.Phi[0, 0] == pytest.approx(prior.latent_std)
-    a = np.array([0.7])
-    expected = prior.transform.value(coordinates.centre + coordinates.Phi @ a)
-    np.testing.assert_allclose(coordinates.value(a), expected)
-    np.testing.assert_allclose(coordinates.inverse(coordinates.value(a)), a)
-    assert kind == "normal" or drawn({"p": unknown}, np.random.default_rng(0))["p"].median > 0.0
-
-
 # --- the reference -------------------------------------------------------------------------------
 
 
@@ -174,15 +133,6 @@ def test_no_other_method_finds_less_than_the_reference():
     assert found.cost == pytest.approx(other.fun, abs=1e-4)
     np.testing.assert_allclose(found.a, other.x, atol=1e-3)
     assert found.cost == pytest.approx(objective.cost(found.a))
-
-
-def test_outliers_are_a_fifth_of_the_readings():
-    z = np.zeros((2000, 2))
-    wild = with_outliers(z, 0.1, np.random.default_rng(0))
-    moved = wild[wild != 0.0]
-    assert len(moved) / z.size == pytest.approx(0.2, abs=0.02)
-    assert 1.0 <= np.abs(moved).min() <= np.abs(moved).max() <= 10.0
-    assert abs(np.sign(moved).mean()) < 0.1
 
 
 # --- jumps ---------------------------------------------------------------------------------------
@@ -226,16 +176,6 @@ def failed(trials, jumps=()):
     return {check.name.split(": ", 1)[1] for check in outcome(trials, jumps).checks if not check.ok}
 
 
-def test_checks_of_good_fits():
-    found = outcome([trial(0, 40.0), trial(1, 40.4, shifted=np.nan)], [])
-    assert found.ok
-    (table,) = found.tables
-    row = dict(zip(table.columns, table.rows[0], strict=True))
-    assert (row["priors"], row["reached"], row["SciPy reached"]) == (2, 2, 2)
-    assert row["time/SciPy"] == pytest.approx(1.5)  # trf is quicker, but fails
-    assert row["outliers kept"] == 1.0
-
-
 @pytest.mark.parametrize(
     ("cost", "changes", "names"),
     [
@@ -252,21 +192,3 @@ def test_checks_of_good_fits():
 )
 def test_checks_of_bad_fits(cost, changes, names):
     assert failed([trial(0, cost, **changes)]) == names
-
-
-@pytest.mark.parametrize(
-    ("changes", "names"),
-    [
-        ({}, set()),
-        ({"one": 2, "every": 2}, {"found where one unknown may jump"}),
-        (
-            {"one": 2},
-            {"found where one unknown may jump", "found, one may jump less all may jump"},
-        ),
-        ({"shift": 3.1}, {"constant moved, in standard deviations"}),
-        ({"widest": 1.3}, {"standard deviation of the constant / before"}),
-    ],
-)
-def test_checks_of_jumps(changes, names):
-    good = JumpTrial(process="rod", seed=0, one=len(AT), every=len(AT), shift=1.0, widest=1.0)
-    assert failed([], [replace(good, **changes)]) == names

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +9,7 @@ import pytest
 from factories import driven_rod, line
 
 import livepde as lp
-from benchmarks import scoring
 from benchmarks.offline import Trajectory, fit
-from benchmarks.peers import table
 from benchmarks.peers.augmented import Augmented
 from benchmarks.problems import PROBLEMS, Data, Problem, Process
 
@@ -63,14 +60,6 @@ def test_offline_fit_finds_the_parameter_within_its_deviation(data):
     assert abs(found.q[-1, 0] - true) < 3 * std
 
 
-def test_same_seed_same_data_and_noise_has_its_level(data):
-    again = ROD.data(0.01, 0)
-    np.testing.assert_array_equal(data.z, again.z)
-    assert not np.array_equal(data.z, ROD.data(0.01, 1).z)
-    noise = (data.z - data.process.exact) / data.noise
-    assert 0.7 < noise.std() < 1.3
-
-
 def test_fits_of_the_data_so_far_do_not_know_the_future():
     data = WALK.data(0.01, 0)
     short = fit(data.until(10))
@@ -81,37 +70,6 @@ def test_fits_of_the_data_so_far_do_not_know_the_future():
     np.testing.assert_allclose(again.q, fit(data.until(12)).q, atol=1e-4)
 
 
-def test_a_parameter_that_moves_is_scored_over_the_second_half():
-    judge = scoring.Judge(WALK.data(0.01, 0))
-    assert judge.scored == list(range(10, 21))
-
-
-def test_coverage_counts_intervals_that_hold_the_truth(data):
-    judge = scoring.Judge(data)
-    true, std = np.log(data.process.q_true[-1]), np.array([[0.1]])
-    assert judge.covered(true + 0.19, std, -1) == 1.0
-    assert judge.covered(true + 0.2, std, -1) == 0.0
-    assert math.isnan(judge.covered(true, None, -1))
-
-
-def test_a_contender_that_fails_is_a_row(data):
-    def broken(data):
-        raise lp.errors.LawError("no")
-
-    score = scoring.scored(broken, data)
-    assert score is not None
-    assert math.isnan(score.error)
-    assert score.note == "LawError: no"
-
-
-def test_a_peer_that_is_not_installed_is_a_row(monkeypatch):
-    absent = table.Peer(("no_such_package",), lambda data: None)
-    monkeypatch.setitem(table.PEERS, "absent", absent)
-    score = table.run_row(ROD, 0.01, 0, "absent")
-    assert score is not None
-    assert score.note == "not installed: no_such_package"
-
-
 def test_peers_are_given_our_forward_model(data):
     augmented = Augmented(data)
     a = np.log(data.process.q_true[0] / 0.3) * 3.0
@@ -119,27 +77,6 @@ def test_peers_are_given_our_forward_model(data):
     for at in range(1, len(TIMES)):
         x = augmented.forecast(x, at)
         np.testing.assert_allclose(augmented.output(x, at), data.process.exact[at], atol=1e-12)
-
-
-def test_promises_about_peers_are_checked():
-    def scores(error, cost):
-        return [scoring.Score(error=error, whole=cost), scoring.Score(error=3 * error, whole=cost)]
-
-    found = {
-        ("rod", 0.01, "prior"): scores(1.0, 1.0),
-        ("rod", 0.01, table.MINE): scores(0.1, 4.0),
-        ("rod", 0.01, table.RIVAL): scores(0.1, 5.0),
-        ("rod", 0.01, "do-mpc: moving horizon"): scores(0.08, 160.0),
-        ("flow", 0.01, "prior"): scores(1.0, 1.0),
-        ("flow", 0.01, table.MINE): scores(0.2, 4.0),
-        ("flow", 0.01, table.RIVAL): scores(0.1, 3.0),
-        ("flow", 0.01, "do-mpc: moving horizon"): 2 * [scoring.Score(note="not installed")],
-    }
-    cheaper, error, work = table._checks(found)
-    assert cheaper.name == f"rod, 1% noise: cost of '{table.MINE}' over '{table.RIVAL}'"
-    assert (cheaper.value, cheaper.bound, cheaper.ok) == (0.8, 1.0, True)
-    assert (error.value, error.ok) == (pytest.approx(1.25), False)
-    assert (work.value, work.bound, work.ok) == (40.0, 50.0, False)
 
 
 @pytest.mark.parametrize("name", [n for n, p in PROBLEMS.items() if None not in p.levels])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import re
 import shutil
 import sys
 from pathlib import Path
@@ -14,7 +13,6 @@ from commands import bench
 from typer.main import get_command
 
 from benchmarks.__main__ import app
-from livepde.runs import Outcome
 
 pytestmark = pytest.mark.study
 
@@ -29,12 +27,6 @@ def costs(monkeypatch):
     return importlib.import_module("suite.costs")
 
 
-def test_the_configuration_names_the_suite():
-    found = json.loads((FOLDER / "asv.conf.json").read_text())
-    assert (FOLDER / found["benchmark_dir"] / "costs.py").is_file()
-    assert (FOLDER / found["repo"] / "pyproject.toml").is_file()
-
-
 def test_steps_are_ratios(costs, monkeypatch):
     monkeypatch.setattr(costs.Step, "params", ((12,), costs.LAWS))
     monkeypatch.setattr(costs, "MODES", 2)
@@ -42,21 +34,6 @@ def test_steps_are_ratios(costs, monkeypatch):
     found = suite.setup_cache()
     ratios = [suite.track_ratio(found, 12, law) for law in costs.LAWS]
     assert all(ratio > 0.0 for ratio in ratios)
-
-
-def test_memory_is_that_of_a_process_of_its_own(costs):
-    found = [costs.Memory().track_memory(10_000, law) for law in costs.LAWS]
-    assert all(0.1 < each < 100.0 for each in found)  # a matrix of its own needs more
-
-
-def test_a_fleet_is_held_against_separate_runs(costs, monkeypatch):
-    monkeypatch.setattr(costs.Fleet, "members", 2)
-    monkeypatch.setattr(costs.Fleet, "runs", 2)
-    monkeypatch.setattr(sys.modules["benchmarks.fleet"], "SAMPLES", 100)
-    suite = costs.Fleet()
-    found = suite.setup_cache()
-    assert suite.track_step(found) > 0.0
-    assert suite.track_command(found) > 0.0
 
 
 # --- commands ------------------------------------------------------------------------------------
@@ -74,27 +51,6 @@ def test_a_quick_run_ends_with_its_checks(name, data_dir, monkeypatch):
     assert content["tables"]
     assert content["checks"]
     assert code == (not all(check["ok"] for check in content["checks"]))
-
-
-@pytest.mark.parametrize(
-    ("words", "seeds", "told"),
-    [
-        ("", 5, " --seeds 5"),
-        ("--quick", 1, " --quick"),
-        ("--quick --seeds 3", 3, " --seeds 3 --quick"),
-    ],
-)
-def test_what_is_given_wins_over_quick(words, seeds, told, monkeypatch):
-    taken = []
-
-    def alarms(number, **options):
-        taken.append((number, options["few"]))
-        return Outcome()
-
-    monkeypatch.setattr("benchmarks.alarms.alarms", alarms)
-    code, output = bench("alarms", *words.split(), "--json")
-    assert (code, taken) == (0, [(seeds, "--quick" in words)])
-    assert json.loads(output)["command"] == f"python -m benchmarks alarms{told}"
 
 
 # --- the page of costs ---------------------------------------------------------------------------
@@ -149,61 +105,3 @@ def test_the_page_of_costs_shows_all_that_was_measured(page, tmp_path):
     assert text.count("Recorded at commit 0123abcd.\n") == 1
     assert {"step.png", "memory.png"} <= {file.name for file in folder.iterdir()}
     assert page.remembered({"scale": found}) == {"scale": [(1_000, 1.5)]}
-
-
-def test_what_a_benchmark_prints_is_kept(page, tmp_path, monkeypatch):
-    monkeypatch.setattr(page, "MEASURED", tmp_path / "performance")
-    page.measure(["step"], [12])
-    found = json.loads((tmp_path / "performance" / "step.json").read_text())
-    assert re.fullmatch("[0-9a-f]{8}", found["commit"])
-    assert {row["nodes"] for row in page.rows_of(found)} == {12}
-    assert len({row["law"] for row in page.rows_of(found)}) > 3
-    with pytest.raises(SystemExit, match="no JSON"):
-        page.measure(["nonsense"], [])
-
-
-# --- the page of peers ---------------------------------------------------------------------------
-
-
-def test_the_page_of_peers_shows_all_that_was_measured(page, tmp_path):
-    del page  # its folder is on the path
-    sys.modules.pop("peers", None)
-    peers = importlib.import_module("peers")
-    folder = tmp_path / "peers"
-    folder.mkdir()
-    columns = ["noise", "estimator", "error", "mean"]
-    check = {"name": "cost", "value": 1.5, "bound": 1.0, "sense": "<=", "ok": False}
-    for name, cost in (("rod", 4.25), ("wall", 2.5)):
-        table = {
-            "title": f"{name}, 1 seed",
-            "columns": columns,
-            "rows": [["1%", "lean", 0.5, cost]],
-        }
-        content = {"commit": "0123abcd", "command": f"python -m benchmarks peers --only {name}"}
-        (folder / f"{name}.json").write_text(
-            json.dumps(content | {"checks": [check], "tables": [table], "notes": ["a note"]})
-        )
-    peers.write(tmp_path)
-    text = (folder / "results.md").read_text()
-    assert text.startswith("# Comparison with peers")
-    assert text.index("## rod") < text.index("| 1% | lean | 0.5 | 4.25 |") < text.index("## wall")
-    assert text.count("python -m benchmarks peers --only wall") == 1
-    assert text.count("FAILED") == 2
-    assert "a note" not in text
-
-
-def test_the_page_of_peers_knows_the_problems_of_the_benchmark(page):
-    del page
-    peers = importlib.import_module("peers")
-    assert set(peers.PROBLEMS) == set(importlib.import_module("benchmarks.peers").PROBLEMS)
-
-
-def test_what_the_benchmark_of_peers_prints_is_kept(page, tmp_path, monkeypatch):
-    del page
-    peers = importlib.import_module("peers")
-    monkeypatch.setattr(peers, "MEASURED", tmp_path / "peers")
-    monkeypatch.setattr(peers, "printed", lambda words: {"command": " ".join(words)})
-    peers.measure(["rod", "wall"])
-    found = json.loads((tmp_path / "peers" / "rod.json").read_text())
-    assert found["command"] == "peers --only rod --seeds 16 --json"
-    assert (tmp_path / "peers" / "wall.json").is_file()

@@ -189,18 +189,6 @@ def test_the_jacobian_by_blocks_is_the_derivative(form, sensors, c1, monkeypatch
     np.testing.assert_allclose(found, (ahead - back) / (2 * step), atol=1e-6 * abs(found).max())
 
 
-@pytest.mark.parametrize("sensors", [lp.Full(), lp.Subdomain(inside)])
-def test_one_update_takes_off_nearly_all_of_the_error(sensors, monkeypatch):
-    solver, data, c = first_stage(plane(24), 1.0, monkeypatch, sensors, c1=0.0)
-    K = solver.factor(data, solver.evaluate(data, c))
-    residual = solver.evaluate(data, c).residual
-    exact, _ = K.iterate(residual, 1e-12)
-    left = K.approximate.solve(residual) - exact
-    n = solver.terms.n
-    for part in (slice(0, n), slice(n, None)):
-        assert np.linalg.norm(left[part]) < 0.05 * np.linalg.norm(exact[part])
-
-
 def test_a_part_that_hardly_moves_does_not_hold_up_the_other(monkeypatch):
     """Without a residual in the second line its update is rounding, which GMRES cannot reduce."""
     model, law = plane(), lp.GradientLaw("auto", newton=EXACT)
@@ -257,18 +245,6 @@ def test_a_run_resumed_gives_the_same_numbers(gain, stream, tmp_path):
     for a, b in zip(one, other, strict=True):
         assert np.array_equal(a.u, b.u)
         assert np.array_equal(a.q, b.q)
-
-
-@pytest.mark.slow
-def test_a_jump_of_the_process_renews_the_factors(stream):
-    model, sensors, samples, fresh = stream
-    identifier = fresh()
-    _, before = settled(model, sensors, samples[:20], identifier)
-    assert sum(before[-10:]) <= 1  # when the patience with one is over
-    jumped = [(t, 4.0 * z) for t, z in samples[20:]]
-    estimates, after = settled(model, sensors, jumped, identifier)
-    assert after[0] > 0
-    assert all(estimate.status.ok for estimate in estimates)
 
 
 @pytest.mark.slow

@@ -167,7 +167,7 @@ def test_the_wrong_column_is_named_first(fault: str):
 def test_a_wrong_input_with_noise_is_named_and_the_initial_state_is_made_of_it(change, words):
     """Inputs with noise have no refit: their first samples are kept, to try columns on them."""
     _, columns = bar(1)
-    wrong = {name: values[:60] for name, values in change(columns).items()}
+    wrong = {name: values[:30] for name, values in change(columns).items()}
     first = {name: float(wrong[name][0]) for name in ("TC1", "TC5")}
     weights = {"TC1": lambda x: 1.0 - x[0] / LENGTH, "TC5": lambda x: x[0] / LENGTH}
     parts = {
@@ -327,7 +327,7 @@ EXCHANGED = Fault("heater", ("T_10", "T_60"), "exchanged")
 @pytest.mark.slow
 def test_exchanged_sensors_that_contradict_all_are_found_from_the_start(tmp_path: Path):
     """The gate takes such columns for a disturbance, after which the stored state is wrong."""
-    prepared = walk(tmp_path, EXCHANGED, 250)
+    prepared = walk(tmp_path, EXCHANGED, 140)
     last = prepared.identifier.run(prepared.stream).last
     assert prepared.identifier._state.trial.shape[1] > 0  # there was a disturbance
     found = [finding.causes[0] for finding in last.verdict.findings if finding.causes]
@@ -349,7 +349,7 @@ def test_exchanged_sensors_that_contradict_all_are_found_from_the_start(tmp_path
 def test_wrong_columns_are_named_where_an_unknown_moves(fault: Fault, noise: str, tmp_path: Path):
     """A furnace with an unknown flux that moves: samples are filtered, not fitted, again."""
     settings = {"law.noise": "auto"} if noise else {}
-    prepared = walk(tmp_path, fault, 150, **settings)
+    prepared = walk(tmp_path, fault, 70, **settings)
     verdict = prepared.identifier.run(prepared.stream).last.verdict
     first = next(finding.causes[0] for finding in verdict.findings if finding.causes)
     kinds = {"fahrenheit": "unit", "exchanged": "exchange", "late": "lag"}
@@ -362,15 +362,15 @@ def test_wrong_columns_are_named_where_an_unknown_moves(fault: Fault, noise: str
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", [EXCHANGED, Fault("furnace", ("T_cold",), "fahrenheit")], ids=str)
 def test_samples_for_trials_outlive_a_restart(fault: Fault, tmp_path: Path):
-    prepared = walk(tmp_path, fault, 120)
+    prepared = walk(tmp_path, fault, 70)
     first, second = prepared.identifier, load(prepared.case.path).prepare().identifier
     for number, sample in enumerate(prepared.stream):
         expected = first.step(sample.t, sample.z, sample.inputs)
-        if number > 60:
+        if number > 35:
             found = second.step(sample.t, sample.z, sample.inputs)
-        if number == 60:
+        if number == 35:
             second.restore(first.dump())
-    assert first._state.trial.shape[1] > 60
+    assert first._state.trial.shape[1] > 35
     np.testing.assert_array_equal(found.q, expected.q)
     assert first.dump() == second.dump()
 
@@ -382,7 +382,7 @@ def test_columns_that_were_right_for_long_are_not_wrong_from_the_start(since: in
     _, columns = bar(3)
     wrong = {name: np.where(np.arange(COUNT) < since, z, z + 30.0) for name, z in columns.items()}
     identifier, samples = begun(columns | {name: wrong[name] for name in PLACES})
-    for sample in samples:
+    for sample in samples[: since + 60]:
         identifier.step(*sample)
     first = float(identifier._state.trial[0, 0, 0])
     assert first == 0.0 if since == 60 else first >= STEP * since

@@ -501,13 +501,15 @@ def test_every_proposed_variant_is_a_case(tmp_path, equation):
         assert cases.load(path, settings=settings).prepare().identifier
 
 
-def heated(h: float = 1e-12, upper: float = 2e-5, switched: float = 0.0) -> pd.DataFrame:
+def heated(
+    h: float = 1e-12, upper: float = 2e-5, switched: float = 0.0, step: float = 10.0
+) -> pd.DataFrame:
     """Return readings of a rod with side loss: finite volumes and the trapezoidal rule.
 
     The left end is driven, the surroundings are at `ambient`. `h`: heat transfer at the right end.
     `upper`: diffusivity beyond 10 cm. `switched`: source from 1200 s on.
     """
-    cells, step, count, parts, rate = 120, 10.0, 240, 10, 3e-4
+    cells, count, parts, rate = 120, round(2400.0 / step), 10, 3e-4
     dx = 0.3 / cells
     x, t = dx * (np.arange(cells) + 0.5), step * np.arange(count)
     alpha = np.where(x < 0.1, 2e-5, upper)
@@ -558,7 +560,7 @@ T_25 = { column = "T_25", role = "sensor", at = "25 cm", noise = "0.05 K" }
 def test_an_exchange_that_the_case_lacks_is_named_and_found(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(HEATED)
-    heated(h=2e-5).to_csv(tmp_path / "rod.csv", index=False)
+    heated(h=2e-5, step=20.0).to_csv(tmp_path / "rod.csv", index=False)
     base = run_variant(path, (), Variant("as stated"))
     assert (base.error, base.level) == ("", "caution")
     assert (base.causes[0].kind, base.causes[0].subject) == ("transfer", "right")

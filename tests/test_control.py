@@ -450,22 +450,6 @@ def test_the_linear_quadratic_controller_is_optimal():
     assert abs(expected - 0.2) > 0.02
 
 
-def test_the_gain_is_kept_while_the_unknown_numbers_stay(monkeypatch):
-    model, asked = reduced(), []
-    controller, before = ct.LQ(model, GOAL, PERIOD), np.array([0.2])
-    gain = ct.LQ.gain
-    monkeypatch.setattr(ct.LQ, "gain", lambda self, step: asked.append(1) or gain(self, step))
-    now, later = known(model), replace(known(model), q=np.array([25.0]))
-    memory, found = controller.start(), []
-    for one in (now, now, later, now):
-        fresh = controller.decide(one, plan(1), before, controller.start())
-        asked.clear()
-        decision = controller.decide(one, plan(1), before, memory)
-        assert decision.inputs.tolist() == fresh.inputs.tolist()
-        memory, found = decision.memory, [*found, len(asked)]
-    assert found == [1, 0, 1, 1]
-
-
 def test_a_state_that_is_lost_holds_the_inputs():
     model = reduced()
     controller = ct.LQ(model, GOAL, PERIOD)

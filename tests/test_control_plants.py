@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -10,14 +9,11 @@ import numpy as np
 import pytest
 
 import livepde.control as ct
-from benchmarks.control import PROBLEMS
 from benchmarks.control import battery as cell
 from benchmarks.control import wall as house
 from benchmarks.control.battery import battery
-from benchmarks.control.compare import FIXED, HORIZONS, LEARNED, TRUE, compare
-from benchmarks.control.horizon import QUIET, MovingHorizon, Setting
+from benchmarks.control.horizon import MovingHorizon, Setting
 from benchmarks.control.problem import Problem, Simulated
-from benchmarks.control.runs import closed_loop
 from benchmarks.control.wall import wall
 from livepde.errors import ConfigurationError
 
@@ -67,24 +63,6 @@ def plant_of(problem: Problem, truth: Any, start: float, seed: int = 0) -> Simul
     return plant
 
 
-def test_people_are_there_by_day():
-    hours = [5.5, 6.0, 17.5, 18.0, 24.0 + 6.0]
-    assert [house.comfort(3600.0 * h)["air"][0] for h in hours] == [15.0, 20.0, 20.0, 15.0, 20.0]
-
-
-def test_each_seed_has_its_weather_and_its_wall(data_dir, monkeypatch):
-    monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
-    house.weather.cache_clear()
-    one, other = wall(0), wall(1)
-    assert one.disturbances(0.0) == {"outside": 0.8}  # the first value of the record
-    assert one.disturbances(0.0) != other.disturbances(0.0)
-    assert one.truth(0.0) != other.truth(0.0)
-    # What is foreseen is what comes.
-    told_of = one.ahead(7200.0)["forecast"]["outside"]
-    coming = [7200.0 + one.period * (k + 1) for k in range(one.horizon)]
-    assert told_of == [one.disturbances(t)["outside"] for t in coming]
-
-
 def test_without_its_record_the_wall_says_what_to_set(monkeypatch):
     monkeypatch.delenv("LIVEPDE_DATA", raising=False)
     house.weather.cache_clear()
@@ -103,14 +81,6 @@ def test_the_charge_that_flows_is_the_mean_filling():
     mean, surface = plant.outputs()
     assert mean == pytest.approx(cell.LOW + 2.0 * 600.0 / 3600.0, abs=1e-4)
     assert surface > mean + 0.05
-
-
-def test_diffusivities_walk_as_the_model_says():
-    """Over many seeds the logarithm spreads by the prior at the start, and by the walk from it."""
-    paths = np.log([cell.drawn(seed)[1] for seed in range(300)])
-    assert paths[:, 0].std() == pytest.approx(cell.SPREAD, rel=0.15)
-    hours = cell.CYCLES * cell.CYCLE / 3600.0
-    assert (paths[:, -1] - paths[:, 0]).std() == pytest.approx(0.3 * np.sqrt(hours), rel=0.15)
 
 
 def test_the_reduced_particle_misses_little():
@@ -170,36 +140,3 @@ def test_the_moving_horizon_goes_on_from_what_it_dumped():
     for one, other in zip(whole[16:], rest, strict=True):
         assert np.array_equal(one.q, other.q)
         assert np.array_equal(one.x, other.x)
-
-
-@needs_mpc
-def test_a_failure_of_the_moving_horizon_is_said(monkeypatch):
-    monkeypatch.setitem(QUIET, "ipopt.max_iter", 1)
-    problem = battery(1)
-    estimator = MovingHorizon(problem, Setting(6, 1.0, 1.0))
-    known = driven(problem, estimator, 10)
-    assert estimator.failed > 0
-    assert known[6].source == "fallback"
-    assert known[6].why == "Ipopt: Maximum_Iterations_Exceeded"
-    assert known[6].q.tolist() == [cell.D]
-
-
-@needs_mpc
-def test_a_comparison_has_four_runs_and_the_best_horizon():
-    settings = [Setting(4, 1.0, 1.0), Setting(5, 1e6, 1e6), Setting(3, 1.0, 1.0, full=True)]
-    short = replace(PROBLEMS["battery"], settings=settings)
-    found = compare(
-        lambda seed: replace(battery(seed), samples=12), 1, short.settings, linear=False
-    )
-    assert {TRUE, FIXED, LEARNED, *HORIZONS.values()} <= {row for _, row in found.rows}
-    assert all(controller == "MPC" for controller, _ in found.rows)  # LQ knows no limits
-    problem = found.problems[0]
-    controller = ct.MPC(problem.reduced, problem.goal, problem.period, problem.horizon)
-    tried = [
-        closed_loop(problem, MovingHorizon(problem, setting), controller, 0).cost(problem)
-        for setting in settings
-    ]
-    assert found.costs("MPC", HORIZONS[False]).tolist() == [min(tried[:2])]
-    assert found.costs("MPC", HORIZONS[True]).tolist() == tried[2:]
-    best = {HORIZONS[False]: settings[int(np.argmin(tried[:2]))], HORIZONS[True]: settings[2]}
-    assert found.settings == best

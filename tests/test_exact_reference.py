@@ -94,21 +94,3 @@ def test_energy_never_grows():
     assert len(rows) == 12
     checks = exact.energy_checks(rows)
     assert all(check.ok for check in checks), [check for check in checks if not check.ok]
-
-
-def test_growth_of_the_energy_is_seen():
-    setting = replace(exact.FULL, steps=10, truth="exact")  # data of another scheme
-    samples = exact.ReferenceSamples.of(setting)
-    course = exact.follow(samples, exact.law(setting, paper.STRICT))
-    assert exact.growth(samples, course) > 1.0
-    failed = replace(course, ok=np.zeros(11, dtype=bool))
-    assert np.isnan(exact.growth(samples, failed))
-    assert failed.failed == 11
-
-
-def test_tables_have_a_row_for_each(found):
-    table = exact.agreement_table(found)
-    assert [row[0] for row in table.rows] == list(CHOSEN)
-    assert all(row[-1] == 0 for row in table.rows)
-    assert len(SETTINGS) >= 16
-    exact._figure(dict.fromkeys(exact.DRAWN, found["partial"])).canvas.draw()

@@ -489,7 +489,7 @@ def test_a_checker_of_cf_accepts_the_files(tmp_path, kind):
     assert not found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_checker_of_cf_accepts_times_without_a_date(tmp_path):
     export(made(tmp_path / "run"), tmp_path / "run.nc")
     # Seconds since nothing are no time of CF. The checker expects one for the name alone.

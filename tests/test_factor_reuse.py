@@ -130,24 +130,3 @@ def test_a_scheme_of_second_order_solves_its_stages_to_the_end():
     )
     assert np.array_equal(one[1], other[1])
     assert all(np.array_equal(a.q, b.q) for a, b in zip(one[0], other[0], strict=True))
-
-
-def test_most_steps_make_no_factor(plate, monkeypatch):
-    """A kept factor saves factorisations: and every stage is solved with it."""
-    given, samples = plate
-    made = []
-    factor = BilinearSolver.factor
-
-    def counted(self, data, at):
-        made.append(at)
-        return factor(self, data, at)
-
-    monkeypatch.setattr(BilinearSolver, "factor", counted)
-    law = lp.GradientLaw(1.0, lp.laws.ResidualDamping(0.1))
-    identifier = lp.Identifier(given.model, given.omega, law, q0=0.0, u0=given.u0)
-    counts = []
-    for sample in samples[1:]:
-        made.clear()
-        assert identifier.step(*sample).status.ok
-        counts.append(len(made))
-    assert np.mean(np.array(counts[5:]) == 0) > 0.7

@@ -32,7 +32,6 @@ from skfem.helpers import dd, ddot, div, dot, grad
 import livepde as lp
 from livepde.errors import MissingInputError, ModelError, ObservationError, SpaceError
 from livepde.fem import START, Form, FunctionSpace, Inputs, Moment, Place, upwind
-from livepde.models import heat
 
 ORDER = 6
 
@@ -341,13 +340,6 @@ def test_product_of_unknowns():
             model.initial_parameter(given)
 
 
-def test_names_of_single_unknowns():
-    field = lp.Field(line(), ElementLineP1(), name="temperature")
-    model = lp.Model(field, lp.Normal(), product)
-    assert list(model.state_space.blocks) == ["temperature"]
-    assert list(model.parameter_space.blocks) == ["q"]
-
-
 def test_interpolation_is_exact_in_the_space():
     for name, case in CASES.items():
         mesh = case.mesh()
@@ -359,22 +351,6 @@ def test_interpolation_is_exact_in_the_space():
         constant = model.state_block.at_vertices @ model.initial(4.0)
         np.testing.assert_allclose(constant, 4.0, atol=1e-11, err_msg=name)
         np.testing.assert_array_equal(model.initial(0.0), 0.0)
-
-
-def test_points_are_located_once_on_a_mesh_without_names(monkeypatch):
-    """scikit-fem searches all facets for each one of a named boundary of quadrilaterals."""
-    mesh = lp.fem.rectangle((0.0, 1.0), (0.0, 1.0), (4, 4))
-    block = heat(mesh, lp.LogNormal(0.1, std=0.05), {"left": 0.0}).state_block
-    triangles, searched = MeshQuad.to_meshtri, []
-
-    def noted(mesh: MeshQuad, *args: object) -> object:
-        searched.append(mesh)
-        return triangles(mesh, *args)
-
-    monkeypatch.setattr(MeshQuad, "to_meshtri", noted)
-    block.probe(np.array([[0.3, 0.7], [0.2, 0.9]]))
-    assert len(searched) == 1
-    assert not searched[0].boundaries
 
 
 def test_probe_outside_of_the_mesh():

@@ -605,20 +605,6 @@ def test_unknowns_that_move_have_no_likelihood_of_a_draw():
 # --- objects that show themselves ----------------------------------------------------------------
 
 
-def test_a_model_shows_its_equation_priors_and_mesh():
-    shown = repr(two().model)
-    for line in (
-        "equation: integral of u' * v + q.k * lp.dot(lp.grad(u), lp.grad(v)) + q.r * u * v"
-        " - q.s * v = 0",
-        "state u: ElementLineP1, 21 coefficients, Dirichlet values left = channel T_left, right",
-        "unknown k: LogNormal(0.1, std=0.05)\n",
-        "unknown s: field, ElementLineP1, Normal(0, std=1)\n",
-        "mesh: 20 cells, x from 0 to 1\n",
-    ):
-        assert line in shown
-    assert "unknown alpha: LogNormal(0.1, std=0.05) m^2/s" in repr(rod())
-
-
 def test_a_ready_made_equation_shows_its_formula():
     from livepde.models import EQUATIONS, burgers, conduction, with_conditions
 
@@ -664,29 +650,6 @@ def test_terms_of_a_model_are_shown_as_they_are_written():
     layers = lp.Piecewise({"a": lambda x: x[0] < 0.5, "b": lambda x: x[0] >= 0.5}, lp.Normal(1, 1))
     model = lp.Model(lp.Field(mesh, lp.linear(mesh)), {"k": layers}, A=conduction)
     assert "unknown k: Normal(1, std=1) for each of k[a], k[b]" in repr(model)
-
-
-def test_an_identifier_shows_law_sensors_and_time():
-    who = identifier(validation=lp.Points({"W": 0.5}))
-    shown = repr(who)
-    for line in ("law: SensitivityLaw()", "sensors: T_30, T_60\n", "validation: W\n", "time: 0 s"):
-        assert line in shown
-    who = identifier()
-    who.run(dated())
-    assert repr(who).startswith("Identifier after 24 samples")
-    assert repr(who).endswith("time: 2.875 s since 2025-03-01 12:00:00 UTC")
-
-
-def test_estimates_and_results_show_their_numbers():
-    estimate = repr(two().last)
-    assert estimate.startswith("Estimate at t = 2.875\n")
-    assert f"k: {two().last['k']}" in estimate
-    assert "s: field, coefficients" in estimate
-    shown = repr(found())
-    assert shown.startswith("Result of 24 samples until t = 2.875 s\n")
-    assert f"alpha: {found().last['alpha']} m^2/s" in shown
-    assert f"verdict: {found().verdict.level}" in shown
-    assert repr(identifier().run([])) == "Result of 0 samples"
 
 
 def test_a_notebook_shows_tables():

@@ -13,7 +13,6 @@ from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
 from livepde.fleet import Fleet, FleetRecords
-from livepde.laws.innovations import Innovations
 from livepde.linalg import BandedBlocks, BandedSolver, Pattern
 from livepde.models import Flux, heat, with_conditions
 from livepde.result import Result
@@ -503,21 +502,6 @@ def test_bad_members():
         fleet.run(pd.DataFrame())
 
 
-def test_statistics_of_innovations_are_those_of_each_member():
-    rng = np.random.default_rng(0)
-    each = [Innovations.start(3) for _ in range(4)]
-    stacked = Innovations.start(3, 4)
-    for k in range(40):
-        e = (1.0 + np.arange(4))[:, None] * (rng.standard_normal((4, 3)) + np.sin(0.1 * k))
-        e[rng.random(e.shape) < 0.2] = np.nan
-        each = [one.add(row[None]) for one, row in zip(each, e, strict=True)]
-        stacked = stacked.add(e)
-        for name in ("ratio", "correlation", "inflation", "scatter", "persistence"):
-            mine = getattr(stacked, name)
-            theirs = [float(getattr(one, name)[0]) for one in each]
-            np.testing.assert_allclose(mine, theirs, rtol=1e-12)
-
-
 def test_blocks_solve_what_each_would_and_a_singular_one_disturbs_none():
     rng = np.random.default_rng(0)
     n, blocks = 9, 6
@@ -609,13 +593,6 @@ def test_what_is_kept_is_what_the_results_of_separate_runs_keep(name):
         xr.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
     kept.clear()
     assert (kept.size, list(kept.records(0))) == (0, [])
-
-
-def test_members_that_step_separately_are_not_kept_as_arrays():
-    fleet = lp.Fleet(rod(), SENSORS, lp.GradientLaw(), 2)
-    estimate = fleet.step(*samples(fleet, 5)[0])
-    with pytest.raises(lp.errors.ConfigurationError, match="separately"):
-        FleetRecords(fleet.model).add(estimate)
 
 
 @pytest.mark.parametrize("law", ["drift", "gate, noise"])

@@ -101,11 +101,14 @@ def test_drawdown_in_a_leaky_aquifer_is_that_of_hantush():
     assert np.abs(found - exact).max() < 0.001 * exact.max()
 
 
-def pumped(folder: Path, **settings: Any) -> Any:
+def pumped(folder: Path, count: int = 40, **settings: Any) -> Any:
     """Return a case with readings of a leaky aquifer; the first one comes after 20 minutes."""
-    t = np.geomspace(1200.0, 3e4, 40)
+    t = np.geomspace(1200.0, 3e4, count)
     rng = np.random.default_rng(1)
-    z = {f"h{r}": [hantush(r, one) for one in t] + rng.normal(0.0, 1e-3, 40) for r in (30, 60, 120)}
+    z = {
+        f"h{r}": [hantush(r, one) for one in t] + rng.normal(0.0, 1e-3, count)
+        for r in (30, 60, 120)
+    }
     pd.DataFrame({"t": t, **z, "Q": Q}).to_csv(folder / "test.csv", index=False)
     sensors = "".join(
         f'{name} = {{ role = "sensor", column = "{name}", at = {name[1:]}.0 }}\n' for name in z
@@ -130,7 +133,7 @@ Q = {{ role = "input", column = "Q" }}
 @pytest.mark.slow
 def test_readings_that_move_against_the_prior_are_named(tmp_path: Path):
     """Heads fall where the drawdown of the model rises."""
-    case = pumped(tmp_path).path
+    case = pumped(tmp_path, 20).path
     code, output = call("check", case, "--set", "data.t0=0")
     assert code == 0
     assert "Readings, and their prediction at the prior" in output

@@ -7,38 +7,16 @@ from factories import observe
 import livepde as lp
 from benchmarks.honest import PROBLEMS
 from benchmarks.honest.batch import Batch
-from benchmarks.honest.linear import Chebyshev, Linear, fine_times
-from benchmarks.honest.noise import disturbed
+from benchmarks.honest.linear import Chebyshev
 from benchmarks.honest.problems.fisher import CELLS, Population
 from benchmarks.honest.problems.flux import NonlinearFlux, RodFlux
 from benchmarks.honest.problems.warm import WarmRod
-from benchmarks.honest.report import outcome
-from benchmarks.honest.twin import SHARES, Run
 from livepde.fem import Inputs, Moment
 
 SMALL = 0.15  # of the noise, root mean square: that much truth and refined livepde may differ
 
 
 # --- truths against closed forms -----------------------------------------------------------------
-
-
-def test_the_answer_to_straight_inputs_is_exact():
-    """y' = -a y + t has y = (t - (1 - exp(-a t))/a)/a, for any step."""
-    a, times = 3.0, np.linspace(0.0, 2.0, 5)
-    exact = (times - -np.expm1(-a * times) / a) / a
-    one, nothing = np.ones((1, 1)), np.zeros((1, 1))
-    for A in (np.array([-a]), np.array([[-a]])):
-        found = Linear(A, one, one, nothing).respond(fine_times(times)[:, None], 0.5)
-        np.testing.assert_allclose(found[:, 0], exact, rtol=1e-12)
-
-
-def test_slow_modes_take_the_series():
-    """A diagonal system next to zero is an integral of its input."""
-    one, times = np.ones((1, 1)), np.linspace(0.0, 1.0, 3)
-    for rate in (0.0, -1e-6, -1e-2):
-        found = Linear(np.array([rate]), one, one, 0 * one).respond(np.ones((17, 1)), 0.5)
-        exact = times if rate == 0.0 else np.expm1(rate * times) / rate
-        np.testing.assert_allclose(found[:, 0], exact, rtol=1e-9)
 
 
 def test_collocation_decays_as_the_first_sine():
@@ -176,42 +154,6 @@ def test_the_flux_of_the_truth_walks_as_the_estimator_believes():
     assert np.linalg.norm(problem.latents["J"].directions(40)) == pytest.approx(expected)
 
 
-# --- data ----------------------------------------------------------------------------------------
-
-
-def test_kinds_of_data():
-    problem = PROBLEMS["rod"]
-    shown = np.zeros((problem.intervals + 1, 300))
-
-    def noise(kind):
-        data = disturbed(kind, problem, shown[:, :3], np.random.default_rng(0))
-        return data, data.z / problem.noise
-
-    def many(kind):
-        return disturbed(kind, problem, shown, np.random.default_rng(0)).z / problem.noise
-
-    white = noise("white")[1]
-    for kind, share in (("ar100", 0.01), ("ar10", 0.1)):
-        e = many(kind)
-        rho = np.mean(e[1:] * e[:-1])
-        assert rho == pytest.approx(np.exp(-1.0 / (share * problem.intervals)), abs=0.02)
-        assert e.std() == pytest.approx(1.0, abs=0.03)
-    student = many("student")
-    assert np.median(np.abs(student)) == pytest.approx(0.765 / np.sqrt(3.0), rel=0.02)
-    data, e = noise("spike")
-    assert np.count_nonzero(e != white) == 1
-    assert np.abs(e[data.spike]).max() > 40.0
-    np.testing.assert_array_equal(data.right / problem.noise, white)
-    data, e = noise("gaps")
-    np.testing.assert_array_equal(e, white)
-    assert np.isnan(data.inputs).mean() == pytest.approx(0.3, abs=0.05)
-    assert np.isfinite(data.inputs[0]).all()
-    data, e = noise("bias")
-    shift = np.abs(e - white)
-    np.testing.assert_allclose(sorted(shift.mean(axis=0)), [0.0, 0.0, 2.0], atol=1e-9)
-    assert list(problem.points)[int(shift[0].argmax())] == data.biased
-
-
 # --- batch and scores ----------------------------------------------------------------------------
 
 
@@ -228,42 +170,3 @@ def test_the_batch_posterior_holds_its_truths():
             std = batch.std(latent, problem.intervals)
             errors.append(((latent.value(fit, 0) - latent.value(theta, 0)) / std).item())
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(1.0, abs=0.25)
-
-
-def scores(seed, covered, width=1.0, error=1.0, shift=0.1):
-    shape = (len(SHARES), 1)
-    return Run(
-        "rod",
-        "spike" if seed < 40 else "white",
-        seed,
-        covered=np.full(shape, covered),
-        width=np.full(shape, width),
-        widest=np.full(shape, 0.2 * width),
-        error=np.full(shape, error),
-        z=np.full(shape, error),
-        fit=np.ones(1),
-        shift=np.full(shape, shift),
-    )
-
-
-def failed(runs):
-    return {check.name for check in outcome(runs).checks if not check.ok}
-
-
-def test_checks_find_what_is_wrong():
-    good = [scores(seed, 0.0 if seed % 20 == 0 else 1.0) for seed in range(80)]
-    assert failed(good) == set()
-    everywhere = {f"all problems, white: coverage after {share:.0%} of the run" for share in SHARES}
-    least = "rod, white: least coverage of one unknown at one time"
-    narrow = [*good[:40], *(scores(seed, float(seed % 3 == 0)) for seed in range(40, 80))]
-    assert failed(narrow) == {"rod, white: coverage", least, *everywhere}
-    wide = [*good[:40], *(scores(seed, 1.0, width=8.0) for seed in range(40, 80))]
-    too_wide = {"rod, white: median width / batch", "rod, white: widest interval / prior"}
-    assert failed(wide) == {"rod, white: coverage", *too_wide, *everywhere}
-    far = [*good[:79], scores(79, 1.0, error=9.0)]
-    assert failed(far) == {"rod, white: error / batch fit"}
-    moved = [scores(0, 0.0, shift=3.0), *good[1:]]
-    assert failed(moved) == {"rod, spike: largest shift by the spike, in standard deviations"}
-    good[0].failure = "StepFailed: at t = 1"
-    assert failed(good) == {"rod, spike: runs that ended early"}
-    assert outcome(good).notes[-1] == "rod, spike, seed 0: StepFailed: at t = 1"

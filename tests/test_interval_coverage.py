@@ -6,17 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks import coverage
-from benchmarks.coverage import PROBLEMS, twin
+from benchmarks.coverage import PROBLEMS
 
 pytestmark = pytest.mark.study
-
-
-@pytest.mark.parametrize("name", PROBLEMS)
-def test_a_twin_is_the_same_for_the_same_seed(name: str):
-    first, again, other = (twin(PROBLEMS[name], seed) for seed in (1, 1, 2))
-    assert first == again
-    assert first.error != other.error
-    assert set(first.inside) == {0.68, 0.95}
 
 
 def test_true_values_are_drawn_from_the_prior_and_move_as_it_says():

@@ -181,27 +181,6 @@ def test_an_unknown_that_the_equation_does_not_read(monkeypatch):
     assert not form.product("v", "u", u, q=q).any()
 
 
-def test_straight_triangles_share_one_tensor(monkeypatch):
-    monkeypatch.setattr(forms, "LARGEST_TENSOR", 0)
-    mesh = MeshTri().refined(3)
-    mesh = MeshTri(mesh.p + 0.01 * np.sin(9.0 * mesh.p[::-1]), mesh.t)
-    field = lp.Field(mesh, ElementTriP1())
-    form = lp.Model(field, field, A=lambda q, u, v, x: q * u * v).form_A
-    (term,) = form.tensor("v", "q").terms
-    assert term.tensors.shape == (3, 3, 3, 1)
-    assert form.tensor("q", "u").terms is form.tensor("v", "q").terms
-
-
-def test_patterns_of_equal_spaces_are_one_object():
-    mesh = MeshTri().refined(2)
-    one, other = (lp.Field(mesh, ElementTriP1()) for _ in range(2))
-    model = lp.Model(one, other, A=lambda q, u, v, x: q * u * v, B=lambda u, v, x: u * v)
-    pattern = model.form_A.pattern("v", "q")
-    assert model.form_A.pattern("v", "u") is pattern
-    assert model.form_M.pattern("v", "u") is pattern
-    assert model.form_B.pattern("v", "u") is pattern
-
-
 def test_forms_on_some_cells_add_up():
     mesh = triangles()
     space = FunctionSpace.of(lp.Field(mesh, ElementTriP2()), "u")

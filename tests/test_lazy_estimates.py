@@ -14,10 +14,8 @@ import livepde as lp
 from livepde.checkpoint import flatten
 from livepde.estimate import read_together
 from livepde.frames import interval_ends
-from livepde.laws import Belief
 from livepde.models import heat
 from livepde.readout import ScalarReadout
-from livepde.records import Record, RecordArrays, Snapshot
 
 
 def rod(unknown=None, law=None, validation=None, cells=30):
@@ -79,26 +77,6 @@ def test_estimates_that_are_read_together_are_the_same():
         assert one.diagnostics.named() == other.diagnostics.named()
         for name in ("q", "u", "q_factor", "u_factor", "prior_factor", "rest"):
             np.testing.assert_array_equal(getattr(one.belief, name), getattr(other.belief, name))
-
-
-@pytest.mark.slow
-def test_what_is_not_read_is_not_computed(monkeypatch):
-    made = []
-    made_by = Belief.__init__
-
-    def counted(self, *given, **named):
-        made.append(1)
-        made_by(self, *given, **named)
-
-    identifier = rod()
-    taken = list(samples(6))
-    identifier.step(*taken[0])
-    monkeypatch.setattr(Belief, "__init__", counted)
-    kept = [identifier.step(*sample) for sample in taken[1:]]
-    assert not made
-    assert [len(estimate.innovation) for estimate in kept] == [5] * 5
-    assert kept[0].parameters["alpha"][0] == kept[0].q[0]
-    assert len(made) == 1
 
 
 @pytest.mark.slow
@@ -164,47 +142,3 @@ def test_a_result_keeps_little_more_than_its_numbers():
     assert data.sizes["snapshot"] == data.sizes["time"] == count
     assert needed <= held + 4 * 8 * count  # the matrix of correlations is told once
     assert held <= 1.2 * (needed + 4 * 8 * count)
-
-
-def test_arrays_give_back_the_records_that_they_took():
-    rng = np.random.default_rng(1)
-    profile = {"u": rng.normal(size=4), "u_std": rng.normal(size=4)}
-    plain = Snapshot(profile, {})
-    whole = Snapshot(profile, {"q": (1.5, 3)}, rng.normal(size=(2, 2)))
-
-    def record(t, status, steps, notes, snapshot=None):
-        numbers, innovation = rng.normal(size=3), rng.normal(size=2)
-        return Record(
-            t=t,
-            numbers=numbers,
-            innovation=innovation,
-            validation_error=np.zeros(0),
-            status=status,
-            steps=steps,
-            notes=notes,
-            snapshot=snapshot,
-        )
-
-    given = [
-        record(0.5, 0, 1, {"a": 1.0}, plain),
-        record(1.0, 4, 2, {}),
-        record(1.5, 1, 0, {"b": 2.0}, whole),
-        record(2.0, 0, 9, {"b": 3.0, "a": 4.0}),
-    ]
-    kept = RecordArrays.of(given)
-    assert RecordArrays.of(kept) is kept
-    assert (len(kept), kept.last_snapshot, list(kept.notes)) == (4, 2, ["a", "b"])
-    np.testing.assert_array_equal(kept.notes["a"], [1.0, np.nan, np.nan, 4.0])
-    for one, other in zip(kept, given, strict=True):
-        for name in ("t", "status", "steps", "notes"):
-            assert getattr(one, name) == getattr(other, name)
-        np.testing.assert_array_equal(one.numbers, other.numbers)
-        np.testing.assert_array_equal(one.innovation, other.innovation)
-        assert one.validation_error.shape == (0,)
-        assert (one.snapshot is None) == (other.snapshot is None)
-        if one.snapshot is not None:
-            assert one.snapshot.told == other.snapshot.told
-            np.testing.assert_array_equal(one.snapshot.profiles["u_std"], profile["u_std"])
-            np.testing.assert_array_equal(one.snapshot.correlation, other.snapshot.correlation)
-    kept.append(given[0])  # what was looked at before does not keep it from growing
-    assert len(list(kept)) == 5

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.linalg import sqrtm
@@ -11,13 +9,12 @@ from scipy.linalg import sqrtm
 import livepde as lp
 from benchmarks import lean
 from benchmarks import rods as costs
-from benchmarks.layered import ENDS, STEP, rod
+from benchmarks.layered import ENDS, STEP
 from benchmarks.peers import arrays
 from benchmarks.peers.augmented import Augmented
 from benchmarks.problems import PROBLEMS
 from benchmarks.problems.rod import ROD
-from livepde.errors import LinearAlgebraError
-from livepde.fem import Inputs, Moment, linear
+from livepde.fem import Inputs, Moment
 
 COUNT = 60
 # The reference has neither safeguards nor an iterated start.
@@ -101,36 +98,6 @@ def test_a_square_is_assembled_as_simulate_does():
     np.testing.assert_allclose(S @ after, known, atol=1e-12 * abs(S).max())
 
 
-def test_a_process_without_constant_matrices_is_refused():
-    mesh = lp.interval(0.0, 1.0, 8)
-    model = lp.Model(
-        lp.Field(mesh, linear(mesh)),
-        {"a": lp.Normal(1.0, 0.1)},
-        A=lambda q, u, v, x: q.a * u * u * v,
-    )
-    with pytest.raises(lean.NotAffineError, match="affine"):
-        lean.Matrices.of(model, np.eye(1), 0.1)
-
-
-def test_unknowns_that_enter_nonlinearly_have_no_slope():
-    mesh = lp.interval(0.0, 1.0, 8)
-    model = lp.Model(
-        lp.Field(mesh, linear(mesh)),
-        {"a": lp.LogNormal(1.0, 0.1)},
-        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
-    )
-    matrices = lean.Matrices.of(model, np.eye(1), 0.1)
-    with pytest.raises(lean.NotAffineError, match="linear"):
-        matrices.derivative(np.zeros((1, 9)))
-
-
-def test_a_singular_matrix_is_an_error():
-    matrices = lean.Matrices.of(rod(31, 2, "source"), np.eye(2), STEP)
-    matrices = replace(matrices, entries=lambda a: np.zeros((1, len(matrices.where))))
-    with pytest.raises(LinearAlgebraError, match="singular"):
-        matrices.factorise(np.zeros((1, 2)))
-
-
 # --- filters as arrays ---------------------------------------------------------------------------
 
 
@@ -198,19 +165,3 @@ def full(augmented, columns, order):
     whole = np.zeros((augmented.model.X.dim, columns.shape[1]))
     whole[augmented.free] = columns
     return whole[order]
-
-
-# --- the tables, at the smallest size ------------------------------------------------------------
-
-
-def test_a_row_without_a_bound_has_no_check():
-    given = costs.Rod(12, 2, "channels")
-    outcome = costs.rods([given], runs=1, first=3)
-    assert outcome.checks == []
-    assert [row[6] for row in outcome.tables[0].rows] == [None, None]
-
-
-def test_every_bound_is_of_a_process_that_is_timed():
-    timed = {(given.nodes, given.unknowns) for given in costs.RODS if given.ends == ENDS[0]}
-    assert set(costs.BOUNDS) <= timed
-    assert {(given.nodes, given.ends) for given in costs.RODS} == set(costs.EARLIER)

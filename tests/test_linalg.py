@@ -122,14 +122,6 @@ def test_pattern_keeps_structure_and_positions(data, n, m):
     np.testing.assert_array_equal(twice, 2 * values)
 
 
-def test_position_outside_of_the_pattern():
-    pattern = Pattern.of(sp.eye_array(3))
-    with pytest.raises(IndexError, match="outside"):
-        pattern.positions(np.array([0]), np.array([1]))
-    with pytest.raises(IndexError, match="outside"):
-        pattern.positions(np.array([2]), np.array([5]))
-
-
 def regular(n, rng, spd=False):
     """A sparse, well-conditioned matrix."""
     matrix = sp.random_array((n, n), density=0.15, rng=rng)
@@ -345,10 +337,6 @@ def test_positive_definite_is_the_sign_of_the_smallest_eigenvalue(n, seed, shift
     smallest = np.linalg.eigvalsh(matrix.toarray()).min()
     if abs(smallest) > 1e-9:
         assert positive_definite(matrix) == (smallest > 0)
-
-
-def test_a_zero_matrix_is_not_positive_definite():
-    assert not positive_definite(sp.csr_array((3, 3)))
 
 
 def test_units_spare_the_banded_engine_its_exchanges_of_rows():

@@ -200,15 +200,15 @@ def test_what_comes_too_fast_is_merged_or_dropped_and_counted(tmp_path, overflow
 
 @pytest.mark.slow
 def test_broken_rows_are_counted_and_the_rest_arrives(tmp_path):
-    good = list(rows(200))
+    good = list(rows(80))
     mixed = []
     for k, row in enumerate(good):
         mixed.append(row)
         mixed.append([{"t": "x"}, {"a": 1.0}, {"t": math.inf}, {"t": row["t"], "a": "?"}][k % 4])
-    run = live(tmp_path, Rows(mixed))
+    run = live(tmp_path, Rows(mixed), verdict=False)
     run.run()
-    assert len(run.journal) == 200
-    assert run.journal.counts == {("malformed", ""): 150, ("malformed", "a"): 50}
+    assert len(run.journal) == 80
+    assert run.journal.counts == {("malformed", ""): 60, ("malformed", "a"): 20}
     kinds = [event.kind for event in run.journal.events]
     assert [kind for kind in kinds if kind not in ("verdict", "unwell", "well")] == [
         "malformed",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,11 +12,8 @@ from skfem import ElementLineP1, ElementLineP2
 import livepde as lp
 from livepde.fem import Inputs, Moment
 from livepde.laws.assimilation import absorb
-from livepde.linalg import Array
-from livepde.linalg.member_arrays import changed, join, put, put_each, take, where
+from livepde.linalg.member_arrays import changed, take
 from livepde.stepping import BandedStage, ForwardStage, KeptFactors, Moments, Span, StageOfMembers
-from livepde.stepping.driven_vector import DrivenVector
-from livepde.stepping.member_stage import SeparateStages
 
 MESH = lp.interval(0.0, 1.0, 14)
 
@@ -123,105 +120,6 @@ def test_matrices_that_time_or_bent_inputs_change_are_not_kept(flow: Any):
     assert "depend on time, or on inputs other than linearly" in BandedStage.refuses(model)
 
 
-def test_stages_that_share_factors_have_their_own_directions():
-    """As for unknowns that move: the process noise of a stage is that of its time."""
-    model, rng = MODELS["source in time"], np.random.default_rng(0)
-    stage, at = BandedStage(model), Moments(t=0.7, channels=(), inputs=np.zeros((1, 0)))
-    columns, q = rng.standard_normal((4, 1, model.X.dim)), np.array([[0.2, 0.5]])
-    columns[1:, :, model.state_space.fixed] = 0.0
-    shared: dict[float, Any] = {}
-    for apart in (0, 1, 2):
-        directions = rng.standard_normal((1, 3, 2))
-        parts = np.zeros(1, dtype=int), q, directions, 0.1, at, stage.kept(1), np.zeros(1, bool)
-        found, _ = stage.advance(columns, StageOfMembers(*parts, shared, apart))
-        wanted, _ = stage.advance(columns, StageOfMembers(*parts, {}, apart))
-        np.testing.assert_array_equal(found, wanted)
-
-
-def test_other_stages_step_members_one_by_one():
-    model = lp.Model(
-        lp.Field(MESH, ElementLineP1(), dirichlet={"left": 1.0}),
-        lp.Normal(0.2, 0.1),
-        A=lambda q, u, v, x: q * (1.0 + u**2) * lp.dot(lp.grad(u), lp.grad(v)),
-    )
-    assert "affine" in BandedStage.refuses(model)
-    stage, forward, rng = SeparateStages(model), ForwardStage(model), np.random.default_rng(1)
-    columns = 1.0 + 0.01 * rng.random((3, 2, model.X.dim))
-    q = np.array([[0.2], [0.3]])
-    columns[1:, :, model.state_space.fixed] = 0.0
-    directions, at = np.ones((2, 2, 1)), Moments(t=0.1, channels=(), inputs=np.zeros((1, 0)))
-    numbers, off = np.array([4, 1]), np.zeros(2, dtype=bool)
-    work = StageOfMembers(numbers, q, directions, 0.1, at, stage.kept(2), off, {})
-    new, _ = stage.advance(columns, work)
-    for k in range(2):
-        kept = KeptFactors.none(1).member(0)
-        wanted, _ = forward.advance(columns[:, k].T, q[k], directions[k].T, 0.1, at.member(k), kept)
-        np.testing.assert_array_equal(new[:, k].T, wanted)
-
-
-@pytest.mark.parametrize(
-    ("vector", "affine", "assembled"),
-    [
-        (lambda moment: np.array([1.0, 2.0]), True, True),
-        (lambda moment: np.array([1.0, 2.0 + 3.0 * moment.inputs["p"]]), True, True),
-        (lambda moment: np.array([moment.t, moment.inputs["p"]]), True, False),
-        (lambda moment: np.array([1.0, abs(moment.inputs["p"])]), False, False),
-    ],
-    ids=["constant", "affine", "timed", "bent"],
-)
-def test_a_driven_vector_is_what_it_was_made_from(vector: Any, affine: bool, assembled: bool):
-    timed = vector(Moment(1.0, Inputs({"p": 1.0})))[0] != vector(Moment(2.0, Inputs({"p": 1.0})))[0]
-    driven = DrivenVector(vector, ("p",), lambda: bool(timed))
-    assert driven.affine is affine
-    assert (driven.responses is not None) is assembled
-    for p in (-3.0, 0.0, 1e6):
-        one = driven(Moments(t=0.3, channels=("p",), inputs=np.array([[p]])))
-        wanted = vector(Moment(0.3, Inputs({"p": p})))
-        np.testing.assert_allclose(one, wanted[None], rtol=1e-13)
-    if affine:
-        rows = np.array([[2.0], [5.0], [-1.0]])
-        found = driven(Moments(t=0.3, channels=("p",), inputs=rows))
-        wanted = np.array([vector(Moment(0.3, Inputs({"p": float(p)}))) for (p,) in rows])
-        np.testing.assert_allclose(np.broadcast_to(found, (3, 2)), wanted, rtol=1e-13)
-
-
-@dataclass(frozen=True, eq=False)
-class Inner:
-    root: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Outer:
-    value: Array
-    inner: Inner
-
-
-def state(members: int, rows: int, at: float) -> Outer:
-    return Outer(np.full(members, at), Inner(np.full((members, rows, 2), at)))
-
-
-def test_members_are_taken_put_and_joined_and_square_roots_widened():
-    whole = join(state(2, 3, 1.0), state(1, 5, 2.0))
-    assert whole.value.tolist() == [1.0, 1.0, 2.0]
-    assert whole.inner.root.shape == (3, 5, 2)
-    assert not whole.inner.root[:2, 3:].any()
-    assert take(whole, 2).value.tolist() == [2.0]
-    assert take(whole, np.array([2, 0])).value.tolist() == [2.0, 1.0]
-    mixed = put(whole, 0, state(1, 1, 7.0))
-    assert mixed.value.tolist() == [7.0, 1.0, 2.0]
-    assert mixed.inner.root[0].tolist() == [[7.0, 7.0]] + 4 * [[0.0, 0.0]]
-    assert whole.value[0] == 1.0
-    both = {2: state(1, 1, 8.0), 0: state(1, 2, 7.0)}
-    assert put_each(whole, both).value.tolist() == [7.0, 1.0, 8.0]
-    assert put_each(whole, both).inner.root[:, 1, 0].tolist() == [7.0, 1.0, 0.0]
-    assert put_each(whole, {0: both[0]}).value.tolist() == [7.0, 1.0, 2.0]
-    assert put_each(whole, {}) is whole
-    chosen = np.array([True, False, False])
-    assert where(chosen, mixed, whole).value.tolist() == [7.0, 1.0, 2.0]
-    assert where(~chosen, mixed, whole).value.tolist() == [1.0, 1.0, 2.0]
-    assert changed(whole, value=np.zeros(3)).inner is whole.inner
-
-
 @pytest.mark.slow
 def test_a_fleet_whose_validation_sensors_read_channels_of_their_own():
     model = rod({"left": lp.Channel("T_0"), "right": 0.0})
@@ -275,19 +173,6 @@ def test_rows_that_a_member_has_missed_stay_out_of_its_log_after_an_alarm():
         both = min(len(times), len(wanted))
         np.testing.assert_allclose(times[-both:], wanted[-both:])
     assert alarms
-
-
-@pytest.mark.slow
-def test_what_a_refit_leaves_is_what_the_law_goes_back_to():
-    law = lp.SensitivityLaw(guards=lp.laws.Guards(past=8))
-    model, rng = rod({"left": 1.0, "right": 0.0}), np.random.default_rng(0)
-    identifier = lp.Identifier(model, lp.Points([0.3, 0.6], noise=0.01), law, u0=0.0)
-    for k in range(8):
-        identifier.step(0.1 * (k + 1), [0.7, 0.4] + 0.01 * rng.standard_normal(2))
-    state = identifier._state
-    assert state.since_newer[0] == state.log.shape[1] - 1
-    np.testing.assert_array_equal(state.newer.q, state.now.q)
-    np.testing.assert_array_equal(state.newer.da, state.now.da)
 
 
 def test_each_member_has_its_own_noise_level_and_is_finite_by_itself():

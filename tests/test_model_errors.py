@@ -428,17 +428,18 @@ def test_a_sound_run_without_a_fit_has_hardly_a_wider_interval(why):
     assert one.wider < 1.3
 
 
-# Where an unknown moves, and in a window, runs take seconds each: one of them, the rest on demand.
-SECONDS = {
-    pair: pytest.mark.slow if pair in (("moves", "gain"), ("window", "lag")) else pytest.mark.long
-    for pair in product(["moves", "window"], ["source", "gain", "lag"])
-}
-EACH = product(UNFITTED, ["source", "gain", "lag"])
+FAULTS = ("source", "gain", "lag")
+# One kind of run with each fault, two with one of them; the rest on demand.
+OFTEN = {("moves", "gain"), ("fades", "gain"), *product(["not stored"], FAULTS)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("why", "wrong"),
-    [pytest.param(*pair, marks=SECONDS.get(pair, pytest.mark.slow)) for pair in EACH],
+    [
+        pytest.param(*pair, marks=[] if pair in OFTEN else pytest.mark.long)
+        for pair in product(UNFITTED, FAULTS)
+    ],
 )
 def test_an_interval_of_innovations_allows_for_errors_of_process_and_sensors(why, wrong):
     z = truth(3, ("source", 0.06)) if wrong == "source" else truth(3).copy()
@@ -626,9 +627,9 @@ def test_an_initial_time_long_before_the_samples_changes_no_course_in_time():
     rng = np.random.default_rng(4)
     ends = {"left": lp.Channel("T"), "right": 0.0}
     rod = lp.models.heat(lp.interval(0.0, 1.0, 20), lp.LogNormal(0.1, std=0.05), dirichlet=ends)
-    t = 0.05 * np.arange(120)
+    t = 0.05 * np.arange(80)
     drive = np.sin(2.1 * t) + 0.3 * np.sin(7.0 * t)
-    late = 0.6 * np.interp(t - 0.4, t, drive)[:, None] + 0.02 * rng.standard_normal((120, 1))
+    late = 0.6 * np.interp(t - 0.4, t, drive)[:, None] + 0.02 * rng.standard_normal((80, 1))
 
     def upper(t0: float) -> float:
         sensors = lp.Points({"a": 0.3}, noise=0.02)

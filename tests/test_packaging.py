@@ -16,7 +16,6 @@ from typer.testing import CliRunner
 
 import livepde
 from livepde import cli
-from livepde.cli import experiments
 from livepde.models import EQUATIONS
 
 ROOT = Path(__file__).parents[1]
@@ -145,27 +144,6 @@ def test_bibtex():
         assert f"  {entry},\n" in paper
     assert text.count("{") == text.count("}")
     assert "None" not in text
-
-
-def test_apa():
-    software, paper = told("citation", "--format", "apa").split("\n\n")
-    assert software == (
-        f"The livepde authors. (n.d.). livepde (Version {livepde.__version__}) [Computer software]."
-    )
-    assert paper == (
-        "Boiger, R., & Kaltenbacher, B. (2016). An online parameter identification method for time "
-        "dependent partial differential equations. Inverse Problems, 32, Article 045006. "
-        "https://doi.org/10.1088/0266-5611/32/4/045006\n"
-    )
-
-
-def test_a_release_has_a_year(monkeypatch, tmp_path):
-    released = (ROOT / "CITATION.cff").read_text() + "date-released: 2027-03-01\n"
-    (tmp_path / "CITATION.cff").write_text(released)
-    monkeypatch.setattr(experiments, "files", lambda package: tmp_path)
-    assert told("citation").startswith("@misc{livepde2027,")
-    assert "  year = {2027},\n" in told("citation")
-    assert told("citation", "--format", "apa").startswith("The livepde authors. (2027). livepde (")
 
 
 # --- completion ------------------------------------------------------------------------------

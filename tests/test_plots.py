@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 import livepde as lp
 from livepde import plots
-from livepde.plots.style import shades_of
 
 DAY = 86400.0
 
@@ -224,21 +222,6 @@ def test_profiles_of_a_state_have_an_exact_line_for_each_time() -> None:
     assert ax.get_legend() is None
 
 
-def test_profiles_draw_where_they_are_told() -> None:
-    figure, axes = plots.figure(1, 2)
-    assert plots.profiles(dataset(), "u", ax=axes[1]) is axes[1]
-    assert plots.history({"a": ([0, 1], [1, 2])}, ax=axes[0]) is axes[0]
-    assert len(figure.axes) == 2
-
-
-def test_times_that_are_counted_lie_early() -> None:
-    ax = plots.profiles(dataset(std=np.nan), "u", times=4)
-    times = [float(text.removeprefix("t = ")) for text in texts(ax)]
-    assert times[0] == 0
-    assert times[-1] == pytest.approx(9.31)
-    assert times[1] < 9.31 / 3
-
-
 def test_history() -> None:
     ax = plots.history(
         {"a": ([0, 1], [1, 0.1]), "b": ([0, 1], [1, 0.2])}, levels={"q = 0": 1.0}, ylabel="error"
@@ -261,13 +244,6 @@ def test_history() -> None:
 def test_refusals(draw: Any, message: str) -> None:
     with pytest.raises(lp.errors.ConfigurationError, match=message):
         draw()
-
-
-def test_colours_differ_in_lightness_too() -> None:
-    shades = [to_hex(colour) for colour in shades_of(6)]
-    lightness = [sum(int(shade[k : k + 2], 16) for k in (1, 3, 5)) for shade in shades]
-    assert lightness == sorted(lightness)
-    assert len(set(plots.PALETTE)) == len(plots.PALETTE)
 
 
 def test_loops_name_a_limit_once():

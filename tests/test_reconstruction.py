@@ -74,13 +74,6 @@ def test_the_norm_of_X_gives_the_papers_formula():
     np.testing.assert_allclose(observed.reconstruct(z).u, expected, atol=1e-12)
 
 
-def test_on_a_subdomain_the_norm_of_X_only_shrinks():
-    model = rod()
-    observed = observe(model, lp.Subdomain(MIDDLE, reconstruction=Tikhonov("X", 0.25)))
-    z = observed.G @ wavy(model)
-    np.testing.assert_allclose(observed.reconstruct(z).u, observed.G.T @ z / 1.25, rtol=1e-9)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("norm", ["X", "V", laplace])
 def test_it_lies_in_the_complement_of_the_null_space(kind, norm):
@@ -353,8 +346,3 @@ def test_the_noisy_excited_twin_shows_what_smoothing_is_good_for(monkeypatch):
     assert whole(0.01, 100, smoothing=True).error == outcome.tables[1].rows[0][2] <= 0.10
     json.dumps(outcome.to_dict(), allow_nan=False)
     outcome.figures["error"]()
-
-
-def test_a_noise_level_is_positive():
-    with pytest.raises(lp.errors.ConfigurationError, match="level must be a positive"):
-        noisy.noisy_run(0.0)

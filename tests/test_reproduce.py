@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 import livepde as lp
-from livepde import progress
 from livepde.reproduce import EXPERIMENTS, seed, seed_excited
 from livepde.reproduce.experiment import track
 from livepde.runs import Outcome
-from livepde.streams import RelativeNoise
 
 pytestmark = pytest.mark.study
 
@@ -74,28 +72,6 @@ def test_seed_with_a_fine_truth_says_the_same() -> None:
     assert "20 times smaller steps" in outcome.notes[0]
 
 
-def test_seed_figures_have_the_lines_of_the_paper(discrete: Outcome) -> None:
-    parameter = discrete.figures["parameter"]()
-    for ax in parameter.axes:
-        assert len(ax.lines) == 7  # six estimates and the exact parameter
-        marked = [line for line in ax.lines if line.get_marker() not in ("None", "")]
-        assert len(marked) == 6
-        assert all(len(line.get_xdata()) == seed.N for line in marked)
-        assert np.allclose(ax.lines[-1].get_ydata(), seed.q_true([np.linspace(0, 1, 31)]))
-    labels = [text.get_text() for text in parameter.axes[-1].get_legend().get_texts()]
-    assert labels[1:-1] == [f"t = {t:g}" for t in (0, 6, 15, 30, 45, 60)]
-    state = discrete.figures["state"]()
-    for ax in state.axes:
-        curves = [line for line in ax.lines if len(line.get_xdata())]
-        assert len(curves) == 12  # an estimate and the exact state for each time
-        for exact, estimate in zip(curves[::2], curves[1::2], strict=True):
-            assert np.abs(exact.get_ydata() - estimate.get_ydata()).max() < 0.1
-    error = discrete.figures["error"]()
-    assert len(error.axes[0].lines) == len(seed.EXPECTED) + 1
-    for figure in (parameter, state, error):
-        figure.canvas.draw()
-
-
 def test_seed_dataset_is_the_run_with_the_highest_gain(discrete: Outcome) -> None:
     data = discrete.dataset
     assert data is not None
@@ -138,37 +114,3 @@ def test_seed_excited_with_exact_data_checks_nothing() -> None:
     outcome = EXPERIMENTS["seed-excited"].run("analytic")
     assert not outcome.checks
     assert "truncation error" in outcome.notes[0]
-
-
-def test_unknown_truth() -> None:
-    with pytest.raises(
-        lp.errors.ConfigurationError, match="expected one of discrete, analytic, fine"
-    ):
-        EXPERIMENTS["seed"].run("real")
-
-
-def test_progress_shows_a_bar_for_every_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = []
-    watched = progress.watched
-
-    def spy(stream: object, total: int, what: str) -> object:
-        shown.append(what)
-        return watched(stream, total, what)  # type: ignore[arg-type]
-
-    monkeypatch.setattr("livepde.reproduce.experiment.watched", spy)
-    EXPERIMENTS["seed"].run(progress=True)
-    cases = [seed._label(*case) for case in seed.EXPECTED]
-    assert shown == [*cases, *cases, "gradient, auto"]
-    assert shown[-2] == "gain 1e4, c1 = 1"
-
-
-def test_track_counts_failed_and_divided_steps() -> None:
-    stream = seed.twin_of(times=seed.TIMES[:6], noise=RelativeNoise(0.01))
-    model, omega = stream.model, stream.observation
-    divided = lp.Identifier(model, omega, lp.GradientLaw(), u0=seed.start, dt_max=0.3)
-    assert track(divided, stream, "").divided == 5
-    never = lp.stepping.Newton(tolerance=0.0, iterations=1)
-    failing = lp.Identifier(model, omega, lp.GradientLaw(newton=never), u0=1.0)
-    found = track(failing, stream, "")
-    assert np.isnan(found.errors[1:]).all()
-    assert found.last.status.code == "not_converged"

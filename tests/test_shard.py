@@ -70,7 +70,7 @@ PAIRS = [("walks", "plain"), ("rod", "gradient"), ("layers", "gate, noise"), ("r
 @pytest.mark.parametrize(("model", "rule"), PAIRS)
 def test_equals_separate_identifiers(model, rule):
     built, chosen = MODELS[model](), lp.GradientLaw() if rule == "gradient" else LAWS[rule]
-    items = stream(built, 10)
+    items = stream(built, 7)
     one = shard(built, chosen)
     assert bool(one.note) == (rule == "gradient")
     q, q_std, innovation, status = run(one, batches(items))
@@ -87,7 +87,7 @@ def test_equals_separate_identifiers(model, rule):
 def test_goes_on_from_a_dump_at_any_batch(rule):
     """With identical numbers, and at its offset."""
     model, chosen = rod(), lp.GradientLaw() if rule == "gradient" else LAWS[rule]
-    pieces = batches(stream(model, 9))
+    pieces = batches(stream(model, 7))
     whole, others = shard(model, chosen), [shard(model, chosen) for _ in range(2)]
     dumps, found = [], []
     for offset, batch in pieces:

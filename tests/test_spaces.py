@@ -351,13 +351,6 @@ def test_riesz_map_of_a_large_space_of_second_order_is_two_solves(zero, monkeypa
     np.testing.assert_allclose(Q.free[:, None] * large.dual(found), free, atol=1e-8)
 
 
-@pytest.mark.parametrize("s", [1.5, 2.5, 3.0])
-def test_other_large_spaces_keep_their_border(s, monkeypatch):
-    Q = CASES["triangles P1"].model(inner=lp.Sobolev(s, LENGTH)).Q
-    monkeypatch.setattr(spaces, "LARGEST_EXPLICIT", 1)
-    assert isinstance(BorderedSpace(Q.border, Q.dim).factor, Leading)
-
-
 @pytest.mark.slow
 def test_names_of_orders():
     """inner="L2" and "H1" are orders 0 and 1; "H2" is order 2, a sparse form on C^1 elements."""

@@ -18,7 +18,6 @@ from livepde.stepping import (
     ForwardStage,
     Held,
     Interval,
-    Kept,
     Near,
     StepFailed,
     advance,
@@ -420,38 +419,6 @@ def test_forward_stage_of_an_affine_model_is_one_factorisation():
     residual = model.mass @ (first - u) / 0.1 + model.B(first) + model.A(first)(q)
     residual = (residual - model.F(Moment(0.1))) * model.X.free
     np.testing.assert_allclose(residual, 0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize("prior", [lp.Normal(2.0), lp.LogNormal(2.0, 1.0)])
-def test_the_matrix_of_a_stage_is_assembled_once_for_each_parameter(prior):
-    calls = []
-
-    class Counted(ForwardStage):
-        def _data_at(self, q, h, moment):
-            calls.append(q)
-            return super()._data_at(q, h, moment)
-
-    mesh = line(8)
-    model = lp.Model(
-        lp.Field(mesh, ElementLineP1()),
-        prior,
-        A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
-        B=lambda u, v, x: u * v,
-    )
-    forward, q = Counted(model), model.latent.prior
-    c = np.column_stack([mesh.p[0] ** 2, mesh.p[0]])
-    directions, kept = np.ones((1, 1)), Kept.none()
-    assert not forward.solver.price  # the choice of an engine looks at matrices of its own
-    calls.clear()
-    found, _ = forward.advance(c, q, directions, 0.1, Moment(0.1), kept)
-    np.testing.assert_allclose(calls, [[2.0]])  # of the physical parameter
-    forward.advance(found, q, directions, 0.1, Moment(0.2), kept)
-    assert len(calls) == 1
-    # The tangent is the derivative along a change of the physical parameter.
-    step = 1e-6
-    moved = model.latent.inverse(np.array([2.0 + step]))
-    near = ForwardStage(model).solve(c[:, 0] + step * c[:, 1], moved, 0.1, Moment(0.1))
-    np.testing.assert_allclose((near - found[:, 0]) / step, found[:, 1], atol=1e-5)
 
 
 def test_held_inputs_are_held_exactly():

@@ -10,7 +10,7 @@ from skfem import ElementQuad1
 
 import livepde as lp
 from livepde.laws.stored_samples import Passed, StoredSamples
-from livepde.stepping import ForwardStage, Sweep, sweep
+from livepde.stepping import ForwardStage, sweep
 
 PLACES = {"a": 0.2, "b": 0.55, "c": 0.8}
 ENDS = {"left": lp.Channel("T_0"), "right": lp.Channel("T_1")}
@@ -99,21 +99,6 @@ def test_a_pass_is_that_of_the_stages_one_by_one(
     np.testing.assert_allclose(states, other, rtol=1e-10)
     np.testing.assert_allclose(costs, others, rtol=1e-9)
     assert costs[0] == pytest.approx(swept.cost(used), rel=1e-10)
-
-
-@pytest.mark.slow
-def test_where_stages_differ_or_lengths_do_not_repeat_stages_follow_each_other(monkeypatch):
-    law = lp.SensitivityLaw(refit=lp.Refit(start=2), shadows=None)
-    uneven = stored("plain", law, np.cumsum(0.05 + 0.001 * np.arange(40)), False)
-    assert not uneven._steps.repeat
-    even = stored("plain", law, EVEN, False)
-    assert even._steps.repeat
-    assert even.filter.stage.repeats
-    q, along = even.start.q, np.zeros((1, 0, even.start.q.shape[1]))
-    parts = even.filter.stage, lp.Alexander2(), even._steps, q, along
-    assert Sweep.of(*parts) is not None
-    monkeypatch.setattr(sweep, "MOST_ENTRIES", 15.0 * 15.0)  # of one matrix, and there are several
-    assert Sweep.of(*parts) is None
 
 
 def test_trajectories_with_a_factor_each_are_followed_one_by_one(monkeypatch):

@@ -385,12 +385,6 @@ def test_smoothed_data_with_the_papers_rule():
     dg.conditions(tracker.errors, c, data="smoothed", floor=1e-6).raise_if_failed()
 
 
-def test_trackers_refuse_an_empty_run():
-    for function in (dg.bounds, dg.conditions):
-        with pytest.raises(ConfigurationError, match="not seen any estimate"):
-            function([], Constants(1.0, 1.0))
-
-
 # --- T* online ------------------------------------------------------------------------------------
 
 

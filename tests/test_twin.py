@@ -91,13 +91,6 @@ def test_discrete_truth_is_the_model_itself() -> None:
     assert np.array_equal(stream.exact_data, np.array(states) @ stream.observed.G.T)
 
 
-def test_analytic_truth_is_the_formula() -> None:
-    stream = twin(truth="analytic", observation=SENSORS)
-    expected = [[u_true([0.25], t), u_true([0.6], t)] for t in TIMES]
-    assert np.allclose(stream.exact_data, np.squeeze(expected), atol=2e-5)
-    assert np.abs(stream.exact_data - twin(observation=SENSORS).exact_data).max() > 1e-3
-
-
 @pytest.mark.parametrize("observation", [SENSORS, MIDDLE])
 def test_fine_truth_lies_between_discrete_and_analytic(
     observation: lp.observation.Observation,
@@ -108,29 +101,6 @@ def test_fine_truth_lies_between_discrete_and_analytic(
     assert fine.exact_data.shape == discrete.exact_data.shape
     error = np.abs(fine.exact_data - exact.exact_data).max()
     assert 0 < error < 0.1 * np.abs(discrete.exact_data - exact.exact_data).max()
-
-
-def test_fine_truth_may_be_the_same_model_with_small_steps() -> None:
-    coarse, fine = twin(), twin(truth="fine", fine_dt=0.01)
-    exact = twin(truth="analytic").states[-1]
-    X = MODEL.X
-    assert X.norm(fine.states[-1] - exact) < 0.2 * X.norm(coarse.states[-1] - exact)
-
-
-def test_fine_points_see_the_fine_state_itself() -> None:
-    # A kink of the coarse P1 state at 0.25 + h/2 would show in data that had been projected.
-    coarse, fine = build(4, ElementLineP1), build(64, ElementLineP1)
-    stream = twin(model=coarse, observation=SENSORS, truth="fine", fine=fine, fine_dt=0.005)
-    expected = [u_true([0.25], t) for t in TIMES]
-    assert np.allclose(stream.exact_data[:, 0], np.squeeze(expected), atol=2e-3)
-
-
-def test_same_seed_same_noise() -> None:
-    noisy = twin(noise=RelativeNoise(0.1), seed=3)
-    assert np.array_equal(data(noisy), data(noisy))
-    assert np.array_equal(data(noisy), data(twin(noise=RelativeNoise(0.1), seed=3)))
-    assert not np.array_equal(data(noisy), data(twin(noise=RelativeNoise(0.1), seed=4)))
-    assert np.array_equal(data(twin()), noisy.exact_data)
 
 
 @pytest.mark.study
@@ -148,14 +118,6 @@ def test_relative_noise_has_its_level_in_the_norm_of_Z(
     mean = np.mean(squares, axis=0)  # for every sample apart
     tolerance = 5 * np.std(squares, axis=0) / np.sqrt(len(squares))
     assert np.all(np.abs(mean - level**2) < tolerance)
-
-
-def test_every_channel_takes_the_same_share() -> None:
-    stream = twin()
-    z, W = stream.exact_data[0], stream.weights
-    shares = RelativeNoise(0.1).std(z, W) ** 2 * np.diag(W)
-    assert np.allclose(shares, shares[0])
-    assert np.isclose(shares.sum(), 0.01 * (z @ W @ z))
 
 
 def test_weights_are_the_norm_of_the_observed_part() -> None:
@@ -197,17 +159,6 @@ def test_errors_of_one_of_several_unknowns() -> None:
     assert stream.error(np.array([1.0, 4.0]), "D") == 0.5
     assert stream.error(np.array([1.0, 4.0]), "c") == 0.0
     assert stream.baseline() == pytest.approx(0.5)
-
-
-def test_exact_start_with_exact_parameter_has_no_error() -> None:
-    stream = twin(observation=lp.Full())
-    exact = lp.Identifier(
-        MODEL, lp.Full(), lp.GradientLaw(), q0=q_true, u0=lambda x: u_true(x, 0.0)
-    )
-    for sample in stream:
-        estimate = exact.step(sample.t, sample.z)
-    assert stream.u_error(estimate) < 1e-12
-    assert stream.energy(estimate) < 1e-20
 
 
 def test_energy_is_that_of_the_paper_and_never_grows() -> None:
