@@ -31,7 +31,7 @@ def at_random(problem, seed=5):
 # --- the lean forward model ----------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_the_lean_model_is_livepde_s(name):
     problem = PROBLEMS[name].at(6)
@@ -55,7 +55,7 @@ def test_the_lean_model_is_livepde_s(name):
     np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_derivatives_of_the_residual(name):
     objective, a = at_random(PROBLEMS[name].at(6))
@@ -88,7 +88,7 @@ def test_a_model_without_a_solution_is_lost_and_not_an_error():
 # --- truths and priors ---------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_the_lean_model_is_close_to_the_truth(name):
     """So far apart that they are no twins, so close that the noise is the larger error."""
@@ -122,7 +122,7 @@ def test_priors_are_honest_and_those_of_a_seed(name):
 # --- the reference -------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_other_method_finds_less_than_the_reference():
     problem = PROBLEMS["column"]
     priors, z = problem.priors(2), problem.readings(2)
@@ -138,7 +138,7 @@ def test_no_other_method_finds_less_than_the_reference():
 # --- jumps ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", PROCESSES)
 def test_truths_with_jumps_agree_with_livepde(name):
     process, levels = PROCESSES[name], np.repeat([1.0, 1.6], 30)

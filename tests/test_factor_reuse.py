@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from factories import usual
 
 import livepde as lp
 from benchmarks.step import problem
@@ -55,7 +56,7 @@ def test_a_kept_factor_changes_no_number(plate, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "law",
-    [lp.GradientLaw(1.0, lp.laws.ResidualDamping(0.1)), lp.GradientLaw("auto")],
+    usual([lp.GradientLaw(1.0, lp.laws.ResidualDamping(0.1)), lp.GradientLaw("auto")]),
     ids=["1", "auto"],
 )
 def test_a_kept_factor_is_made_again_after_a_restart(law, plate, tmp_path):

@@ -130,7 +130,7 @@ class ShortNonlinearFlux(NonlinearFlux):
     length, intervals = 2.0, 20
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [ShortWarmRod, ShortFlux, ShortNonlinearFlux])
 def test_derivatives_of_the_truth(kind):
     problem = kind()
@@ -141,7 +141,7 @@ def test_derivatives_of_the_truth(kind):
     np.testing.assert_allclose(exact, expected, atol=1e-4 * np.abs(expected).max())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_flux_of_the_truth_walks_as_the_estimator_believes():
     problem = ShortFlux()
     rng = np.random.default_rng(3)

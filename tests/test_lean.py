@@ -38,7 +38,7 @@ def latent(given: costs.Rod, state: lean.Filter):
     return own.prior + state.y[:, :, 0] * own.deviations
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("ends", ENDS)
 @pytest.mark.parametrize(("nodes", "unknowns"), [(31, 2), (31, 10), (60, 3)])
 def test_the_lean_reference_has_the_numbers_of_the_law(nodes, unknowns, ends):
@@ -60,7 +60,7 @@ def test_the_lean_reference_has_the_numbers_of_the_law(nodes, unknowns, ends):
     assert abs(estimate.q - 1.0).max() > 0.01  # something was learned
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("ends", ENDS)
 def test_members_side_by_side_have_the_numbers_of_a_fleet(ends):
     given, members = costs.Rod(31, 2, ends), 5
@@ -88,7 +88,7 @@ def test_a_lean_forward_step_is_one_of_simulate():
         np.testing.assert_allclose(u[place], expected, atol=1e-13)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_square_is_assembled_as_simulate_does():
     given = costs.Rod(costs.SQUARE, 4, "source")
     model = given.model
@@ -107,7 +107,7 @@ def data(request):
     return problems[request.param].data(0.01, 0).until(5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_ensemble_as_arrays_is_a_loop_over_its_members(data):
     members, inflation = 6, 1.02
     filter_ = arrays.Ensemble(arrays.Stack(data), members, inflation)
@@ -130,7 +130,7 @@ def test_an_ensemble_as_arrays_is_a_loop_over_its_members(data):
     np.testing.assert_allclose(factor @ factor.T, expected @ expected.T, atol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_unscented_filter_as_arrays_is_a_loop_over_its_points(data):
     filter_ = arrays.Unscented(arrays.Stack(data))
     augmented = Augmented(data)

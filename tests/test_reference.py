@@ -166,7 +166,7 @@ def test_energy_is_lost_to_damping_and_to_implicit_Euler_only():
     np.testing.assert_allclose(np.diff(levels), -damping[1:] - Euler, atol=1e-12 * levels[0])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("size", [300.0, 1e5])
 @pytest.mark.parametrize("error", [0.0, 1e-3])
 def test_estimates_of_q_do_not_depend_on_the_size_of_the_state(size, error):
@@ -175,7 +175,7 @@ def test_estimates_of_q_do_not_depend_on_the_size_of_the_state(size, error):
     np.testing.assert_allclose(one.U, other.U / size, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", SETTINGS)
 def test_every_setting_is_solved(name):
     found = run(replace(SETTINGS[name], steps=15))
@@ -187,7 +187,7 @@ def test_every_setting_is_solved(name):
     assert reference.residuals(at, found.Q, bent, found.Z, found.F).min() > 1e-9
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_step_can_have_three_solutions():
     """nu = 0.01, t = 3.6: one continues the step before, one is found from r(0), one is between."""
     found = trajectory("partial, nu = 0.01")

@@ -38,7 +38,7 @@ def identifier(model: lp.Model, observation: lp.observation.Observation, law: An
     return lp.Identifier(model, observation, law, q0=0.0, u0=lambda x: excited_u(x, 0.0))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("law", "observation"),
     [
@@ -54,7 +54,7 @@ def test_contract(law: Any, observation: lp.observation.Observation) -> None:
     assert report.ok, str(report)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", LAWS)
 def test_energy_falls_with_exact_data(name: str) -> None:
     """The terms with A cancel in the coupled step, as in (align:neplusnr)."""

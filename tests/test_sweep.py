@@ -59,19 +59,18 @@ PACES = np.cumsum(np.where(np.arange(80) < 40, 0.05, 0.125))
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "t", "options", "parts"),
+    ("kind", "t", "first", "options", "parts"),
     [
-        ("plain", EVEN, {}, {}),
-        ("plain", PACES, {}, {"between": {"T_0": "hold", "T_1": "next"}}),
-        ("layers", EVEN, {}, {"dt_max": 0.02, "between": {"T_1": "hold"}}),
-        ("plain", EVEN[:24], {}, {"dt_max": 0.001}),  # intervals of more steps than a block
-        ("offset", EVEN, {"shadows": None}, {"scheme": lp.ImplicitEuler()}),
-        ("plain", PACES, {}, {"u0_errors": [1.0, lambda x: x[0]]}),
+        ("plain", EVEN, True, {}, {}),
+        ("plain", PACES, False, {}, {"between": {"T_0": "hold", "T_1": "next"}}),
+        ("layers", EVEN, True, {}, {"dt_max": 0.02, "between": {"T_1": "hold"}}),
+        ("plain", EVEN[:24], False, {}, {"dt_max": 0.001}),  # intervals of more steps than a block
+        ("offset", EVEN, True, {"shadows": None}, {"scheme": lp.ImplicitEuler()}),
+        ("plain", PACES, False, {}, {"u0_errors": [1.0, lambda x: x[0]]}),
     ],
 )
-@pytest.mark.parametrize("first", [False, True])
 def test_a_pass_is_that_of_the_stages_one_by_one(
-    kind: str, t: Any, options: Any, parts: Any, first: bool, monkeypatch: pytest.MonkeyPatch
+    kind: str, t: Any, first: bool, options: Any, parts: Any, monkeypatch: pytest.MonkeyPatch
 ):
     law = lp.SensitivityLaw(refit=lp.Refit(start=2, window=100), gate=np.inf, **options)
     samples = stored(kind, law, t, first, **parts)

@@ -103,6 +103,14 @@ def test_fine_truth_lies_between_discrete_and_analytic(
     assert 0 < error < 0.1 * np.abs(discrete.exact_data - exact.exact_data).max()
 
 
+def test_fine_points_see_the_fine_state_itself() -> None:
+    # A kink of the coarse P1 state at 0.25 + h/2 would show in data that had been projected.
+    coarse, fine = build(4, ElementLineP1), build(64, ElementLineP1)
+    stream = twin(model=coarse, observation=SENSORS, truth="fine", fine=fine, fine_dt=0.005)
+    expected = [u_true([0.25], t) for t in TIMES]
+    assert np.allclose(stream.exact_data[:, 0], np.squeeze(expected), atol=2e-3)
+
+
 @pytest.mark.study
 @pytest.mark.parametrize("observation", [SENSORS, MIDDLE, lp.Full()])
 def test_relative_noise_has_its_level_in_the_norm_of_Z(
