@@ -697,7 +697,7 @@ def test_a_setting_adds_an_unknown_only_as_a_whole(tmp_path):
 
 
 def test_a_key_that_is_new_among_dotted_keys_has_its_own_line():
-    text = 'unknowns.alpha = { prior = 1 }  # told\noptions.C = 2\nlaw = { noise = 1 }\n'
+    text = "unknowns.alpha = { prior = 1 }  # told\noptions.C = 2\nlaw = { noise = 1 }\n"
     given = {"unknowns.loss": {"prior": 3}, "options.H": 4, "unknowns.alpha.prior": 5}
     for key, value in given.items():
         once = _with(text, key.split("."), value)
