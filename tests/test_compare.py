@@ -676,6 +676,17 @@ def test_a_variant_without_an_unknown_lacks_what_is_read_for_it_alone(tmp_path):
     assert not run_variant(path, (), variants["no loss"]).error
 
 
+def test_a_variant_has_no_reference_for_numbers_that_it_lacks(tmp_path):
+    """With a published value of alpha, or of loss, those without such a number failed."""
+    path = tmp_path / "case.toml"
+    path.write_text(f'{HEATED}\n[reference]\nalpha = "1e-5 m^2/s"\nloss = "1e-4 1/s"\n')
+    heated().iloc[:5].to_csv(tmp_path / "rod.csv", index=False)
+    prepared = cases.load(path).prepare()
+    variants = {one.name: one for one in proposed(prepared, ended("as stated", 0.0, 1.0))}
+    for name in ("no loss", "two layers of alpha"):
+        assert not run_variant(path, (), variants[name]).error
+
+
 def test_no_variant_lacks_what_the_equation_needs(tmp_path):
     """Water flows in a stream bed by `v` or by `K`: the only one of them cannot go."""
     path = tmp_path / "case.toml"

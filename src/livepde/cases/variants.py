@@ -29,6 +29,7 @@ from livepde.cases.remedies import (
 from livepde.cases.set_aside import with_errors_of_set_aside
 from livepde.dates import since_1970
 from livepde.errors import CaseError, ModelError
+from livepde.fem.field_blocks import base_name
 from livepde.plots.style import modes_told
 from livepde.records import interval_95, scalars, used_errors
 from livepde.result import Result
@@ -593,12 +594,19 @@ def _fewer(case: Case) -> Iterator[Variant]:
     optional = _optional(case)
     for name, unknown in case.spec.unknowns.items():
         key = f"unknowns.{toml_key(name)}"
+        gone = _references(case, name)
         if unknown.regions:
-            yield Variant(f"one {name} everywhere", (f"{key}.regions=",))
+            yield Variant(f"one {name} everywhere", (f"{key}.regions=", *gone))
         if name in optional:
             with suppress(ModelError):  # the equation needs it, or another one
                 unread = [f"{own}=" for own in unread_without(case, name)]
-                yield Variant(f"no {name}", (f"{key}=", *unread))
+                yield Variant(f"no {name}", (f"{key}=", *unread, *gone))
+
+
+def _references(case: Case, name: str) -> list[str]:
+    """Return the settings that remove the references of an unknown with other numbers."""
+    known = [label for label in case.spec.reference if base_name(label) == name]
+    return [f"reference.{toml_key(label)}=" for label in known]
 
 
 def _optional(case: Case) -> set[str]:
@@ -635,4 +643,4 @@ def _layers(case: Case) -> Iterator[Variant]:
         for what, layers in tried.items():
             value = toml_value({label: list(ends) for label, ends in layers.items()})
             setting = f"unknowns.{toml_key(name)}.regions={value}"
-            yield Variant(f"{what} of {name}", (setting,))
+            yield Variant(f"{what} of {name}", (setting, *_references(case, name)))
