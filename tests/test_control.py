@@ -371,9 +371,28 @@ def test_a_late_sample_is_stepped_to_as_long_as_it_took():
         one.step(180.0, nothing, inputs)
 
 
+def test_readings_with_their_noise_have_the_same_effect_in_each_form():
+    """By names, the identifier took such a sample, and the filter beside it refused it."""
+    inputs, (one, two) = {"heater": 0.3, "room": ROOM}, SENSORS.names(2)
+    forms = [
+        lambda a, b: [[a, 0.5], [b, np.nan]],
+        lambda a, b: {one: (a, 0.5), two: b},
+        lambda a, b: {one: a, two: b, f"noise of {one}": 0.5},
+    ]
+    found = []
+    for form in forms:
+        nominal = ct.Kalman(reduced(), PERIOD, drive={"heater": 0.1})
+        learned, alone = ct.Learned(identifier(), nominal), ct.Kalman(reduced(), PERIOD, drive={})
+        for k in range(3):
+            z = form(20.0 + k, 20.0)
+            last = learned.step(PERIOD * k, z, inputs).x, alone.step(PERIOD * k, z, inputs).x
+        found.append(np.concatenate([*last, learned.estimate.q]))
+    np.testing.assert_array_equal(found, found[:1] * 3)
+
+
 def test_samples_of_the_filter_are_checked():
     one, inputs = ct.Kalman(reduced(), PERIOD, drive={}), {"heater": 0.3, "room": ROOM}
-    with pytest.raises(lp.errors.SampleError, match="unknown sensor 'T_6'"):
+    with pytest.raises(lp.errors.SampleError, match="unknown channel 'T_6'"):
         one.step(0.0, {"T_6": 20.0}, inputs)
     for z in ([1.0, 2.0, 3.0], ["hot", 1.0]):
         with pytest.raises(lp.errors.SampleError, match="z"):

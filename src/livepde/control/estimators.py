@@ -17,7 +17,7 @@ from livepde.errors import ConfigurationError, RunError, SampleError, TimeOrderE
 from livepde.estimate import Estimate
 from livepde.identifier import Identifier
 from livepde.linalg import Array
-from livepde.samples import labelled, number, readings
+from livepde.samples import Channels, number
 
 # Standard deviation of the isotropic process noise, relative to that of the channels.
 FLOOR = 1e-6
@@ -83,6 +83,7 @@ class Kalman:
         self._moving = model.columns(list(offset))
         self._walk = np.array(list(offset.values()))
         self._noise = np.asarray(model.sensors.noise)
+        self._channels = Channels((), model.frame.sensors, None)
         self._t = np.nan
         self.set(q)
         x = model.start if x is None else np.asarray(x, dtype=float)
@@ -129,13 +130,7 @@ class Kalman:
         t = number(t, "time t")
         if not math.isfinite(t):
             raise SampleError(f"time t must be a finite number; got {t}.")
-        sensors, r, z = self.model.sensors.names, self.model.size, labelled(z)
-        if isinstance(z, Mapping):
-            unknown = [name for name in z if name not in sensors]
-            if unknown:
-                raise SampleError(f"unknown sensor '{unknown[0]}'; there are {list(sensors)}.")
-            z = [number(z.get(name), f"sensor '{name}'") for name in sensors]
-        seen, own = readings(z, self.model.frame.sensors)
+        seen, own, *_ = self._channels.parse(z, None)
         noise = self._noise if own is None else np.where(np.isnan(own), self._noise, own)
         if not np.isnan(self._t):
             h = t - self._t
@@ -146,7 +141,7 @@ class Kalman:
             self._predict(h, inputs)
         self._t = t
         self._update(seen, noise, inputs)
-        offset = np.zeros(len(self.model.channels))
+        r, offset = self.model.size, np.zeros(len(self.model.channels))
         offset[self._moving] = self._x[r:]
         return Known(
             self._x[:r],
@@ -326,11 +321,12 @@ class Learned:
     def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
         identifier, model = self.identifier, self.nominal.model
         self.estimate = estimate = identifier.step(t, z, inputs)  # a bad sample changes nothing
-        if isinstance(z, Mapping):  # with validation sensors, perhaps
-            z = {name: z[name] for name in model.sensors.names if name in z}
+        # The nominal filter has the assimilated sensors alone.
+        seen, noise, *_ = identifier._channels.parse(z, inputs)
+        pairs = seen if noise is None else np.column_stack([seen, noise])
         # The nominal filter runs at every sample, trusted or not, so that a fallback starts from a
         # converged state.
-        nominal = self.nominal.step(estimate.t, z, inputs)  # a date as a number
+        nominal = self.nominal.step(estimate.t, pairs, inputs)  # a date as a number
         doubt = self.trust.doubt(estimate, model)
         self._good = 0 if doubt else min(self._good + 1, self.trust.patience)
         if self._good < self.trust.patience:
