@@ -89,7 +89,7 @@ FILLED = {
         on("0.06 m", "5 m")
         | at(T_1="0.3 m")
         | {"options.H": "100 m", "options.T0": "12 degC"}
-        | {"channels.T_f.quantity": "fluid", "channels.T_f.at": None},
+        | {"channels.T_f.quantity": "fluid", "channels.T_f.at": None, "initial": "12 degC"},
         {"k": 2.0, "R_b": 0.1},
         7200.0,
     ),
@@ -98,7 +98,7 @@ FILLED = {
         on("0.036 m", "5 m")
         | at(T_f="0.036 m")
         | {f"options.{name}": value for name, value in (RADII | GROUT).items()}
-        | {"mesh.cells": 40},
+        | {"mesh.cells": 40, "initial": "12 degC"},
         {"k": 2.0, "rho_c": 2.2e6, "R_b": 0.12, "share": 0.4},
         7200.0,
     ),
@@ -146,7 +146,9 @@ FILLED = {
     ),
     "pumping_test": Filled(
         {"s_1": 0.0, "s_2": 0.0, "Q [m3/h]": 36.0},
-        on("0.1 m", "2000 m") | at(s_1="10 m", s_2="50 m") | {"options.b": "10 m"},
+        on("0.1 m", "2000 m")
+        | at(s_1="10 m", s_2="50 m")
+        | {"options.b": "10 m", "initial": "0 m"},
         {"k": 1e-4, "Ss": 1e-5},
         600.0,
     ),

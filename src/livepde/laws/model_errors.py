@@ -31,6 +31,7 @@ from livepde.verdict.directions import (
     AVERAGED,
     LONGEST_AVERAGE,
     SHIFT,
+    averages_on_line,
     sensor_averages,
     sensor_shifts,
     stated_positions,
@@ -93,7 +94,7 @@ def _sensor_columns(
     ]
     slow = _slow(times, predicted, RESPONSE * max(float(np.ptp(times)), 1e-300))
     each.append((_beyond_rounding(slow - predicted, predicted), math.inf))
-    if problem.model.mesh.dim() == 1:
+    if averages_on_line(problem.model):
         mean = (sensor_averages(problem.model, problem.observed) @ np.column_stack(states)).T
         longest = (LONGEST_AVERAGE / AVERAGED) ** 2
         each.append((_beyond_rounding(mean, predicted), longest))

@@ -19,6 +19,7 @@ import scipy.sparse as sp
 
 from livepde.errors import ObservationError
 from livepde.fem import Inputs, Moment, On, lengths
+from livepde.fem.fields import unweighted
 from livepde.linalg import Array, IntArray, row_product
 from livepde.model import Model
 from livepde.observation import CombinedObserved, Observed, Points
@@ -328,7 +329,7 @@ class Dictionary:
         }
         if not shifts:
             del amplitudes["position"]
-        if shifts != 1:  # on a line only: over which direction it is elsewhere nobody knows
+        if not (shifts and averages_on_line(model)):
             del amplitudes["averaging"]
         while amplitudes and sensors * sum(axes for *_, axes in amplitudes.values()) > room:
             kind, _ = amplitudes.popitem()
@@ -524,6 +525,15 @@ def sensor_shifts(model: Model, observed: Observed) -> tuple[list[sp.csr_array],
         scale = sp.diags_array(step / np.where(width > 0.0, width, np.inf))
         found.append(sp.csr_array(scale @ (ends[1] - ends[0])))
     return found, step
+
+
+def averages_on_line(model: Model) -> bool:
+    """Return whether a sensor may average along the mesh.
+
+    Elsewhere nobody knows over which direction; along a radius none does, as wells do not.
+    """
+    fields = [block.field for block in model.state_space.fields.values()]
+    return model.mesh.dim() == 1 and all(one.weight is unweighted for one in fields)
 
 
 def sensor_averages(model: Model, observed: Observed) -> sp.csr_array:
