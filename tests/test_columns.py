@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.sparse as sp
+from factories import usual
 from scipy.sparse.linalg import splu
 
 import livepde as lp
@@ -134,13 +135,8 @@ def run(columns: dict[str, Any], **options: Any) -> lp.Result:
     return identifier.run(samples)
 
 
-OFTEN = ("input late",)  # the others are long tests
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "fault", [pytest.param(f, marks=[] if f in OFTEN else pytest.mark.long) for f in FAULTS]
-)
+@pytest.mark.parametrize("fault", usual(FAULTS))
 def test_the_wrong_column_is_named_first(fault: str):
     change, name, words = FAULTS[fault]
     _, columns = bar(1)
@@ -160,8 +156,10 @@ def test_the_wrong_column_is_named_first(fault: str):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda c: scaled(c, "TC5", 1.8, 32.0), "TC5 may be in degF"),
         (lambda c: exchanged(tilted(c), "TC2", "TC5"), "TC2 and TC5 may be exchanged"),
+        pytest.param(
+            lambda c: scaled(c, "TC5", 1.8, 32.0), "TC5 may be in degF", marks=pytest.mark.long
+        ),
     ],
 )
 def test_a_wrong_input_with_noise_is_named_and_the_initial_state_is_made_of_it(change, words):
@@ -360,7 +358,9 @@ def test_wrong_columns_are_named_where_an_unknown_moves(fault: Fault, noise: str
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fault", [EXCHANGED, Fault("furnace", ("T_cold",), "fahrenheit")], ids=str)
+@pytest.mark.parametrize(
+    "fault", usual([EXCHANGED, Fault("furnace", ("T_cold",), "fahrenheit")]), ids=str
+)
 def test_samples_for_trials_outlive_a_restart(fault: Fault, tmp_path: Path):
     prepared = walk(tmp_path, fault, 70)
     first, second = prepared.identifier, load(prepared.case.path).prepare().identifier

@@ -577,7 +577,12 @@ def test_an_exchange_that_the_case_lacks_is_named_and_found(tmp_path):
     ("name", "error", "truth"),
     [
         ("layers of alpha", {"upper": 4e-5}, {"alpha[layer_1]": 2e-5, "alpha[layer_2]": 4e-5}),
-        ("source that jumps", {"switched": 0.003}, {"alpha": 2e-5, "source": 0.003}),
+        pytest.param(
+            "source that jumps",
+            {"switched": 0.003},
+            {"alpha": 2e-5, "source": 0.003},
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_a_layer_for_each_sensor_and_a_source_that_jumps_are_tried(tmp_path, name, error, truth):

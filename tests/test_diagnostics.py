@@ -73,16 +73,6 @@ def test_a_wrong_derivative_of_a_sensor_is_found_beside_larger_readings():
     assert failed(report) == ["G'(u) by differences"]
 
 
-def test_a_right_derivative_passes():
-    model = reaction(
-        line(6),
-        ElementLineP1(),
-        B=lambda u, v, x: u**3 * v,
-        dB=lambda u, du, v, x: 3 * u**2 * du * v,
-    )
-    check_model(model, u=1.0).raise_if_failed()
-
-
 @pytest.mark.slow
 def test_a_form_that_is_not_analytic_is_found():
     report = check_model(reaction(line(6), ElementLineP1(), B=lambda u, v, x: np.abs(u) * v))

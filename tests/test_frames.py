@@ -115,7 +115,7 @@ SHEET = Frame(flat=True)
     [
         pytest.param(Frame(), Frame(mirrored=True), id="mirrored"),
         pytest.param(Frame(), Frame(origin=500.0), id="later", marks=pytest.mark.long),
-        pytest.param(Frame(), Frame(unit=3600.0), id="seconds"),
+        pytest.param(Frame(), Frame(unit=3600.0), id="seconds", marks=pytest.mark.long),
         pytest.param(Frame(), Frame(split=True), id="groups"),
         pytest.param(SHEET, replace(SHEET, swapped=True), id="axes"),
         pytest.param(SHEET, replace(SHEET, scale=1.0 + 1e-12), id="rounding"),

@@ -16,7 +16,6 @@ import livepde as lp
 from livepde.laws.error_columns import SMALL, ErrorColumns
 from livepde.laws.model_errors import linear_model, model_errors
 from livepde.laws.stored_samples import StoredSamples
-from livepde.stepping import ForwardStage
 from livepde.verdict import (
     Allowed,
     Cause,
@@ -26,7 +25,6 @@ from livepde.verdict import (
     Verdict,
     discretised,
 )
-from livepde.verdict.directions import Now, boundary_lifts, later
 from livepde.verdict.evidence import NU, TEMPER, Causes, Family, LinearModel, Mixture, averaged
 
 # --- the average --------------------------------------------------------------------------------
@@ -195,33 +193,6 @@ def identified(z: Any) -> lp.Identifier:
     for t, row in zip(TIMES, z, strict=True):
         found.step(t, row, ends(t))
     return found
-
-
-def test_responses_that_have_not_begun_take_no_solve():
-    stage, rng = ForwardStage(rod()), np.random.default_rng(5)
-    n = stage.model.X.dim
-    inputs = lp.fem.Inputs({"left": 0.0, "right": 0.0})
-    now = Now(np.zeros(n), stage.model.latent.prior, lp.fem.Moment(0.1, inputs))
-    p, loads, lifts = np.zeros((3, 4, n))
-    p[0], loads[1] = rng.standard_normal((2, n)) * stage.model.X.free
-    lifts[2] = boundary_lifts(stage.model)["left"]
-    factor, rows = stage.linearised(now.u, now.q, 0.1, now.moment)
-    solved = []
-
-    class Noted:
-        def solve(self, b: Any) -> Any:
-            solved.append(b.shape)
-            return factor.solve(b)
-
-    stage.linearised = lambda *args: (Noted(), rows)  # type: ignore[method-assign]
-    found = later(stage, p, now, 0.1, loads, lifts)
-    assert solved == [(n, 3)]
-    free = stage.model.X.free
-    matrix = rows if isinstance(rows, np.ndarray) else rows.toarray()
-    left = (matrix @ found.T - (stage.model.mass @ p.T) / 0.1 - loads.T) * free[:, None]
-    assert np.abs(left).max() < 1e-10
-    assert (found[3] == 0.0).all()
-    assert (found * (1.0 - free) == lifts).all()
 
 
 @pytest.mark.slow

@@ -73,14 +73,6 @@ def test_a_reading_counts_with_its_own_noise_as_with_that_of_its_sensor(law):
 
 
 @pytest.mark.slow
-def test_noise_that_is_not_there_is_that_of_the_sensor():
-    stated, own = identifier(), identifier()
-    for t, z, _ in stream(10):
-        one, two = stated.step(t, z), own.step(t, np.column_stack([z, [NAN, NAN]]))
-        assert same(one, two)
-
-
-@pytest.mark.slow
 def test_all_forms_say_the_same():
     each = [identifier() for _ in range(4)]
     for t, z, std in stream(8):

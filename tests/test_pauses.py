@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from factories import usual
 from typer.testing import CliRunner
 
 import livepde as lp
@@ -189,8 +190,8 @@ def estimate_of(path: Path) -> lp.Estimate:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["gap", "small leap"])
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
+@pytest.mark.parametrize("kind", usual(["small leap", "gap"]))
+@pytest.mark.parametrize("seed", usual([0, 1]))
 def test_the_unknowns_survive(tmp_path: Path, kind: str, seed: int) -> None:
     """The rod remembers an hour, and its ends have gone on unseen for ten minutes."""
     found = estimate_of(case(tmp_path, kind, seed))

@@ -47,7 +47,7 @@ def as_tuple(item: Any) -> tuple[float, Any]:
 
 @pytest.mark.slow
 def test_a_process_that_is_missing_is_said():
-    found = doubts(run(rod(lp.Normal(0.2, 0.1)), rod(lp.Normal(0.2), loss=1.0), shadows=None))
+    found = doubts(run(rod(lp.Normal(0.2, 0.1)), rod(lp.Normal(0.2), loss=1.0), verdict=False))
     assert any("Model misfit" in text for text in found[:2])
 
 

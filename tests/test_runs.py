@@ -19,7 +19,6 @@ from livepde.models import heat
 from livepde.result import Result
 from livepde.runs import (
     Check,
-    Outcome,
     RunWriter,
     Table,
     checks_of,
@@ -84,15 +83,6 @@ def test_checks():
         Check("a", 1.0, 1.0, "in")
     with pytest.raises(lp.errors.ConfigurationError, match="one number"):
         Check("a", 1.0, (0.0, 1.0), "<=")
-
-
-def test_outcome():
-    table = Table("t", ("a",), [(1,)])
-    outcome = Outcome([table], [Check("a", 3.0, 2.0, "<=")], ["n"])
-    assert not outcome.ok
-    content = outcome.to_dict()
-    assert content["tables"] == [{"title": "t", "columns": ["a"], "rows": [[1]]}]
-    assert content["notes"] == ["n"]
 
 
 # --- loop ------------------------------------------------------------------------------------

@@ -100,14 +100,6 @@ def test_sigma_is_learned_from_the_data(stage):
 
 
 @pytest.mark.parametrize("stage", STAGES, ids=repr)
-def test_noise_factor_is_what_the_stream_settles_to(stage):
-    stream = type(stage)(**{**vars(stage), "noise": 1.0})([(0.1 * k, [0.0]) for k in range(200)])
-    for _ in stream:
-        pass
-    assert stage.noise_factor(0.1) == pytest.approx(stream.std[0], rel=1e-9)
-
-
-@pytest.mark.parametrize("stage", STAGES, ids=repr)
 def test_missing_values_stay_missing_and_change_nothing_else(stage):
     times, rng = irregular(40), np.random.default_rng(4)
     values = rng.standard_normal((40, 2))

@@ -289,10 +289,7 @@ OFTEN = (
     "gradient, blocks",
     "auto gain",
     "sensitivity",
-    "sensitivity, inputs",
-    "sensitivity, nonlinear",
     "sensitivity, large square",
-    "guards and jumps",
 )
 RARELY = (pytest.param(name, marks=pytest.mark.long) for name in CASES if name not in OFTEN)
 

@@ -73,12 +73,6 @@ def test_transitions_are_exponentials_and_compose(evolution: Any):
     np.testing.assert_allclose(twice, evolution.growth(0.7, 2.0), atol=1e-12)
 
 
-def test_a_mean_reverting_unknown_keeps_its_prior_variance():
-    evolution = lp.MeanReverting(2.0)
-    kept = evolution.transition(0.5)[0, 0] ** 2 + evolution.growth(0.5, 1.0)[0]
-    assert kept == pytest.approx(1.0)
-
-
 UNKNOWNS = {
     "log": lp.LogNormal(0.4, 0.2),
     "logit": lp.LogitNormal(0.4, 0.2, bounds=(0.1, 0.9)),
