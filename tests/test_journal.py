@@ -39,7 +39,7 @@ from livepde.streams.intake import Intake
 from livepde.streams.sources import Follow, Row, Rows, json_row
 
 NAME = "journal.sqlite"
-CHECKPOINT = 24  # samples between two checkpoints here: a run has several in less time
+CHECKPOINT = 40  # samples between two checkpoints here: a run has several in less time
 GROUP = 8  # samples of one commit here
 
 
@@ -175,7 +175,7 @@ class Breaks:
 def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(
     tmp_path, monkeypatch, method, waits
 ):
-    count = CHECKPOINT + 20
+    count = CHECKPOINT + 40
     whole, broken = folders(tmp_path)
     finished(whole, count)
     run = started(broken, count, waits=waits)
