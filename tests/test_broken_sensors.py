@@ -245,7 +245,7 @@ def driven(folder: Path, z, text=None, **cells):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", ["sensor", "boundary", "all sensors"])
+@pytest.mark.parametrize("place", usual(["sensor", "boundary", "all sensors"], often=2))
 def test_a_wild_first_row_does_not_make_the_start(tmp_path, place):
     z = readings(120)
     _, expected = driven(tmp_path / "a", z)
