@@ -347,7 +347,8 @@ def test_exchanged_sensors_that_contradict_all_are_found_from_the_start(tmp_path
 def test_wrong_columns_are_named_where_an_unknown_moves(fault: Fault, noise: str, tmp_path: Path):
     """A furnace with an unknown flux that moves: samples are filtered, not fitted, again."""
     settings = {"law.noise": "auto"} if noise else {}
-    prepared = walk(tmp_path, fault, 70, **settings)
+    rows = 150 if fault.kind == "late" else 70
+    prepared = walk(tmp_path, fault, rows, **settings)
     verdict = prepared.identifier.run(prepared.stream).last.verdict
     first = next(finding.causes[0] for finding in verdict.findings if finding.causes)
     kinds = {"fahrenheit": "unit", "exchanged": "exchange", "late": "lag"}
