@@ -621,3 +621,36 @@ def test_a_member_that_is_taken_out_late_has_an_estimate():
     for k in range(30):
         fleet.step(0.1 * (k + 1), np.zeros((2, 1)))
     assert fleet.identifier(0).estimate().verdict.level == "not judged"
+
+
+@pytest.mark.long
+def test_the_verdict_on_a_member_is_that_of_a_separate_run():
+    model, law, members = rod(), lp.SensitivityLaw(), 2
+    fleet = lp.Fleet(model, SENSORS, law, members)
+    assert not fleet.verdict(0).judged  # before the first sample
+    separate = [lp.Identifier(model, SENSORS, law) for _ in range(members)]
+    for t, z, inputs in samples(fleet, steps=50):
+        z[1, 1] += 0.3  # an offset of one sensor
+        fleet.step(t, z, inputs)
+        for k, one in enumerate(separate):
+            one.step(t, z[k], {name: values[k] for name, values in inputs.items()})
+    levels = []
+    for k, one in enumerate(separate):
+        found, expected = fleet.verdict(k), one._settled(one.estimate()).verdict
+        levels.append(found.level)
+        assert found.level == expected.level
+        assert [each.what for each in found.findings] == [each.what for each in expected.findings]
+        assert found.errors is not None
+        for mine, own in zip(found.errors.unknowns, expected.errors.unknowns, strict=True):
+            assert (mine.low, mine.high) == pytest.approx((own.low, own.high), rel=1e-5)
+    assert levels[1] != "trusted"
+
+
+def test_a_member_whose_first_samples_are_gone_is_not_judged():
+    law = lp.SensitivityLaw(refit=lp.laws.Refit(start=4, window=10))
+    fleet = lp.Fleet(rod(), SENSORS, law, 2)
+    for sample in samples(fleet, steps=40):
+        fleet.step(*sample)
+    verdict = fleet.verdict(0)
+    assert verdict.level == "not judged"
+    assert "no longer stored" in verdict.untested[0]

@@ -85,6 +85,10 @@ class FleetEngine(ABC):
         other._begins = [self._begins[k] for k in which]
         return other
 
+    def begun(self, k: int) -> Any:
+        """Return the parts of the law with which a member begins."""
+        return self._begins[k]
+
     @abstractmethod
     def start(self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]) -> State:
         """Return the state at the start, from coefficients of each member."""

@@ -16,6 +16,7 @@ from livepde import checkpoint, errors
 from livepde.checkpoint import Fingerprint
 from livepde.dates import stamp_of
 from livepde.fem import Inputs, Moment
+from livepde.fleet.assessment import assessed
 from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEngine, beginnings
 from livepde.fleet.estimate import FleetEstimate, FleetResult, number_of
 from livepde.frames import layout_of
@@ -39,6 +40,7 @@ from livepde.samples import (
 )
 from livepde.start import initial_errors, initial_readings
 from livepde.stepping import Advance, Between, Scheme, Span, own_noise
+from livepde.verdict import Verdict
 
 FORMAT = 12  # of the checkpoint
 
@@ -101,6 +103,7 @@ class Fleet:
         u0_errors: tuple[Any, ...] | list[tuple[Any, ...]] = (),
     ) -> None:
         self.members = _named(members)
+        self._judging = law
         if isinstance(law, SensitivityLaw):  # the sums of each member would cost more than its step
             law = replace(law, verdict=False)
         q0s, u0s = self._each("q0", q0), self._each("u0", u0)
@@ -416,6 +419,21 @@ class Fleet:
         start = self._starts.get(k) or self._one._started(self._q0[k], self._u0[k], self._errors[k])
         self._starts[k] = start
         return start._placed(state, ends, self._samples)
+
+    def verdict(self, member: str | int) -> Verdict:
+        """Return the verdict on a member, by name or number, as that of a run of its own.
+
+        Members are not assessed while they are stepped together. This takes the stored samples of
+        one member again, which is as slow as a separate run of it.
+        """
+        k = number_of(self.members, member)
+        law, begun = self._judging, self._engine.begun(k)
+        if self._state is None or not isinstance(law, SensitivityLaw) or not law.verdict:
+            return Verdict.unjudged()
+        ends = {name: values[k].copy() for name, values in self.ends.items()}
+        one = self._one._started(self._q0[k], self._u0[k], self._errors[k])
+        state = self._engine.member(self._state, k)
+        return assessed(one, law, begun, state, ends, self._samples)
 
     def template(self) -> Any:
         """Return the state of the first member at its start without inputs: for its structure."""
