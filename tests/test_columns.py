@@ -302,7 +302,7 @@ def test_an_early_boundary_is_no_late_sensor_and_the_search_ends(tmp_path: Path)
     assert (misfit.causes[0].kind, misfit.causes[0].subject) == ("lag", "T05")
     assert misfit.causes[0].size == pytest.approx(-3600.0, rel=0.05)
     # Searches from elsewhere end at the same trajectory: that is the fit, and the model is wrong.
-    assert last.verdict.level == "caution"
+    assert {finding.what for finding in last.verdict.findings} == {"effect", "misfit", "flat"}
     assert last.fit is not None
     assert last.fit.converged
     assert last.fit.passes < 50  # 205 where each of eleven searches is followed to its end

@@ -10,11 +10,14 @@ from typing import Any
 
 import broken_rod
 import numpy as np
+import pandas as pd
 import pytest
+from scipy.linalg import solve_banded
 from scipy.optimize import least_squares
 from scipy.special import erfc, erfcx
 
 import livepde as lp
+from livepde import cases
 from livepde.laws import refit as refit_module
 from livepde.laws.gate import near_neighbours
 from livepde.laws.refit import refitted
@@ -386,3 +389,64 @@ def test_readings_withdrawn_while_a_refit_is_under_way_are_not_in_it():
     identifier = insulated(apart=True)
     numbers = numbers_of(identifier, broken)
     assert abs(numbers[-1, 0] - 0.23) < 5.0 * numbers[-1, 1]
+
+
+WALL = """
+equation = "conduction"
+initial = "interpolate"
+mesh = { from = 0, to = "36 cm", cells = 20 }
+data = { file = "wall.csv", time = "t", time_unit = "s" }
+law = { shadows = false, verdict = false }
+unknowns.k = { prior = "0.8 W/m/K", std = "0.4 W/(m K)", transform = "log" }
+unknowns.C = { prior = "1.6e6 J/(m3 K)", std = "5e5 J/(m3 K)", transform = "log" }
+channels.a = { role = "boundary", column = "a", at = "left" }
+channels.b = { role = "boundary", column = "b", at = "right" }
+channels.q = { role = "sensor", column = "q", at = "left", quantity = "flux", noise = "2 W/m2" }
+"""
+
+
+def wall(count: int) -> dict[str, Any]:
+    """Return temperatures at both faces of a wall and the flux into it: finite volumes."""
+    k, C, length, cells, h = 0.62, 1.45e6, 0.36, 72, 600.0
+    width, day = length / cells, 2 * np.pi / 86400.0
+    share = k * (h / 2) / (C * width**2)
+    bands = np.zeros((3, cells))
+    bands[0, 1:] = bands[2, :-1] = -share
+    bands[1] = 1.0 + 2.0 * share
+    bands[1, [0, -1]] += share
+
+    def faces(t: Any) -> Any:
+        return np.array(
+            [
+                20.0 + 0.8 * np.sin(day * t) + 0.6 * np.sin(day * t / 3.3),
+                6.0 + 5.0 * np.sin(day * t - 2.0) + 3.0 * np.sin(day * t / 4.1),
+            ]
+        )
+
+    u, t = 20.0 - 14.0 * (np.arange(cells) + 0.5) / cells, h * np.arange(count)
+    flux = np.zeros(count)
+    for step in range(2 * count - 1):
+        if step:
+            u[[0, -1]] += 2.0 * share * faces(step * h / 2)
+            u = solve_banded((1, 1), bands, u)
+        if step % 2 == 0:
+            flux[step // 2] = 2.0 * k * (faces(step * h / 2)[0] - u[0]) / width
+    rng = np.random.default_rng(1)
+    a, b = faces(t) + 0.03 * rng.standard_normal((2, count))
+    return {"t": t, "a": a, "b": b, "q": flux + 0.3 * rng.standard_normal(count)}
+
+
+@pytest.mark.slow
+def test_a_fit_far_from_its_prior_is_not_the_end_of_the_search(tmp_path):
+    """A wall with an uncertain start: the fit ended at k = 0.1 and six times the heat capacity.
+
+    The residuals there are half as large again as the noise, which alone did not begin a search.
+    """
+    (tmp_path / "case.toml").write_text(WALL)
+    pd.DataFrame(wall(360)).round(2).to_csv(tmp_path / "wall.csv", index=False)
+    prepared = cases.load(tmp_path / "case.toml").prepare()
+    last = prepared.identifier.run(prepared.stream).last
+    assert last.parameters["k"][0] == pytest.approx(0.62, rel=0.03)
+    assert last.parameters["C"][0] == pytest.approx(1.45e6, rel=0.05)
+    assert last.fit.converged
+    assert last.fit.cost < 90.0  # 118 at the wrong end

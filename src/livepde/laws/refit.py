@@ -52,6 +52,7 @@ SHORT = 0.1  # prior standard deviations of a step whose second-order part is le
 CURVED = 0.75  # largest second-order part of a step over its first-order part (Transtrum 2012)
 SHORTEST, LEAST = 1e-7, 1e-9  # step, and predicted decrease relative to the cost, that are none
 LARGE, DOUBTFUL = 30.0, 2.5  # mean squares of residuals that need a new search, the second one
+FAR = 6.0  # prior standard deviations from the prior: no honest prior is so wrong
 UNSURE = 0.5  # only where a direction keeps more than this share of its prior standard deviation
 ROUNDING = 1e-12  # share of a variance
 AT_BOUND = 1e-6  # prior standard deviations from a bound at which a fit is held by it
@@ -114,7 +115,7 @@ def refitted(
         used=search.used,
         converged=search.settled and not search.lost,
         passes=search.passes,
-        screened=screens and search.unexplained and not search.lost,
+        screened=screens and (search.unexplained or search.far) and not search.lost,
     )
 
 
@@ -175,13 +176,14 @@ class _Search:
         """
         start = self.samples.reached
         self.descend(start)
-        screens = self.suspicious and (
-            len(self.samples) >= (ANEW_LAST if self.last else ANEW) * screened
-        )
+        # Fewer samples have shown that there is no other end, if this is the same.
+        stays = self.best is not None and np.linalg.norm(self.best.xi - start) < STAYS
+        more = len(self.samples) >= (ANEW_LAST if self.last else ANEW) * screened
+        screens = self.suspicious and (more or (self.far and not stays))
         if screens:
             self.screen()
-        elif screened and self.best and np.linalg.norm(self.best.xi - start) < STAYS:
-            self.lacking = 0  # fewer samples have shown that there is no other end
+        elif screened and stays:
+            self.lacking = 0
         if self.last and self.lost:
             self.draw()
         return screens
@@ -315,8 +317,18 @@ class _Search:
 
     @property
     def suspicious(self) -> bool:
-        """True if the best trajectory does not explain the samples, as a wrong minimum does not."""
-        return self.lost or self._square > LARGE
+        """True if the best trajectory does not explain the samples, or contradicts the prior.
+
+        So do wrong minima.
+        """
+        return self.lost or self.far or self._square > LARGE
+
+    @property
+    def far(self) -> bool:
+        """True if the best trajectory is far outside the prior, N(0, I) of all coordinates."""
+        if self.best is None:
+            return False
+        return float(self.best.xi @ self.best.xi) > FAR**2 + 2.0 * float(self.samples.alive.sum())
 
     @property
     def lost(self) -> bool:
