@@ -222,7 +222,7 @@ def _widths(model: Model, centre: Array, spread: float | None) -> Array:
 
 def _densities(form: Form, moment: Moment, **coefficients: Array) -> Array:
     """Return the weighted integrand at all quadrature points, by plain evaluation of the form."""
-    found = []
+    found = [np.zeros(1)]  # a form may have no term
     for term in (piece for whole in form.terms for _, piece in whole.pieces()):
         values = {key: local.values(coefficients[key]) for key, local in term.spaces.items()}
         density, _ = term.evaluate(values, moment)
