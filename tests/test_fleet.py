@@ -629,11 +629,16 @@ def test_the_verdict_on_a_member_is_that_of_a_separate_run():
     fleet = lp.Fleet(model, SENSORS, law, members)
     assert not fleet.verdict(0).judged  # before the first sample
     separate = [lp.Identifier(model, SENSORS, law) for _ in range(members)]
-    for t, z, inputs in samples(fleet, steps=50):
+    for number, (t, z, inputs) in enumerate(samples(fleet, steps=50)):
         z[1, 1] += 0.3  # an offset of one sensor
-        fleet.step(t, z, inputs)
+        if number in (20, 21):  # gaps of a sensor and of an input
+            z[0, 0] = np.nan
+            inputs = {name: np.array([np.nan, values[1]]) for name, values in inputs.items()}
+        noise = np.full_like(z, 0.02 + 0.01 * (number % 2))  # of each reading
+        fleet.step(t, np.stack([z, noise], axis=-1), inputs)
         for k, one in enumerate(separate):
-            one.step(t, z[k], {name: values[k] for name, values in inputs.items()})
+            pairs = np.stack([z[k], noise[k]], axis=-1)
+            one.step(t, pairs, {name: values[k] for name, values in inputs.items()})
     levels = []
     for k, one in enumerate(separate):
         found, expected = fleet.verdict(k), one._settled(one.estimate()).verdict

@@ -22,6 +22,7 @@ from live_rod import CLOCK, COLUMNS, OPENED, identifier, journal, live, rows, sa
 from patience import PATIENCE
 
 import livepde as lp
+from livepde.runs.ailments import Ailments
 from livepde.runs.backlog import Backlog
 from livepde.runs.journal import Event, Journal
 from livepde.runs.live_loop import Live
@@ -704,3 +705,22 @@ def test_a_followed_file_in_utf_16_is_named(tmp_path):
     assert found
     assert all("UTF-16" in row.broken for row in found if row.broken)
     assert found[0].broken == "the file is in UTF-16, not to be followed: write UTF-8"
+
+
+def test_a_full_disk_in_a_silence_is_reported_as_what_it_is():
+    """It was an event of the kind "silent", and its end had none."""
+    now = [0.0]
+    feed = SimpleNamespace(interval=1.0, doubt="", done=False)
+    journal = SimpleNamespace(in_place=True)
+    ailments = Ailments(feed, journal, lambda: None, 10.0, lambda: now[0])
+    assert ailments.look() is None
+    now[0] = 20.0
+    assert not ailments.listen(heard=False)
+    ailments.unwritten = "no space"
+    assert ailments.look() == ("unwell", "no space")
+    assert ailments.look() is None
+    ailments.unwritten = ""
+    assert ailments.look() == ("silent", "no data from the source for more than 10 s")
+    assert ailments.listen(heard=True) == "data source reconnected after 20 s"
+    ailments.stepped(SimpleNamespace(status=SimpleNamespace(taken=True, ok=True)))
+    assert ailments.look() == ("well", "")  # the end of a silence has been reported

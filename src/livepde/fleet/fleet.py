@@ -421,7 +421,7 @@ class Fleet:
         return start._placed(state, ends, self._samples)
 
     def verdict(self, member: str | int) -> Verdict:
-        """Return the verdict on a member, by name or number, as that of a run of its own.
+        """Return the verdict that a separate run of a member would have, by name or number.
 
         Members are not assessed while they are stepped together. This takes the stored samples of
         one member again, which is as slow as a separate run of it.

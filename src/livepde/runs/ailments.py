@@ -73,14 +73,16 @@ class Ailments:
         return next(found, ("", ""))
 
     def look(self) -> tuple[str, str] | None:
-        """Return kind and sentence of an event if the run's health has changed, else None."""
+        """Return kind and sentence of an event if the run's health has changed, else None.
+
+        The sentence is empty after a silence, whose end has an event of its own.
+        """
         (kind, why), before = self._ailing(), self._told[0]
         if kind == before:
             return None
         self._told = kind, why
         if why:
             return "silent" if kind == "silent" else "unwell", why
-        # The event "heard" has reported the end of a silence.
         return "well", "" if before == "silent" else "recovered"
 
     def away(self, why: str) -> None:
