@@ -260,6 +260,12 @@ def test_without_that_input_another_unknown_is_taken(here):
     assert set(found["channels"]) == {"T_5cm"}
 
 
+def test_a_column_of_the_flow_needs_no_unknown_flux(here):
+    found = begun("time_s,flow [mm/h],T_5cm\n0,1,20\n1,1,20\n", equation="advection_diffusion")
+    assert set(found["unknowns"]) == {"kappa"}
+    assert found["channels"]["flow"]["role"] == "input"
+
+
 @pytest.mark.parametrize("name", ["borehole", "grouted_borehole", "pumping_test"])
 def test_graded_meshes_where_the_equation_wants_them(here, name):
     found = begun("time_s,a\n0,1\n1,1\n", equation=name)

@@ -140,7 +140,7 @@ ONE = lp.Normal(1.0, 1.0)
     [
         (heat, {"dirichlet": {"left": 0.0, "right": 0.0}, "transfer": ONE}, "and there is none"),
         (conduction, {"C": 0.0}, "must be positive"),
-        (advection_diffusion, {}, "give v"),
+        (advection_diffusion, {}, "give an unknown flux v"),
         (advection_diffusion, {"v": ONE, "L": 0.0}, "L must be positive"),
         (fisher_kpp, {"r": ONE, "K": 0.0}, "K must be a positive number"),
         (porous_fisher, {"r": ONE, "m": 0.5}, "m must be at least 1"),
@@ -219,6 +219,18 @@ def test_flux_and_head_add_up():
     assert np.allclose(found, last_state(one, 0.0, times))
 
 
+def test_a_measured_flow_carries_as_one_that_the_head_drives():
+    mesh, times = lp.interval(0.0, 1.0, 20), np.linspace(0, 0.5, 11)
+    given = mesh, broad(0.1), {"left": 1.0, "right": 0.0}
+    more = {"dispersivity": broad(0.1), "ratio": 1.5, "stabilise": True}
+    driven = advection_diffusion(*given, K=broad(2.0), L=4.0, **more)
+    measured = advection_diffusion(*given, flow=True, **more)
+    assert measured.channel_units["flow"] == "m/s"
+    one = last_state(driven, 0.0, times, lambda t: {"dH": 2.0 * np.sin(9 * t)})
+    two = last_state(measured, 0.0, times, lambda t: {"flow": np.sin(9 * t)})
+    assert np.allclose(one, two, rtol=1e-12)
+
+
 COLUMN_CASE = """
 equation = "advection_diffusion"
 initial = 10.0
@@ -245,6 +257,21 @@ def test_in_a_case_the_head_goes_with_the_conductivity(tmp_path):
         load(case).prepare()
     case.write_text(COLUMN_CASE + 'dH = { role = "input", column = "dH" }\n')
     assert load(case).model.channels == ("dH", "T_0")
+
+
+def test_in_a_case_a_measured_flow_needs_no_unknown_flux(tmp_path):
+    case = tmp_path / "bed.toml"
+    (tmp_path / "bed.csv").write_text("t,T_0,T_5,w\n0,10,10,1\n600,11,10,2\n")
+    text = "\n".join(line for line in COLUMN_CASE.splitlines() if not line.startswith("K ="))
+    flow = 'flow = { role = "input", column = "w", unit = "mm/h" }\n'
+    case.write_text(f"{text}\n{flow}")
+    prepared = load(case).prepare()
+    assert prepared.identifier.model.channels == ("flow", "T_0")
+    first = next(iter(prepared.stream))
+    assert first.z["flow"] == pytest.approx(1e-3 / 3600.0)
+    case.write_text(text)
+    with pytest.raises(ModelError, match="the input flow"):
+        load(case).prepare()
 
 
 FIXED = {"left": 0.0, "right": 0.0}

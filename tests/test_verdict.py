@@ -102,7 +102,7 @@ def run(
     law: Any = None,
     places: Any = None,
     validation: Any = None,
-    u0: float = 0.0,
+    u0: float | None = 0.0,
 ) -> tuple[lp.Identifier, lp.Estimate]:
     """Return identifier and last estimate of a run with some readings."""
     sensors = lp.Points(places or PLACES, noise=NOISE * stated, unit="degC")
@@ -200,6 +200,13 @@ def test_a_start_that_is_off_hides_no_other_fault(fault: str):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("level", [0.0, 20.0])
+def test_a_start_that_nobody_stated_is_a_suspect(level: float):
+    _, estimate = run(level + shown() + errors(), u0=None)
+    remedies = [one.remedy for one in estimate.verdict.findings if one.what == "start"]
+    assert any("Give `u0`" in remedy for remedy in remedies) == (level > 0.0)
+
+
 def test_a_sensor_elsewhere_is_named():
     found = run(shown() + errors(), places={**PLACES, "B": 0.56})[1].verdict
     assert ("position", "B") in named(found)

@@ -25,6 +25,7 @@ from livepde.forecast import Forecast, ahead, future_times, seen_rows
 from livepde.laws import AnyLaw, Belief, Report, SensitivityLaw, Status, numerical, stepped
 from livepde.laws.later import then
 from livepde.laws.step_diagnostics import Diagnostics
+from livepde.laws.verdict import with_assumed_start
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.model import Model
 from livepde.observation import Observation
@@ -445,14 +446,16 @@ class Identifier(StreamRuns):
         known, ignored = self.validation, self.ignored
         names, units = ((), ()) if known is None else (known.names, known.units)
         inputs = self._channels.inputs
-        if not names and not steps.irregular and gaps.silent:
+        assumed = self.problem.initial is None and self.model.form_initial is None
+        if not names and not steps.irregular and gaps.silent and not assumed:
             return judge
 
         def found() -> Verdict:
             held = gaps.findings(inputs, diagnose().shifts)
-            return judge().with_findings(
+            verdict = judge().with_findings(
                 [*steps.findings(), *validation.findings(names, ignored, units), *held]
             )
+            return with_assumed_start(verdict) if assumed else verdict
 
         return found
 

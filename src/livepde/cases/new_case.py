@@ -261,7 +261,8 @@ def _unknowns(equation: Equation, inputs: set[str]) -> Iterator[str]:
     chosen = _alternative(equation, inputs)
     for name, variable in equation.unknowns.items():
         if name == chosen or not variable.optional:
-            others = [other for other in equation.alternatives if other != name]
+            others = [one for one in equation.alternatives if one in equation.unknowns]
+            others = [one for one in others if one != name]
             more = f"; or {', '.join(others)}, or both" if name == chosen else ""
             prior = _open(variable.unit)
             given: dict[str, Any] = {"prior": prior, "std": prior}

@@ -44,7 +44,7 @@ def model_of(case: CaseContent) -> Model:
             raise _without_input(case, name, f"the {variable.text}")
     unknowns = _unknowns(case)
     with case.located("unknowns", NameClashError):
-        model = case.equation.build(case.mesh, unknowns, _dirichlet(case), **case.options)
+        model = _built(case, unknowns)
     _check_inputs(case, model, given, constants)
     model = model.with_constant_inputs(constants) if constants else model
     own = unknowns_of(case)
@@ -52,6 +52,14 @@ def model_of(case: CaseContent) -> Model:
         return model
     with case.located("channels", ModelError):
         return model.with_unknowns(own)
+
+
+def _built(case: CaseContent, unknowns: Mapping[str, Any]) -> Model:
+    """Return the model of the equation with some unknowns, before constants and own unknowns."""
+    # An optional input switches on the term that reads it.
+    switched = case.equation.options.keys() & {*case.roles("input"), *case.constants}
+    options = {**case.options, **dict.fromkeys(switched, True)}
+    return case.equation.build(case.mesh, unknowns, _dirichlet(case), **options)
 
 
 def _check_inputs(
@@ -80,8 +88,7 @@ def _unread(case: CaseContent, model: Model, constants: Iterable[str]) -> list[s
 def unread_without(case: CaseContent, unknown: str) -> list[str]:
     """Return the keys of the inputs that the equation reads for an unknown alone."""
     unknowns = {name: one for name, one in _unknowns(case).items() if name != unknown}
-    model = case.equation.build(case.mesh, unknowns, _dirichlet(case), **case.options)
-    return _unread(case, model, case.constants)
+    return _unread(case, _built(case, unknowns), case.constants)
 
 
 def _without_input(case: CaseContent, name: str, what: str) -> CaseError:

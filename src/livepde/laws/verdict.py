@@ -160,6 +160,14 @@ def with_discretisation(verdict: Verdict, shadows: ShadowSet | None, s: ShadowSt
     return verdict.with_untested(missing).with_findings([more])
 
 
+def with_assumed_start(verdict: Verdict) -> Verdict:
+    """Return a verdict that names the initial state of zero, which nobody stated, as a suspect."""
+    if verdict.level == "trusted" or not verdict.findings:
+        return verdict
+    text, remedy = FINDINGS["start, assumed"].filled()
+    return verdict.with_findings([Finding("start", "note", text, "u0", remedy=remedy)])
+
+
 def with_columns(verdict: Verdict, columns: Columns | str) -> Verdict:
     """Return a verdict that names the columns of the data which explain a misfit."""
     doubted = any(finding.severity != "note" for finding in verdict.findings)

@@ -44,14 +44,16 @@ def advection_diffusion(
     source: Unknown | None = None,
     L: float = 1.0,
     ratio: float = 1.0,
+    flow: bool = False,
     stabilise: bool = False,
     element: Any = None,
     unit: str = "degC",
 ) -> Model:
     """Return u_t + w u_z - div((kappa + dispersivity |w|) grad u) = source, along z = x[0].
 
-    The velocity is w = ratio (v + K dH/L): a flux v, the Darcy flux of a measured head difference
-    dH, or the sum of both. Examples are heat in a stream bed (Stallman 1965) and solutes.
+    The velocity is w = ratio (flow + v + K dH/L): a measured flux, an unknown flux v, the Darcy
+    flux of a measured head difference dH, or their sum. Examples are heat in a stream bed
+    (Stallman 1965), a pipe with a flow meter, and solutes.
 
     Parameters
     ----------
@@ -75,6 +77,8 @@ def advection_diffusion(
     ratio
         Ratio of velocity to flux: for heat the volumetric heat capacity of water over that of the
         saturated bed (about 1.5), for a solute 1/porosity.
+    flow
+        Whether the flux, or a part of it, is the input channel "flow" in m/s, positive along z.
     stabilise
         True: add the artificial diffusion of `livepde.fem.upwind`, for flows with a cell Peclet
         number |w| h/(2 kappa) above 1.
@@ -82,7 +86,7 @@ def advection_diffusion(
     Raises
     ------
     ModelError
-        Neither v nor K is given, or a length or ratio is not positive.
+        None of v, K and flow is given, or a length or ratio is not positive.
 
     Examples
     --------
@@ -94,8 +98,9 @@ def advection_diffusion(
     >>> model.channels
     ('dH', 'T_river', 'T_40')
     """
-    if v is None and K is None:
-        raise ModelError("advection_diffusion: give v (a flux), K (with the input dH), or both.")
+    if v is None and K is None and not flow:
+        text = "give an unknown flux v, a measured one (the input flow), or K with the input dH."
+        raise ModelError(f"advection_diffusion: {text}")
     for name, value in {"L": L, "ratio": ratio}.items():
         if not value > 0:
             raise ModelError(f"advection_diffusion: {name} must be positive; got {value}.")
@@ -104,7 +109,9 @@ def advection_diffusion(
     everywhere("advection_diffusion", mesh, kappa=kappa)
 
     def velocity(q: Any, x: Any) -> Any:
-        flux = q.v if v is not None else 0.0
+        flux = x.inputs["flow"] if flow else 0.0
+        if v is not None:
+            flux = flux + q.v
         if K is not None:
             flux = flux + q.K * x.inputs["dH"] / L
         return ratio * flux
@@ -124,7 +131,7 @@ def advection_diffusion(
         Field(mesh, element or linear(mesh), dirichlet=dict(dirichlet or {}), unit=unit),
         unknowns,
         A=transport,
-        inputs={"dH": "m"} if K is not None else {},
+        inputs=({"flow": "m/s"} if flow else {}) | ({"dH": "m"} if K is not None else {}),
         **ADVECTION_DIFFUSION.about(unknowns),
     )
 
@@ -132,7 +139,7 @@ def advection_diffusion(
 ADVECTION_DIFFUSION = Equation(
     name="advection_diffusion",
     summary="heat or a solute carried by a flow along a column: stream beds",
-    formula="u_t = div((kappa + dispersivity |w|) grad u) - w u_z,  w = ratio (v + K dH/L)",
+    formula="u_t = div((kappa + dispersivity |w|) grad u) - w u_z,  w = ratio (flow + v + K dH/L)",
     state=Variable("degC", "temperature"),
     unknowns={
         "kappa": Variable("m^2/s", "diffusivity: a number, by layer, or a field"),
@@ -141,15 +148,19 @@ ADVECTION_DIFFUSION = Equation(
         "dispersivity": Variable("m", "dispersivity", True),
         "source": Variable("K/s", "heat gained over heat capacity", True, transform=""),
     },
-    inputs={"dH": Variable("m", "head difference, positive if it drives along z", True)},
+    inputs={
+        "dH": Variable("m", "head difference, positive if it drives along z", True),
+        "flow": Variable("m/s", "measured flux along z", True),
+    },
     options={
         "L": Option("m", "length over which the head falls by dH", 1.0),
         "ratio": Option("", "velocity over flux: C of water over C of the wet bed", 1.0),
+        "flow": Option("", "whether the flux is measured; set by an input `flow`", False),
         "stabilise": Option("", "whether to add the diffusion that fast flows need", False),
     },
     build=by_name(advection_diffusion),
     element=linear,
-    alternatives={"K": ("dH", "L", "ratio"), "v": ("ratio",)},
+    alternatives={"K": ("dH", "L", "ratio"), "flow": ("flow", "ratio"), "v": ("ratio",)},
 )
 
 

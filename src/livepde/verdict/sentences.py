@@ -57,6 +57,10 @@ FINDINGS: dict[str, Sentence] = {
         "The readings do not fit the initial state ({p}). This shifts each unknown by less than "
         "one standard deviation."
     ),
+    "start, assumed": Sentence(
+        "No `u0` was given, so the run began from a state of zero.",
+        "Give `u0`, the state at t0. If it is zero, give 0.",
+    ),
     "past": Sentence(
         "Earlier data did not fit the model. The last {count} samples fit, and the earlier error "
         "now shifts each unknown by less than one standard deviation."
