@@ -31,7 +31,8 @@ class ReducedEvolution:
         # Copies, as the harmonics of a periodic unknown, move by F; every mode of a copy moves
         # alike.
         F = self.model.transition(h)
-        return np.asarray(np.kron(F, np.eye((self.part.stop - self.part.start) // len(F))))
+        modes = (self.part.stop - self.part.start) // len(F)
+        return F if modes == 1 else np.asarray(np.kron(F, np.eye(modes)))
 
     def growth(self, h: float) -> Array:
         """Return the variance its coordinates gain in a time h."""
@@ -315,7 +316,11 @@ def _mode_counts(modes: int | str | dict[str, int], fields: object) -> dict[str,
 
 @lru_cache(maxsize=64)
 def _transition(evolutions: tuple[ReducedEvolution, ...], h: float) -> Array:
-    return np.asarray(block_diag(*(evolution.transition(h) for evolution in evolutions)))
+    F = np.eye(evolutions[-1].part.stop if evolutions else 0)
+    for evolution in evolutions:
+        if evolution.model.moves:
+            F[evolution.part, evolution.part] = evolution.transition(h)
+    return F
 
 
 @lru_cache(maxsize=64)
