@@ -238,6 +238,13 @@ def _array(z: Any) -> Array:
     return numbers(z, "z")
 
 
+def _are_pairs(z: Any, count: int) -> bool:
+    """Return whether readings come with the noise of each."""
+    with suppress(ValueError):  # rows of several lengths
+        return bool(np.shape(z) == (count, 2))
+    return False
+
+
 def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
     """Return the measurements of all sensors, shape (sensors,), as a new array.
 
@@ -249,10 +256,7 @@ def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
         return np.array(z), None
     if isinstance(z, np.ma.MaskedArray):
         z = numbers(z, "z")
-    pairs = False
-    with suppress(ValueError):  # rows of several lengths
-        pairs = np.shape(z) == (observed.size, 2)
-    if pairs:
+    if _are_pairs(z, observed.size):
         values, stds = np.array(z, dtype=object).T.tolist()
         noise = own_noise(list(map(check_noise, observed.names, stds)))
         return readings(values, observed)[0], noise

@@ -135,12 +135,22 @@ def conversion(given: str, unit: str, where: str) -> Affine:
     if (usual := USUAL.get((with_powers(given), unit))) is not None:
         return Affine(*usual)
     check_unit(given, where)
+    zero, one, two = _converted(given, unit, where)
+    # Units as decibels are logarithmic: three points do not lie on a line.
+    if not math.isclose(two - one, one - zero):
+        raise CaseError(f"{where}: '{given}' has no linear scale; {_expected(unit)}.")
+    return Affine(float(one - zero), float(zero))
+
+
+def _converted(given: str, unit: str, where: str) -> tuple[float, float, float]:
+    """Return what 0, 1 and 2 of a unit are in another one."""
     registry = pint_registry()
     import pint
 
     try:
         parsed = parsed_unit(registry, given)
         zero, one, two = (registry.Quantity(k, parsed).to(unit).magnitude for k in (0.0, 1.0, 2.0))
+        return zero, one, two
     except pint.UndefinedUnitError as error:
         raise CaseError(
             f"{where}: '{error.args[0] if error.args else given}' is not a unit that is known; "
@@ -152,10 +162,6 @@ def conversion(given: str, unit: str, where: str) -> Affine:
         ) from None
     except (pint.PintError, *NOT_A_UNIT):
         raise CaseError(f"{where}: '{given}' is not a unit; {_expected(unit)}.") from None
-    # Units as decibels are logarithmic: three points do not lie on a line.
-    if not math.isclose(two - one, one - zero):
-        raise CaseError(f"{where}: '{given}' has no linear scale; {_expected(unit)}.")
-    return Affine(float(one - zero), float(zero))
 
 
 def with_powers(unit: str) -> str:

@@ -85,19 +85,31 @@ def init(
         new_case.check_free(folder, ["case.toml"])
         found = named(equation or "heat", EQUATIONS, "equation")
         case = folder / "case.toml"
-        changes = parse(settings or [])
-        zone = zone_named(str(changes.get("data.zone") or "UTC"), "--set data.zone")
-        missing = missing_in(changes.pop("data.missing", None), "--set data.missing")
-        how: dict[str, Any] = {"time_format": time_format, "skip": skip, "zone": zone}
-        how |= {"missing": missing, "stated": str(changes.get("data.time_unit") or "")}
-        first, *others = (measured(file, found.time_unit, **how) for file in data)
-        read = reduce(Measured.joined, others, first)
-        files = new_case.files_for(read, folder, found)
-        _show_read(console, read, found)
-        files["case.toml"] = filled(files["case.toml"], changes, f"{case}")
-        new_case.write_files(folder, files)
-        _show_written(console, case, data, files)
+        _begin(console, case, data, found, parse(settings or []), time_format, skip)
     console.print(f"  livepde check {case}\n  livepde run {case}")
+
+
+def _begin(
+    console: Console,
+    case: Path,
+    data: Sequence[Path],
+    equation: Equation,
+    changes: dict[str, Any],
+    time_format: str,
+    skip: int | None,
+) -> None:
+    """Write a case for tables, with some keys set, and print what was read and is left open."""
+    zone = zone_named(str(changes.get("data.zone") or "UTC"), "--set data.zone")
+    missing = missing_in(changes.pop("data.missing", None), "--set data.missing")
+    how: dict[str, Any] = {"time_format": time_format, "skip": skip, "zone": zone}
+    how |= {"missing": missing, "stated": str(changes.get("data.time_unit") or "")}
+    first, *others = (measured(file, equation.time_unit, **how) for file in data)
+    read = reduce(Measured.joined, others, first)
+    files = new_case.files_for(read, case.parent, equation)
+    _show_read(console, read, equation)
+    files["case.toml"] = filled(files["case.toml"], changes, f"{case}")
+    new_case.write_files(case.parent, files)
+    _show_written(console, case, data, files)
 
 
 def _show_written(

@@ -334,10 +334,9 @@ def _allowed(
     """
     problem, reduction = filter_.problem, filter_.reduction
     latent = problem.model.latent
-    own = set(latent.parts) - _read(problem.model)
-    for name, item in latent.parts.items():
-        if isinstance(item.unknown, Scalar) and item.unknown.corrects:  # an input
-            own.add(name)
+    scalars = {n: p.unknown for n, p in latent.parts.items() if isinstance(p.unknown, Scalar)}
+    corrections = {name for name, unknown in scalars.items() if unknown.corrects}  # of inputs
+    own = (latent.parts.keys() - _read(problem.model)) | corrections
     known = reduction.bounded(filter_.estimate(x)[0])
     # An interval about a value beyond a bound is one about the bound: the half within it is left.
     middle = 0.5 * (ends[0] + ends[1])
@@ -356,18 +355,19 @@ def _allowed(
         labels = item.block.labels(name)
         prior, unit = item.unknown.prior, item.unknown.unit
         usual = USUAL * float(prior.latent_std) if prior.symmetric else 0.0
-        if len(labels) == item.size:
-            rows = zip(labels, range(part.start, part.stop), strict=True)
-            for label, k in rows:
-                numbers = [float(one[k]) for one in (value, *ends, plain_low, plain_high, wider)]
-                yield Allowed.of(label, unit, numbers, usual=usual, of_sensor=name in own)
-            continue
-        size = float(np.sqrt((value[part] ** 2).mean()))
-        every = (*ends, plain_low, plain_high)
-        off = [float(np.sqrt(((end[part] - value[part]) ** 2).mean())) for end in every]
-        numbers = [size, size - off[0], size + off[1], size - off[2], size + off[3]]
-        numbers.append(float(np.sqrt((wider[part] ** 2).mean())))
-        yield Allowed.of(name, unit, numbers, usual=usual, of_sensor=name in own)
+        every = np.array([value, *ends, plain_low, plain_high, wider])[:, part]
+        if len(labels) != item.size:  # a field
+            labels, every = [name], _root_mean_squares(every)[:, None]
+        for label, numbers in zip(labels, every.T.tolist(), strict=True):
+            yield Allowed.of(label, unit, numbers, usual=usual, of_sensor=name in own)
+
+
+def _root_mean_squares(every: Array) -> Array:
+    """Return size, ends of both intervals and their ratio of a field, from those of its numbers."""
+    value, *ends, wider = every
+    size, ratio = (float(np.sqrt((one**2).mean())) for one in (value, wider))
+    off = [float(np.sqrt(((end - value) ** 2).mean())) for end in ends]
+    return np.array([size, size - off[0], size + off[1], size - off[2], size + off[3], ratio])
 
 
 def linear_model(

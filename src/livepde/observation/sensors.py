@@ -474,19 +474,26 @@ class Averages(Observation):
             if size == 0.0:  # a boundary on the axis
                 size, row = _integral(block, measure, lambda x, _: 1.0)
         else:
-            cut = crossed(measure, region)
-            size, row = _integral(
-                block, measure, lambda x, cells: weight(x) * region(x) * ~np.isin(cells, cut)
-            )
-            # A region between the quadrature points of one cell is looked for on finer parts.
-            members = cut if size > 0 or len(cut) else np.arange(mesh.nelements)
-            if len(members):
-                fine = FineMeasure(mesh, order, members=members)
-                more, added = _integral(block, fine, lambda x, _: weight(x) * region(x))
-                size, row = size + more, row + added
+            size, row = _integral_inside(block, measure, region)
         if size <= 0:
             raise ObservationError(f"Averages: region '{name}' contains no part of the mesh.")
         return row / size
+
+
+def _integral_inside(block: FieldBlock, measure: Measure, region: Predicate) -> tuple[float, Array]:
+    """Return the integrals over a region; cells that its border crosses are divided."""
+    mesh, weight = block.field.mesh, block.field.weight
+    cut = crossed(measure, region)
+    size, row = _integral(
+        block, measure, lambda x, cells: weight(x) * region(x) * ~np.isin(cells, cut)
+    )
+    # A region between the quadrature points of one cell is looked for on finer parts.
+    members = cut if size > 0 or len(cut) else np.arange(mesh.nelements)
+    if len(members):
+        fine = FineMeasure(mesh, measure.order, members=members)
+        more, added = _integral(block, fine, lambda x, _: weight(x) * region(x))
+        size, row = size + more, row + added
+    return size, row
 
 
 def _integral(

@@ -15,6 +15,7 @@ from livepde.dates import when
 from livepde.diagnostics.check_report import Bound, Check, Sense, Table
 from livepde.diagnostics.information_gain import TRADED, InformationGain
 from livepde.frames import ERRORS, estimates, model_errors, relative_error
+from livepde.linalg import Array
 from livepde.plots.style import modes_told, note, prior_left
 from livepde.records import NORMAL_95, field_names, refused_readings, scalars, used_errors
 from livepde.runs.journal import Journal
@@ -77,15 +78,10 @@ def resistance(data: xr.Dataset) -> Resistance | None:
     k = np.array([float(data[label][-1]) for label in layers])
     relative = np.array([float(data[f"{label}_std"][-1]) for label in layers]) / k
     parts = np.array([*layers.values()]) / k
-    correlation = np.eye(len(k))
-    if len(k) > 1 and "correlation" in data:
-        names = [str(name) for name in data["unknown"].values]
-        rows = [names.index(label) for label in layers]
-        correlation = data["correlation"].values[np.ix_(rows, rows)]
     R = float(parts.sum())
     # d ln R / d ln k_i = -R_i / R.
     slopes = relative * parts / R
-    variance = float(slopes @ correlation @ slopes)
+    variance = float(slopes @ _correlation(data, list(layers)) @ slopes)
     surfaces = data.attrs.get(SURFACES)
     errors = model_errors(data)
     each = {one.label: (one.high, one.low) for one in (errors.unknowns if errors else ())}
@@ -99,6 +95,15 @@ def resistance(data: xr.Dataset) -> Resistance | None:
         low=float(low.sum()),
         high=float(high.sum()),
     )
+
+
+def _correlation(data: xr.Dataset, labels: Sequence[str]) -> Array:
+    """Return the correlations of some unknowns of a run at its end; of one there are none."""
+    if len(labels) == 1 or "correlation" not in data:
+        return np.eye(len(labels))
+    names = [str(name) for name in data["unknown"].values]
+    rows = [names.index(label) for label in labels]
+    return np.asarray(data["correlation"].values[np.ix_(rows, rows)])
 
 
 def digits(value: float, std: float) -> tuple[str, str]:

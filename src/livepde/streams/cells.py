@@ -88,12 +88,12 @@ def _remedy(value: Any, decimal: str, cells: Iterable[Any], missing: Missing) ->
         return NO_POINT
     if not isinstance(value, str):
         return "expected a number (leave it empty if it is missing)."
-    texts = dict.fromkeys(
-        cell.strip()
-        for cell in cells
-        if isinstance(cell, str) and not is_missing(cell, missing)
-        if number_of(cell, decimal) is None and "'" not in cell
-    )
+
+    def odd(cell: Any) -> bool:
+        read = is_missing(cell, missing) or number_of(cell, decimal) is not None
+        return isinstance(cell, str) and not read and "'" not in cell
+
+    texts = dict.fromkeys(cell.strip() for cell in cells if odd(cell))
     stated = [one for one in missing if isinstance(one, str)]
     key = f"data.missing={[*stated, *list(texts)[:MOST]]}"
     return (

@@ -330,17 +330,20 @@ def _remedy(cell: Any, clock: Clock, dates: bool) -> str:
     if clock.format in ELAPSED:
         return f"expected an elapsed time as time_format has it, {clock.format!r}."
     if not dates or clock.since is not None:
-        if clock.decimal != "." and number_of(cell) is not None:
-            return NO_POINT
-        return "expected a number, as in the other rows."
+        marked = clock.decimal != "." and number_of(cell) is not None
+        return NO_POINT if marked else "expected a number, as in the other rows."
     if clock.format:
         return f"expected a date as time_format has it, {clock.format!r}."
     expected = "expected a date and time such as 2025-04-01 12:00"
-    if isinstance(cell, str) and (forms := elapsed_formats([cell])):
-        known = " or ".join(map(repr, forms))
-        return f"{expected}; if it is an elapsed time, set time_format = {known}."
-    format = guessed_format(cell) if isinstance(cell, str) else ""
-    return expected + (f"; set time_format, perhaps {format!r}." if format else ".")
+    return expected + (_other_format(cell) if isinstance(cell, str) else ".")
+
+
+def _other_format(text: str) -> str:
+    """Return the end of a sentence about a text that may be a time in another format."""
+    if forms := elapsed_formats([text]):
+        return f"; if it is an elapsed time, set time_format = {' or '.join(map(repr, forms))}."
+    format = guessed_format(text)
+    return f"; set time_format, perhaps {format!r}." if format else "."
 
 
 def _day_after(value: Any) -> date | None:

@@ -124,11 +124,8 @@ class Reading:
                     continue
                 raise self._missing(where, name, column, names)
             of = noise_of.get(name, "")  # the noise of each reading of this channel
-            unit, own = (
-                self.units.get(name, units.get(column, "")),
-                self.channel_units.get(of or name),
-            )
-            rule = conversion(unit or own, own, f"units of '{name}'") if own else Affine()
+            unit = self.units.get(name, units.get(column, ""))
+            rule = self._rule(name, unit, self.channel_units.get(of or name))
             scale = rule.factor, rule.offset
             if of:  # in the unit of the readings where it states none
                 scale = rule.factor if unit else found[of].factor, 0.0
@@ -136,6 +133,11 @@ class Reading:
         if self.strict:
             self._refuse_more(where, names, {time, *(one.names[0] for one in found.values())})
         return found
+
+    @staticmethod
+    def _rule(name: str, unit: str, own: str | None) -> Affine:
+        """Return how values in a stated unit, else their own, become those of the model."""
+        return conversion(unit or own, own, f"units of '{name}'") if own else Affine()
 
     def _refuse_more(self, where: str, names: Sequence[str], used: set[str]) -> None:
         """Refuse a column that is no channel."""

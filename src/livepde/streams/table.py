@@ -271,18 +271,9 @@ def to_table(
         [scaled(column, use) for column in columns.values()] or [np.zeros((len(use), 0))]
     )
     remarks = Counter(_noise_remarks(columns, values))
-    kept = np.zeros(len(use), dtype=bool)
-    kept[:: every // stride] = True
-    chosen = kept.copy()
-    # A value that is not valid is missing; a sample is left out for its first missing channel only.
-    for k, (name, channel) in enumerate(columns.items()):
-        low, high = channel.valid
-        wrong = (values[:, k] < low) | (values[:, k] > high)
-        values[wrong, k] = np.nan
-        lacking = kept & np.isnan(values[:, k]) & channel.needed
-        kept &= ~lacking
-        remarks["invalid", name] += int((wrong & chosen).sum())
-        remarks["skipped", name] = int(lacking.sum())
+    chosen = np.zeros(len(use), dtype=bool)
+    chosen[:: every // stride] = True
+    kept = _complete(columns, values, chosen, remarks)
     if not kept.any():
         raise DataError(f"{where[0]}: no sample has all channels that it needs.")
     if rows.held.any():
@@ -294,6 +285,25 @@ def to_table(
         t = t - t[0]
     remarks = +remarks  # drops counts of zero
     return DataTable(t, values, tuple(columns), origin=origin, remarks=remarks)
+
+
+def _complete(
+    columns: Mapping[str, Column], values: Array, chosen: Mask, remarks: Counter[tuple[str, str]]
+) -> Mask:
+    """Return which chosen samples have all channels that they need; values that are not valid go.
+
+    A sample is left out for its first missing channel only. `remarks`: of both, counted.
+    """
+    kept = chosen.copy()
+    for k, (name, channel) in enumerate(columns.items()):
+        low, high = channel.valid
+        wrong = (values[:, k] < low) | (values[:, k] > high)
+        values[wrong, k] = np.nan
+        lacking = kept & np.isnan(values[:, k]) & channel.needed
+        kept &= ~lacking
+        remarks["invalid", name] += int((wrong & chosen).sum())
+        remarks["skipped", name] = int(lacking.sum())
+    return kept
 
 
 def _chosen(

@@ -243,15 +243,7 @@ def averaged(model: LinearModel, causes: Causes, families: Sequence[Family]) -> 
     Hypotheses without weight are left out.
     """
     total, (mean, variance, _) = model.left[2], model.asked
-    n, none = len(model.z), _Axes.of(model, NO_FAMILY, causes.columns)
-    single = [_beside(model, none, causes, size) for size in causes.sizes]
-    several: list[list[_Tried]] = []
-    for family in families:
-        axes = _Axes.of(model, family, causes.columns)
-        several.append([_alone(model, axes, size) for size in family.sizes])
-        several.append([_beside(model, axes, causes, size) for size in family.beside])
-    # Blocks of hypotheses that differ in their size, which is the outer axis.
-    groups = [[[_alone(model, none, 0.0)]], [single], several]
+    n, groups = len(model.z), _hypotheses(model, causes, families)
     tried = [one for group in groups for sizes in group for one in sizes]
     squares = np.maximum(np.concatenate([one.squares for one in tried]), 0.0)
     volume = np.concatenate([one.volume for one in tried])
@@ -265,6 +257,20 @@ def averaged(model: LinearModel, causes: Causes, families: Sequence[Family]) -> 
     moves = [one.moves(np.flatnonzero(own)) for one, own in zip(tried, each, strict=True)]
     shift, more = (np.concatenate(part) for part in zip(*moves, strict=True))
     return Mixture(weights[used], mean + shift, np.sqrt((variance + more) * level[used, None]))
+
+
+def _hypotheses(
+    model: LinearModel, causes: Causes, families: Sequence[Family]
+) -> list[list[list[_Tried]]]:
+    """Return "nothing is wrong", single causes, and families, each with one block a size."""
+    none = _Axes.of(model, NO_FAMILY, causes.columns)
+    single = [_beside(model, none, causes, size) for size in causes.sizes]
+    several: list[list[_Tried]] = []
+    for family in families:
+        axes = _Axes.of(model, family, causes.columns)
+        several.append([_alone(model, axes, size) for size in family.sizes])
+        several.append([_beside(model, axes, causes, size) for size in family.beside])
+    return [[[_alone(model, none, 0.0)]], [single], several]
 
 
 def _kinds(groups: Sequence[Sequence[Sequence[_Tried]]]) -> tuple[IntArray, list[int]]:
