@@ -93,8 +93,8 @@ def test_diffusivity_follows_the_filling():
 @pytest.mark.parametrize(
     ("start", "area", "c_max", "message"),
     [
-        (0.0, 0.0, FULL, "area must be positive"),
-        (0.0, AREA, -1.0, "c_max must be positive"),
+        (0.0, 0.0, FULL, "area must be a positive number"),
+        (0.0, AREA, -1.0, "c_max must be a positive number"),
         (0.1 * R, AREA, FULL, "centre"),
     ],
 )

@@ -278,7 +278,7 @@ def test_what_is_wrong_is_said():
         groundwater(mesh, T, T, wells={"Q": (30.0, 10.0)}, radius=1.0)
     with pytest.raises(ModelError, match="S by region is not possible"):
         groundwater(mesh, T, lp.Piecewise({"a": lambda x: x[0] > 30.0}, lp.Normal(1.0, 1.0)))
-    with pytest.raises(ModelError, match="thickness, must be positive"):
+    with pytest.raises(ModelError, match="thickness, must be a positive number"):
         pumping_test(lp.interval(0.1, 10.0, 5, geometric=True), T, T, b=0.0)
     # A drawdown with the quotient of two storages in its weak form was four times too large.
     rings = lp.Piecewise({"near": lambda x: x[0] < 20.0, "far": lambda x: x[0] > 20.0}, T)

@@ -141,7 +141,7 @@ ONE = lp.Normal(1.0, 1.0)
         (heat, {"dirichlet": {"left": 0.0, "right": 0.0}, "transfer": ONE}, "and there is none"),
         (conduction, {"C": 0.0}, "must be positive"),
         (advection_diffusion, {}, "give an unknown flux v"),
-        (advection_diffusion, {"v": ONE, "L": 0.0}, "L must be positive"),
+        (advection_diffusion, {"v": ONE, "L": 0.0}, "L must be a positive number"),
         (fisher_kpp, {"r": ONE, "K": 0.0}, "K must be a positive number"),
         (porous_fisher, {"r": ONE, "m": 0.5}, "m must be at least 1"),
     ],

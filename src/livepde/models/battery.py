@@ -6,7 +6,7 @@ from typing import Any
 
 from numpy import exp
 
-from livepde.errors import ModelError
+from livepde.errors import ModelError, require_positive
 from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
 from livepde.model import Model
 from livepde.models.description import Equation, Option, Variable, by_name
@@ -64,8 +64,7 @@ def battery_particle(
     ('I',)
     """
     for name, value in {"area": area, "c_max": c_max}.items():
-        if not value > 0:
-            raise ModelError(f"battery_particle: {name} must be positive; got {value}.")
+        require_positive(f"battery_particle: {name}", value, ModelError)
     if abs(float(mesh.p.min())) > 1e-9 * float(mesh.p.max()):
         raise ModelError(
             f"battery_particle: the mesh begins at {float(mesh.p.min()):g} m; a particle begins at "

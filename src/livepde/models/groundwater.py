@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.errors import ModelError
+from livepde.errors import ModelError, require_positive
 from livepde.fem import Channel, Field, On, Piecewise, Place, Unknown, dot, grad, linear
 from livepde.linalg import Array
 from livepde.model import Model
@@ -63,8 +63,7 @@ def pumping_test(
     """
     one_number("pumping_test", Ss=Ss)
     everywhere("pumping_test", mesh, k=k)
-    if not b > 0:
-        raise ModelError(f"pumping_test: b, the thickness, must be positive; got {b}.")
+    require_positive("pumping_test: b, the thickness,", b, ModelError)
     ends = {"right": 0.0}
     state = Field(mesh, element or linear(mesh), dirichlet=ends, unit="m", **AROUND_AXIS)
     terms: list[Any] = [

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from livepde.errors import ModelError
+from livepde.errors import ModelError, require_positive
 from livepde.fem import (
     Field,
     Source,
@@ -102,8 +102,7 @@ def advection_diffusion(
         text = "give an unknown flux v, a measured one (the input flow), or K with the input dH."
         raise ModelError(f"advection_diffusion: {text}")
     for name, value in {"L": L, "ratio": ratio}.items():
-        if not value > 0:
-            raise ModelError(f"advection_diffusion: {name} must be positive; got {value}.")
+        require_positive(f"advection_diffusion: {name}", value, ModelError)
     every = {"kappa": kappa, "v": v, "K": K, "dispersivity": dispersivity, "source": source}
     unknowns = {name: unknown for name, unknown in every.items() if unknown is not None}
     everywhere("advection_diffusion", mesh, kappa=kappa)
