@@ -151,7 +151,7 @@ class Identifier(StreamRuns):
         u0_errors = tuple(u0_errors)
         check_start(model, t0, u0, {"u0_from": u0_from, "u0_errors": u0_errors})
         # Unknowns of the sensors, as an offset, join those of the model: laws treat both alike.
-        self.model = model = with_sensors(model, observation)
+        self.model = model = with_sensors(model, observation, validation)
         self.law = law
         spaces = (model.state_space, model.X, model.parameter_space)
         self.observed = observation.bind(*spaces)

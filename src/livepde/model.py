@@ -29,20 +29,25 @@ from livepde.fem import (
     Moment,
     Named,
     On,
+    SensorState,
+    SensorTerms,
     Sobolev,
     Source,
     Unknown,
     cells,
     compose,
     dot,
+    equation_text,
     grad,
+    no_term,
     source_density,
+    terms_text,
     with_constants,
 )
 from livepde.fem.meshes import halved
 from livepde.linalg import Array, IntArray
 from livepde.records import Layout, name_clashes
-from livepde.showing import Shown, expression, listed
+from livepde.showing import Shown, listed
 from livepde.spaces import BorderedSpace, DualOperator, HilbertSpace, product
 
 
@@ -60,10 +65,6 @@ def _summed(form: Callable[[Any, Any], Any], u: Any, v: Any) -> Any:
     if not isinstance(u, Named):
         return form(u, v)
     return sum(form(part, getattr(v, name)) for name, part in vars(u).items())
-
-
-def _no_term(u: Any, v: Any, x: Any) -> Any:
-    return 0.0 * x[0]
 
 
 class Model(Shown):
@@ -111,6 +112,9 @@ class Model(Shown):
         lambda q: {"diffusivity": q.k / q.C}. If all of them are numbers and A is linear in unknowns
         and coefficients, a step is as fast as with an A that is linear in the unknowns. If an
         unknown in them varies in space, A is evaluated at each step.
+    sensors
+        Sensors that respond slowly, by name: their states are coefficients behind those of the
+        fields. Identifiers add those of their observations (`lp.observation.Slow`).
 
     Notes
     -----
@@ -148,7 +152,7 @@ class Model(Shown):
         state: Field | Mapping[str, Field],
         parameter: Unknown | Mapping[str, Unknown],
         A: Integrand | On | Sequence[Integrand | On],
-        B: Integrand | On | Sequence[Integrand | On] = _no_term,
+        B: Integrand | On | Sequence[Integrand | On] = no_term,
         f: Source | On | Sequence[Source | On] = 0.0,
         M: Integrand | On | Sequence[Integrand | On] | None = None,
         *,
@@ -160,17 +164,20 @@ class Model(Shown):
         formula: str = "",
         initial: Integrand | On | Sequence[Integrand | On] | None = None,
         coefficients: Callable[[Any], Mapping[str, Any]] | None = None,
+        sensors: Mapping[str, SensorState] | None = None,
     ) -> None:
         self._parts: dict[str, Any] = {
             **{"A": A, "B": B, "f": f, "M": M, "dA": dA, "dB": dB},
             **{"inputs": inputs, "initial": initial, "coefficients": coefficients},
+            "sensors": sensors,
         }
         self.state = state
         self.parameter = parameter
         self.time_unit, self.length_unit = time_unit, length_unit
         units = {"time_unit": time_unit, "length_unit": length_unit}
         self._about: dict[str, Any] = {**units, "formula": formula}
-        self.state_space = FunctionSpace.of(state, "u")
+        self.sensors = dict(sensors or {})
+        self.state_space = FunctionSpace.of(state, "u").with_sensors(self.sensors)
         self.mesh = self.state_space.mesh
         self.parameter_space = FunctionSpace.of(parameter, "q")
         self.inputs = tuple(inputs)
@@ -179,7 +186,10 @@ class Model(Shown):
         x, q = self.state_space, self.parameter_space
         pair = {"u": x, "v": x}
         self.form_M = self._form("M", x.product if M is None else M, pair)
-        self.form_B = self._form("B", B, pair, "u", dB)
+        self._at_sensors = SensorTerms(self.sensors, self.form_M)
+        if more := self._at_sensors.mass:
+            self.form_M = self._form("M", x.product if M is None else M, pair, more=more)
+        self.form_B = self._form("B", B, pair, "u", dB, more=self._at_sensors.response)
         self.latent = Latent(q)
         self._set_A(A, dA, coefficients)
         sources = f if isinstance(f, Sequence) else [f]
@@ -202,11 +212,11 @@ class Model(Shown):
             if block.field.dirichlet:
                 rows[f"state {name}"] += f", Dirichlet values {block.field.boundary_text}"
         formula = self.formula
-        rows["equation"] = formula or _equation(self._parts)
+        rows["equation"] = formula or equation_text(self._parts)
         shown = {} if formula else {"M": "mass M(u, v)"}
         for name, what in {**shown, "initial": "initial state"}.items():
             if self._parts[name] is not None:
-                rows[what] = " + ".join(_terms(self._parts[name]))
+                rows[what] = " + ".join(terms_text(self._parts[name]))
         for name in self.parameter_space.unknowns:
             rows[f"unknown {name}"] = self._prior_text(name)
         if self.inputs:
@@ -255,8 +265,14 @@ class Model(Shown):
         nonlinear: str | None = None,
         derivative: Any = None,
         parameter: str | None = None,
+        more: Sequence[On] = (),
     ) -> Form:
         mesh, order, inputs = self.mesh, self.order, self.inputs
+        if more:  # terms of slow sensors, whose derivatives nobody has to give
+            integrands = integrands if isinstance(integrands, Sequence) else [integrands]
+            given = isinstance(derivative, Sequence)
+            derivative = derivative if given else [derivative] * len(integrands)
+            integrands, derivative = [*integrands, *more], [*derivative, *(None for _ in more)]
         return Form(name, integrands, spaces, mesh, order, nonlinear, derivative, inputs, parameter)
 
     def _set_A(
@@ -270,13 +286,14 @@ class Model(Shown):
         spaces = {"q": self.parameter_space, "u": x, "v": x}
         computed = self._coefficients(coefficients, dA)
         terms = computed.expanded(A) if computed else A
-        self.physical_A = self.linear_A = self._form("A", terms, spaces, "u", dA, "q")
+        own = self._at_sensors.unknown_response
+        self.physical_A = self.linear_A = self._form("A", terms, spaces, "u", dA, "q", own)
         # Numbers computed from the unknowns, and A in both; None if there are none.
         self.coefficients = computed if computed and computed.numeric else None
         self.computed = tuple(computed.names) if computed else ()  # what A reads besides q
         if self.coefficients is not None:
             more = spaces | {"q": self.coefficients.space}
-            self.linear_A = self._form("A", A, more, "u", None, "q")
+            self.linear_A = self._form("A", A, more, "u", None, "q", own)
         self.form_A = compose(self.physical_A, self.latent)
 
     def _coefficients(
@@ -305,6 +322,11 @@ class Model(Shown):
             raise ModelError(f"with_unknowns: {what}; write parameter={{name: unknown, ...}}.")
         unknowns = {**cast(Mapping[str, Unknown], self.parameter), **more}
         return Model(self.state, unknowns, **self._parts, **self._about)
+
+    def with_sensors(self, sensors: Mapping[str, SensorState]) -> Model:
+        """Return the same process with more sensors that respond slowly."""
+        parts = self._parts | {"sensors": {**self.sensors, **sensors}}
+        return Model(self.state, self.parameter, **parts, **self._about)
 
     def with_terms(
         self,
@@ -348,7 +370,8 @@ class Model(Shown):
             return with_constants(part, values) if callable(part) else part
 
         left = {name: unit for name, unit in self._input_units.items() if name not in values}
-        kept = {"inputs": left, "coefficients": self._parts["coefficients"]}  # read no channels
+        # What reads no channels.
+        kept = {name: self._parts[name] for name in ("coefficients", "sensors")} | {"inputs": left}
         parts = {name: bound(part) for name, part in self._parts.items() if name not in kept}
         return Model(self.state, self.parameter, **parts, **kept, **self._about)
 
@@ -449,7 +472,7 @@ class Model(Shown):
     @cached_property
     def state_mass(self) -> sp.csr_array:
         """L2 Gram matrix of the state, shape (n, n)."""
-        return self.bilinear(self.state_space.product)
+        return self.bilinear([self.state_space.product, *self._at_sensors.mass])
 
     @cached_property
     def X(self) -> HilbertSpace:
@@ -643,7 +666,7 @@ class Model(Shown):
             return boundary
         # Projection onto functions with the Dirichlet values: what these contribute is known.
         functional = self.form_initial.vector("v", moment, q=q) - self._projection.dual(boundary)
-        return boundary + self._projection.riesz(functional)
+        return self.state_space.completed(boundary + self._projection.riesz(functional))
 
     @cached_property
     def _projection(self) -> HilbertSpace:
@@ -654,7 +677,8 @@ class Model(Shown):
         """Return du_0/dq applied to columns of shape (m, k): shape (n, k); zero without initial."""
         if self.form_initial is None:
             return np.zeros((self.X.dim, directions.shape[1]))
-        return self._projection.riesz(self.form_initial.product("v", "q", directions, moment, q=q))
+        changed = self.form_initial.product("v", "q", directions, moment, q=q)
+        return self.state_space.completed(self._projection.riesz(changed))
 
     def initial_parameter(self, q0: Any = None) -> Array:
         """Return latent coefficients of q0; None is the prior mean. Fixed coefficients are zero."""
@@ -670,26 +694,3 @@ class Model(Shown):
         if np.any(q < lower) or np.any(q > upper):
             raise ModelError("q0 is outside the bounds of a scalar unknown.")
         return q
-
-
-def _terms(given: Any) -> list[str]:
-    terms = given if isinstance(given, Sequence) else [given]
-    return [
-        f"{_terms(one.form)[0]} on {one.name!r}" if isinstance(one, On) else expression(one)
-        for one in terms
-        if one is not _no_term
-    ]
-
-
-def _equation(parts: Mapping[str, Any]) -> str:
-    """Return the weak form of the process as text."""
-    mass = "u' * v" if parts["M"] is None else "M(u', v)"
-    left = " + ".join([mass, *_terms(parts["A"]), *_terms(parts["B"])])
-    given = parts["f"]
-    sources = [
-        str(one) if isinstance(one, int | float | Mapping) else _terms(one)[0]
-        for one in (given if isinstance(given, Sequence) else [given])
-        if one != 0.0
-    ]
-    right = f"integral of ({' + '.join(sources)}) * v" if sources else "0"
-    return f"integral of {left} = {right}"

@@ -68,11 +68,21 @@ def check_ignored(names: Iterable[str], validation: tuple[str, ...]) -> None:
             )
 
 
-def with_sensors(model: Model, observation: Observation) -> Model:
-    """Return a model with the unknowns of its sensors besides, such as an offset."""
+def with_sensors(
+    model: Model, observation: Observation, validation: Observation | None = None
+) -> Model:
+    """Return a model with the unknowns of its sensors besides, and with the states of slow ones."""
     known = model.parameter_space.unknowns
     own = {name: item for name, item in observation.unknowns.items() if name not in known}
-    return model.with_unknowns(own) if own else model
+    model = model.with_unknowns(own) if own else model
+    if validation and (free := [n for n, s in validation.states.items() if s.unknown]):
+        raise ConfigurationError(
+            f"validation: the time constant of '{free[0]}' is an unknown, which only assimilated "
+            "sensors have: give a number."
+        )
+    states = {**(validation.states if validation else {}), **observation.states}
+    new = {name: one for name, one in states.items() if name not in model.sensors}
+    return model.with_sensors(new) if new else model
 
 
 def stated_problem(

@@ -40,6 +40,7 @@ from livepde.records import Layout
 from livepde.runs import Journal
 from livepde.runs.summary import ROLES, TOTALS
 from livepde.samples import Sample
+from livepde.start import with_sensors
 from livepde.stepping import Alexander2, ImplicitEuler, Scheme
 from livepde.streams import Clock, Column, DataTable
 
@@ -318,8 +319,8 @@ class Case(CaseContent):
 
     @cached_property
     def model(self) -> Model:
-        """The model."""
-        return model_of(self)
+        """The model, with the states of sensors that respond slowly."""
+        return with_sensors(model_of(self), self.observation, self.validation)
 
     @cached_property
     def columns(self) -> dict[str, Column]:

@@ -28,8 +28,8 @@ from livepde.units import AFTER_A_WORD, AFTER_SLASH, IN_BRACKETS, conversion, ot
 EXACT = "interpolate-exact"
 INTERPOLATED = ("readings", "interpolate", EXACT)
 
-Kinds: TypeAlias = dict[tuple[str, str | None], dict[str, schema.ChannelSpec]]
-"""(kind of sensor, component of the state) -> its channels."""
+Kinds: TypeAlias = dict[tuple[str, str | None, str], dict[str, schema.ChannelSpec]]
+"""(kind of sensor, component of the state, time constant as stated) -> its channels."""
 MEMBERS = 10_000  # channels of one `each`
 
 
@@ -95,18 +95,36 @@ def kinds_of(channels: Mapping[str, schema.ChannelSpec]) -> Kinds:
     """Return sensors by kind and component of the state: one observation reads each of them."""
     kinds: Kinds = {}
     for name, channel in channels.items():
-        kinds.setdefault((_kind(channel), channel.of), {})[name] = channel
+        slow = "" if channel.time_constant is None else str(channel.time_constant)
+        kinds.setdefault((_kind(channel), channel.of, slow), {})[name] = channel
     return kinds
 
 
 def _whole(case: CaseContent, kinds: Kinds, outer: Mapping[str, Any]) -> observation.Observation:
     """Return one observation of all kinds, which has the keyword arguments `outer`."""
     common = outer if len(kinds) == 1 else {}
-    parts = [
-        _part(case, kind, members, {"unit": case.unit(next(iter(members))), **common}, of)
-        for (kind, of), members in kinds.items()
-    ]
+    parts = []
+    for (kind, of, slow), members in kinds.items():
+        own = {"unit": case.unit(next(iter(members))), **common}
+        part = _part(case, kind, members, {} if slow else own, of)
+        parts.append(observation.Slow(part, _constant(case, members), **own) if slow else part)
     return parts[0] if len(parts) == 1 else observation.Combined(parts, **outer)
+
+
+def _constant(case: CaseContent, channels: Mapping[str, schema.ChannelSpec]) -> float | fem.Prior:
+    """Return the time constant of channels of one kind, of assimilated ones with its prior."""
+    (name, channel), *_ = channels.items()
+    given, key, unit = (
+        channel.time_constant,
+        f"channels.{name}.time_constant",
+        case.equation.time_unit,
+    )
+    if not isinstance(given, schema.TimeConstantSpec):
+        return case.positive(given, unit, key)
+    value = case.positive(given.value, unit, f"{key}.value")
+    if channel.role != "sensor":
+        return value
+    return fem.LogNormal(value, case.positive(given.std, unit, f"{key}.std"))
 
 
 def _kind(channel: schema.ChannelSpec) -> str:
@@ -538,7 +556,7 @@ def _coordinate(case: CaseContent, cell: str, where: str) -> float:
 
 
 def unknowns_of(case: CaseContent) -> dict[str, fem.Unknown]:
-    """Return the unknowns of the sensors: offset, gain, position, correlated: numbers for each."""
+    """Return the unknowns of the sensors: offset, gain, position, ...: numbers for each."""
     state = case.equation.state.unit
     found: dict[str, fem.Unknown] = {}
     # Differences of a temperature are in K.
@@ -567,6 +585,15 @@ def unknowns_of(case: CaseContent) -> dict[str, fem.Unknown]:
         # An Ornstein-Uhlenbeck process: stationary standard deviation and correlation time.
         prior, fades = fem.Normal(0.0, std), fem.MeanReverting(time)
         found["correlated"] = fem.Scalars(tuple(errors), prior, unit=unit, evolution=fades)
+    constants = {
+        name: _constant(case, {name: item})
+        for name, item in case.roles("sensor").items()
+        if isinstance(item.time_constant, schema.TimeConstantSpec)
+    }
+    if constants:
+        prior = _common(case, constants, "time_constant")
+        unit = case.equation.time_unit
+        found["time_constant"] = fem.Scalars(tuple(constants), prior, unit=unit)
     return found
 
 

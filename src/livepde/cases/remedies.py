@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from livepde.cases.process import prior_of
 from livepde.cases.read import settings_in, toml_key, toml_value
+from livepde.cases.schema import TimeConstantSpec
 from livepde.errors import CaseError
 from livepde.laws import SensitivityLaw
 from livepde.linalg import Array
@@ -21,7 +22,7 @@ from livepde.streams.oddities import switches
 from livepde.units import conversion
 from livepde.verdict import Cause, Finding, Severity, Verdict, channel_setting
 from livepde.verdict.directions import stated_positions, usual_shifts
-from livepde.verdict.sentences import ESTIMATED, FINDINGS, LIKELY, amount_of, estimating
+from livepde.verdict.sentences import ESTIMATED, FINDINGS, LIKELY, amount_of, clause, estimating
 
 if TYPE_CHECKING:
     from livepde.cases.case import Case, Prepared
@@ -53,13 +54,24 @@ def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
     omitted = _omitted(prepared) if verdict.level in DOUBTED else ""
 
     def settled(finding: Finding) -> Finding:
-        finding = replace(finding, causes=tuple(map(named, finding.causes)))
+        causes = [*finding.causes, *_also(prepared, finding.causes)]
+        finding = replace(finding, causes=tuple(map(named, causes)))
         if finding.what != "misfit" or not omitted or omitted in finding.remedy:
             return finding
         own = finding.remedy or (finding.causes[0].remedy if finding.causes else "")
         return replace(finding, remedy=f"{omitted} {own}".strip())
 
     return replace(verdict, findings=tuple(map(settled, verdict.findings)))
+
+
+def _also(prepared: Prepared, causes: Sequence[Cause]) -> Iterator[Cause]:
+    """Iterate over causes that look like those named: a slow response like a late clock."""
+    known = {cause.subject for cause in causes if cause.kind == "response"}
+    unit = prepared.case.equation.time_unit
+    for cause in causes:
+        if cause.kind == "lag" and cause.subject not in known and _slow(prepared, cause):
+            text, remedy = clause("response", cause.subject, cause.size, unit, positive=True)
+            yield replace(cause, kind="response", text=text, remedy=remedy, setting="")
 
 
 def _omitted(prepared: Prepared) -> str:
@@ -164,7 +176,7 @@ def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     remedies: dict[str, Callable[[Prepared, Cause], tuple[str, ...]]]
     remedies = {**dict.fromkeys(KEYS, _of_sensor), "exchange": _exchanged}
     remedies |= {"source": _source, "loss": _loss, "transfer": _transfer}
-    remedies |= {"flux": _flux, "boundary": _boundary}
+    remedies |= {"flux": _flux, "boundary": _boundary, "response": _slow}
     kind = cause.kind
     if kind == "offset" and cause.subject in case.roles("boundary"):
         kind = "boundary"
@@ -196,6 +208,22 @@ def _of_sensor(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     if given is None:
         return settings_in(cause.setting)
     return (channel_setting(cause.subject, key, toml_value(given)),)
+
+
+def _slow(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
+    """Return the setting of an unknown time constant, with the prior that other sensors state."""
+    channels = prepared.case.roles("sensor")
+    channel = channels.get(cause.subject)
+    if channel is None or not cause.size > 0.0:
+        return ()
+    taken = (channel.follows, channel.quantity, channel.at_std, channel.time_constant)
+    if any(one is not None for one in taken):
+        return ()
+    others = (item.time_constant for item in channels.values())
+    given = next((one for one in others if isinstance(one, TimeConstantSpec)), None)
+    size = amount_of(cause.size, prepared.case.equation.time_unit)
+    known = given.model_dump() if given else {"value": size, "std": size}
+    return (channel_setting(cause.subject, "time_constant", toml_value(known)),)
 
 
 def _usual_std(prepared: Prepared, cause: Cause) -> float | str | None:

@@ -317,6 +317,13 @@ class CorrelatedSpec(Spec):
     std: Quantity
 
 
+class TimeConstantSpec(Spec):
+    """An unknown time constant of a sensor: its median and standard deviation."""
+
+    value: Quantity
+    std: Quantity
+
+
 FLUX = "flux"  # quantity of a sensor that measures a flux
 
 
@@ -344,6 +351,7 @@ class ChannelSpec(Spec):
     offset: Quantity | None = None
     gain: PositiveFloat | None = None
     correlated: CorrelatedSpec | None = None
+    time_constant: TimeConstantSpec | Quantity | None = None
     wait: Quantity | None = None
     repeated: Literal["first", "last"] | None = None
     valid: Pair | None = None
@@ -414,7 +422,8 @@ class ChannelSpec(Spec):
             raise ValueError(
                 'quantity = "flux" needs at = the name of an end, as "left", or a position'
             )
-        if own := {"offset", "correlated", "at_std", "of", "component"} & self.model_fields_set:
+        keys = {"offset", "correlated", "at_std", "of", "component", "time_constant"}
+        if own := keys & self.model_fields_set:
             raise ValueError(f'{own.pop()} is not possible with quantity = "flux": leave it out')
         return self
 
@@ -450,6 +459,9 @@ class ChannelSpec(Spec):
             own -= {"offset"}
         if own and self.role not in ("sensor", "ignored"):
             raise ValueError(f"{own.pop()} requires role = 'sensor'")
+        unfit = not sensor or self.follows or self.quantity or self.at_std is not None
+        if self.time_constant is not None and unfit:
+            raise ValueError("time_constant requires a sensor at a fixed place, without at_std")
         if self.of is not None and not sensor:
             raise ValueError(f"of requires a sensor, but the role is {self.role}")
         if self.component is not None and not (sensor and self.is_point):

@@ -57,6 +57,7 @@ NAMES = {  # kind of cause -> name of the variant
     "offset": "offset of {}",
     "gain": "gain of {}",
     "position": "position of {}",
+    "response": "time constant of {}",
     "averaging": "length of {}",
     "jump": "jumps of {}",
     "source": "source",
@@ -157,6 +158,11 @@ class VariantRun:
     def gained(self, base: VariantRun) -> float:
         """Return log evidence minus that of the case itself; NaN if other readings count."""
         if self.same_readings is not None:
+            if base.failed and self.readings.keys() == base.readings.keys():
+                # The evidence of a fit that fails moves by thousands with a few readings. Those
+                # that the variant lacks have the mean evidence of its own ones instead.
+                share = sum(base.readings.values()) / sum(self.readings.values())
+                return share * self.log_evidence - base.log_evidence
             return self.log_evidence - self.same_readings
         if self.error or dict(self.readings) != dict(base.readings):
             return math.nan
@@ -588,7 +594,8 @@ def _sensors(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
 
 def _fewer(case: Case) -> Iterator[Variant]:
     """Iterate over the case with fewer unknowns."""
-    for key, word in (("offset", "offsets"), ("gain", "gains"), ("at_std", "uncertain positions")):
+    words = {"offset": "offsets", "gain": "gains", "at_std": "uncertain positions"}
+    for key, word in {**words, "time_constant": "time constants"}.items():
         stated = [n for n, one in case.roles("sensor").items() if getattr(one, key) is not None]
         yield Variant(f"no {word}", tuple(channel_setting(name, key, "") for name in stated))
     optional = _optional(case)

@@ -28,6 +28,7 @@ from livepde.fem.fields import (
     positive,
     upwind,
 )
+from livepde.fem.form_text import equation_text, no_term, terms_text
 from livepde.fem.forms import Form
 from livepde.fem.latent import Coefficients, Composed, Latent, LatentPart, compose, numbers
 from livepde.fem.measure import START, Inputs, Moment, Place, with_constants
@@ -54,6 +55,8 @@ from livepde.fem.priors import (
     Prior,
     RandomWalk,
 )
+from livepde.fem.sensor_states import SensorState
+from livepde.fem.sensor_terms import SensorTerms
 from livepde.fem.sobolev import Sobolev, random_field
 from livepde.fem.space import FunctionSpace, Named, source_density
 
@@ -87,6 +90,8 @@ __all__ = [
     "RandomWalk",
     "Scalar",
     "Scalars",
+    "SensorState",
+    "SensorTerms",
     "Sobolev",
     "Source",
     "Unknown",
@@ -99,6 +104,7 @@ __all__ = [
     "declared",
     "div",
     "dot",
+    "equation_text",
     "grad",
     "grid",
     "hermite",
@@ -111,6 +117,7 @@ __all__ = [
     "maximum",
     "minimum",
     "mul",
+    "no_term",
     "numbers",
     "positive",
     "quadratic",
@@ -120,6 +127,7 @@ __all__ = [
     "shares",
     "smooth",
     "source_density",
+    "terms_text",
     "trace",
     "transpose",
     "upwind",

@@ -20,6 +20,7 @@ from skfem import Mesh, MeshLine
 from skfem.element import Element
 
 from livepde.errors import SpaceError
+from livepde.fem.measure import Measure
 from livepde.fem.priors import CONSTANT, Evolution, Normal, Prior, RandomWalk
 from livepde.fem.sobolev import Sobolev
 from livepde.linalg import Array
@@ -72,11 +73,11 @@ class On:
     >>> flux = On("left", lambda v, x: x.inputs["Q"] * v)
     """
 
-    name: str
+    name: str | Measure
     form: Integrand
 
 
-def placed(integrand: Integrand | On) -> tuple[Integrand, str | None]:
+def placed(integrand: Integrand | On) -> tuple[Integrand, str | Measure | None]:
     """Return an integrand, and the boundary or subdomain of its integral; None: all cells."""
     return (integrand.form, integrand.name) if isinstance(integrand, On) else (integrand, None)
 

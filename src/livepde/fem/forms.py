@@ -184,7 +184,8 @@ class Form(FormMatrices):
         self.terms: list[_Term] = []
         for item, one in zip(items, given, strict=True):
             integrand, where = placed(item)
-            self.terms.append(_Term(integrand, Measure(mesh, order, where), self.spaces, one))
+            measure = where if isinstance(where, Measure) else Measure(mesh, order, where)
+            self.terms.append(_Term(integrand, measure, self.spaces, one))
         self._inputs = Inputs(dict.fromkeys(inputs, 1.0))
         self._forget()
         self._moving: list[bool] = []  # terms that read time or inputs, and the nonlinear argument
@@ -582,7 +583,7 @@ class Form(FormMatrices):
         size = np.abs(values)
         whole = size.max(axis=(1, 2), keepdims=True)
         if key == self.parameter:
-            unknowns = local.space.unknowns.values()
+            unknowns = [local.space.unknowns[name] for name in local.blocks]
             counts = [item.components for item in local.locals]
             std = np.repeat([float(item.prior.std) for item in unknowns], counts)
             whole = np.maximum(whole, std[:, None, None])

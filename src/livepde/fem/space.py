@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +14,7 @@ from skfem import Mesh
 from skfem.helpers import dot
 
 from livepde.errors import ModelError, SpaceError
-from livepde.fem.field_blocks import FieldBlock, Local, base_name, block_of
+from livepde.fem.field_blocks import FieldBlock, Local, NamesBlock, base_name, block_of
 from livepde.fem.fields import (
     Declaration,
     Integrand,
@@ -27,6 +27,7 @@ from livepde.fem.fields import (
     ignores,
 )
 from livepde.fem.measure import Measure, Moment
+from livepde.fem.sensor_states import SensorBlock, SensorMeasure, SensorState
 from livepde.linalg import Array, IntArray, Mask, compact
 
 
@@ -48,7 +49,8 @@ class LocalSpace:
     def __init__(self, space: FunctionSpace, measure: Measure) -> None:
         self.space = space
         self.kept = measure.kept and measure.members is None and not measure.thin
-        self.locals = [block.local(measure) for block in space.blocks.values()]
+        self.blocks = space.blocks_on(measure)
+        self.locals = [block.local(measure) for block in self.blocks.values()]
         self.shape = measure.shape
         self.components = sum(local.components for local in self.locals)
         self.dofs: IntArray = space.dofs_on(measure)
@@ -182,15 +184,15 @@ class LocalSpace:
     def jets(self, values: Array) -> Any:
         """Return the argument of a form for component values of shape (components, ..., E, P)."""
         start, jets = 0, []
-        for block, local in zip(self.space.blocks.values(), self.locals, strict=True):
+        for block, local in zip(self.blocks.values(), self.locals, strict=True):
             stop = start + local.components
             jets.append(block.jet(local, values[start:stop]))
             start = stop
-        if self.space.single:
+        if self.space.single or any(name in self.space.sensors for name in self.blocks):
             return jets[0]
         # Regions with priors of their own, as k[soil], add up to q.k: each is zero elsewhere.
         found: dict[str, Any] = {}
-        for name, jet in zip(map(base_name, self.space.blocks), jets, strict=True):
+        for name, jet in zip(map(base_name, self.blocks), jets, strict=True):
             found[name] = found[name] + jet if name in found else jet
         return Named(**found)
 
@@ -237,11 +239,13 @@ class FunctionSpace:
     """A product of unknowns, each a field, a scalar, or values per region.
 
     With `single`, forms get the unknown itself, not a namespace. Regions with priors of their own
-    are unknowns, "k[soil]", of which forms see the sum, q.k.
+    are unknowns, "k[soil]", of which forms see the sum, q.k. A state may also have `sensors` that
+    respond slowly, with the row (1, n) that each sees of the fields.
     """
 
     unknowns: Mapping[str, Declaration]
     single: bool
+    sensors: Mapping[str, sp.csr_array] = field(default_factory=dict)
 
     @classmethod
     def of(cls, unknown: Unknown | Mapping[str, Unknown], name: str) -> FunctionSpace:
@@ -267,13 +271,47 @@ class FunctionSpace:
     @cached_property
     def blocks(self) -> dict[str, Any]:
         """Block of each unknown, by name."""
-        return {name: block_of(unknown) for name, unknown in self.unknowns.items()}
+        found: dict[str, Any] = {name: block_of(item) for name, item in self.unknowns.items()}
+        size = sum(block.size for block in found.values())
+        rows = enumerate(self.sensors.items(), size)
+        return found | {name: SensorBlock(number, row) for number, (name, row) in rows}
+
+    def blocks_on(self, measure: Measure) -> dict[str, Any]:
+        """Return the blocks that forms see on a measure."""
+        if not isinstance(measure, SensorMeasure):
+            return {name: one for name, one in self.blocks.items() if name not in self.sensors}
+        if self.sensors:
+            return {measure.sensor: self.blocks[measure.sensor]}
+        # Of the unknowns those with a number for each sensor.
+        return {name: one for name, one in self.blocks.items() if isinstance(one, NamesBlock)}
+
+    def with_sensors(self, sensors: Mapping[str, SensorState]) -> FunctionSpace:
+        """Return a space of states with sensors that respond slowly."""
+        if not sensors:
+            return self
+        if taken := sorted(set(sensors) & set(self.parts)):
+            raise ModelError(f"sensor and component are both called '{taken[0]}': rename one.")
+        return replace(self, sensors={name: one.row(self) for name, one in sensors.items()})
+
+    @cached_property
+    def of_fields(self) -> Array:
+        """Ones for coefficients of fields, zeros for the states of sensors, shape (dim,)."""
+        return np.repeat([1.0, 0.0], [self.dim - len(self.sensors), len(self.sensors)])
+
+    def completed(self, u: Array) -> Array:
+        """Return states, (dim,) or (dim, k), in which each slow sensor shows what it sees."""
+        if not self.sensors:
+            return u
+        found = u.copy()
+        for name, row in self.sensors.items():
+            found[self.part(name)] = row @ u[: row.shape[1]]
+        return found
 
     @cached_property
     def mesh(self) -> Mesh:
         """The mesh of a state, which all components share."""
-        if len(self.fields) < len(self.blocks):
-            numbers = sorted(set(self.blocks) - set(self.fields))
+        if len(self.fields) < len(self.unknowns):
+            numbers = sorted(set(self.unknowns) - set(self.fields))
             raise ModelError(f"state: {numbers} must be a Field, on the mesh of the others.")
         meshes = [block.field.mesh for block in self.fields.values()]
         if any(mesh is not meshes[0] for mesh in meshes):
@@ -334,7 +372,7 @@ class FunctionSpace:
     @cached_property
     def prior(self) -> Array:
         """Prior mean as coefficients, shape (dim,)."""
-        return np.concatenate([block.prior() for block in self.blocks.values()])
+        return self.completed(np.concatenate([block.prior() for block in self.blocks.values()]))
 
     @cached_property
     def labels(self) -> dict[str, int]:
@@ -409,13 +447,12 @@ class FunctionSpace:
 
     def dofs_on(self, measure: Measure) -> IntArray:
         """Return the coefficient of each local function on a measure, shape (local, elements)."""
-        each: list[IntArray] = [block.dofs_on(measure) for block in self.blocks.values()]
-        if len(each) == 1:
-            (dofs,) = each
-            return dofs
-        return np.concatenate(
-            [dofs + np.int32(start) for dofs, start in zip(each, self.starts, strict=True)]
-        )
+        starts = dict(zip(self.blocks, self.starts, strict=True))
+        each: list[IntArray] = [
+            block.dofs_on(measure) if starts[name] == 0 else block.dofs_on(measure) + starts[name]
+            for name, block in self.blocks_on(measure).items()
+        ]
+        return each[0] if len(each) == 1 else np.concatenate(each)
 
     def local(self, measure: Measure) -> LocalSpace:
         """Return the local space on a measure; cached ones are shared by all forms."""
@@ -433,7 +470,8 @@ class FunctionSpace:
     def interpolate(self, value: Any) -> Array:
         """Return coefficients of a number, a function of x, coefficients, or a mapping by name.
 
-        With several fields, a number is the value of all of them.
+        With several fields, a number is the value of all of them. Sensors that respond slowly show
+        what they see, unless the coefficients have them.
         """
         if isinstance(value, Mapping):  # all others have the coefficients of the prior
             if unknown := set(value) - set(self.parts):
@@ -441,16 +479,23 @@ class FunctionSpace:
             result = self.prior.copy()
             for name, item in value.items():
                 result[self.part(name)] = self._interpolate(name, item)
-            return result
+            return self.completed(result)
+        if np.shape(value) == (self.dim,):
+            return _coefficients(value, self.dim)
+        size = self.dim - len(self.sensors)
+        return self.completed(np.append(self._all(value, size), np.zeros(self.dim - size)))
+
+    def _all(self, value: Any, size: int) -> Array:
+        """Return coefficients of all that are not of sensors."""
         if self.single:
             return self._interpolate(next(iter(self.blocks)), value)
         if callable(value):
             raise SpaceError(
                 f"a function of x for {list(self.blocks)}: give a mapping, a function for each."
             )
-        if len(self.fields) == len(self.blocks) and np.ndim(value) == 0:
-            return np.concatenate([block.interpolate(value) for block in self.blocks.values()])
-        return _coefficients(value, self.dim)
+        if len(self.fields) == len(self.unknowns) and np.ndim(value) == 0:
+            return np.concatenate([block.interpolate(value) for block in self.fields.values()])
+        return _coefficients(value, size)
 
     def _interpolate(self, name: str, value: Any) -> Array:
         block, part = self.blocks.get(name), self.part(name)

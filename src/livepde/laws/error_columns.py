@@ -314,7 +314,8 @@ class ErrorColumns:
         An error of that shape and a wrong value of the unknown are one thing, as a steady flow is
         where the velocity is unknown.
         """
-        reduction, free = self.samples.filter.reduction, self.model.X.free
+        reduction = self.samples.filter.reduction
+        free = self.model.X.free * self.model.state_space.of_fields
 
         def at_all(load: Load | Array) -> Array:
             each = (load(now) if callable(load) else load for now in nows)

@@ -357,6 +357,11 @@ class GradientLaw(Law[GradientParts, GradientState]):
                 "GradientLaw: a component of the state has no mass term, so M is not an inner "
                 "product of X: use SensitivityLaw, or give M a term for each component."
             )
+        if slow := [*problem.model.sensors]:
+            raise LawError(
+                f"GradientLaw compares readings with the field, and '{slow[0]}' responds slowly: "
+                "leave out its time constant, or use SensitivityLaw."
+            )
         if problem.input_noise or problem.initial_rank:
             raise LawError(
                 "GradientLaw has no covariance that input_noise, u0_from or u0_errors could enter: "

@@ -20,7 +20,7 @@ from livepde.laws.law import Problem
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array, Mask, RowProduct, row_product
 from livepde.linalg.member_arrays import changed
-from livepde.model import Model, h1_form
+from livepde.model import Model, h1_form, mass_form
 from livepde.observation import Observed
 from livepde.spaces import HilbertSpace
 from livepde.stepping import Moments
@@ -146,8 +146,8 @@ class Anchor:
         points = next(iter(model.state_space.fields.values())).field.mesh.p
         size = float(np.ptp(points, axis=1).max())
         # The length makes the product independent of the unit of length.
-        mass, whole = model.state_mass, model.bilinear(h1_form)
-        gram = sp.csr_array(mass + size**2 * (whole - mass))
+        stiffness = model.bilinear(h1_form) - model.bilinear(mass_form)
+        gram = sp.csr_array(model.state_mass + size**2 * stiffness)
         return HilbertSpace(gram, "X", model.state_space.fixed)
 
     def corrected(self, x: FilterState, d: Array, used: Mask, at: Moments) -> FilterState:

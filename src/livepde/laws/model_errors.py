@@ -320,7 +320,8 @@ def _read(model: Model) -> set[str]:
         parts = [model.physical_A.matrix("v", "q", moment, u=u, q=q)]
         if (form := model.form_initial) is not None:
             parts.append(form.matrix("v", "q", moment, q=latent.prior))
-    found = np.sum([abs(part).sum(axis=0) for part in parts], axis=0)
+    fields = model.state_space.of_fields  # a slow sensor alone reads its time constant
+    found = np.sum([fields @ abs(part) for part in parts], axis=0)
     return {name for name in latent.parts if found[model.parameter_space.part(name)].any()}
 
 

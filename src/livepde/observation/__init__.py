@@ -21,6 +21,7 @@ from livepde.observation.operator import (
 )
 from livepde.observation.reconstruction import Alpha, Apriori, Discrepancy, Tikhonov
 from livepde.observation.sensors import Averages, LineIntegrals, Matrix, Moving, Points
+from livepde.observation.slow import Slow
 from livepde.observation.subdomain import Full, Subdomain
 
 __all__ = [
@@ -44,6 +45,7 @@ __all__ = [
     "Reconstructed",
     "Reconstruction",
     "Reconstructor",
+    "Slow",
     "Split",
     "Subdomain",
     "Tikhonov",

@@ -27,7 +27,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ObservationError
-from livepde.fem import FunctionSpace, Moment, Place, Unknown, numbers
+from livepde.fem import FunctionSpace, Moment, Place, SensorState, Unknown, numbers
 from livepde.linalg import Array, Mask
 from livepde.observation.operator import STEP, Direct, Observation, Observed
 from livepde.spaces import HilbertSpace
@@ -74,6 +74,10 @@ class Combined(Observation):
                 )
             found |= part.unknowns
         return found
+
+    @property
+    def states(self) -> Mapping[str, SensorState]:
+        return {name: one for part in self.parts for name, one in part.states.items()}
 
     @property
     def nodal(self) -> bool:
@@ -201,6 +205,10 @@ class Calibrated(Observation):
     @property
     def unknowns(self) -> Mapping[str, Unknown]:
         return self.base.unknowns
+
+    @property
+    def states(self) -> Mapping[str, SensorState]:
+        return self.base.states
 
     @property
     def optional(self) -> frozenset[str]:
@@ -383,6 +391,10 @@ class Transformed(Observation):
     @property
     def directs(self) -> Mapping[str, Direct]:
         return self.base.directs
+
+    @property
+    def states(self) -> Mapping[str, SensorState]:
+        return self.base.states
 
     @property
     def places(self) -> Array | None:

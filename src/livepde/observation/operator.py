@@ -13,7 +13,15 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from livepde.errors import ObservationError, require_positive
-from livepde.fem import FieldBlock, FunctionSpace, Moment, Place, Unknown, numbers
+from livepde.fem import (
+    FieldBlock,
+    FunctionSpace,
+    Moment,
+    Place,
+    SensorState,
+    Unknown,
+    numbers,
+)
 from livepde.linalg import Array, IntArray, Mask, Memo
 from livepde.spaces import HilbertSpace
 
@@ -276,6 +284,11 @@ class Observation:
     @property
     def unknowns(self) -> Mapping[str, Unknown]:
         """Unknowns of the sensors, added by an identifier to those of the model."""
+        return {}
+
+    @property
+    def states(self) -> Mapping[str, SensorState]:
+        """States of slow sensors, by name, added by an identifier to the state of the model."""
         return {}
 
     @property

@@ -155,8 +155,9 @@ def later(stage: ForwardStage, p: Array, now: Now, h: float, loads: Array, lifts
     """Return responses p of a process a time h later; p, loads and lifts: (responses, n).
 
     M (p+ - p)/h + S_u p+ = load, with p+ = lift on the boundary. A response that has not begun
-    stays zero, and takes no solve.
+    stays zero, and takes no solve. Loads act on the fields, not on the states of sensors.
     """
+    loads = loads * stage.model.state_space.of_fields
     lifted = lifts.any(axis=1)
     begun = p.any(axis=1) | loads.any(axis=1) | lifted
     if not begun.any():

@@ -72,9 +72,9 @@ class Cause:
     Attributes
     ----------
     kind, subject
-        Kind of error ("offset", "lag", "position", "averaging", "gain", "drift", "jump",
-        "boundary", "source", "loss", "flux", "transfer", "initial", "unit", "exchange"), and the
-        sensor, channel, boundary or unknown that it concerns.
+        Kind of error ("offset", "lag", "response", "position", "averaging", "gain", "drift",
+        "jump", "boundary", "source", "loss", "flux", "transfer", "initial", "unit",
+        "exchange"), and the sensor, channel, boundary or unknown that it concerns.
     text
         The cause in words, with its size.
     share

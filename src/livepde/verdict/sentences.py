@@ -305,6 +305,10 @@ LIKELY: dict[str, Sentence] = {
         "{name} may be {amount} {side}",
         "Check the clock, the averaging and the response time of {name}.",
     ),
+    "response": Sentence(
+        "{name} may respond slowly, with a time constant of {amount}",
+        "To test this, estimate its time constant.",
+    ),
     "position": Sentence("{name} may be {amount} {where}", "Check the position of {name}."),
     "averaging": Sentence(
         "{name} may average over {amount}",

@@ -1,0 +1,38 @@
+"""Weak forms as text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from livepde.fem.fields import On
+from livepde.showing import expression
+
+
+def no_term(u: Any, v: Any, x: Any) -> Any:
+    """A form that is zero."""
+    return 0.0 * x[0]
+
+
+def terms_text(given: Any) -> list[str]:
+    """Return the terms of a form as code."""
+    terms = given if isinstance(given, Sequence) else [given]
+    return [
+        f"{terms_text(one.form)[0]} on {one.name!r}" if isinstance(one, On) else expression(one)
+        for one in terms
+        if one is not no_term
+    ]
+
+
+def equation_text(parts: Mapping[str, Any]) -> str:
+    """Return the weak form of the process as text."""
+    mass = "u' * v" if parts["M"] is None else "M(u', v)"
+    left = " + ".join([mass, *terms_text(parts["A"]), *terms_text(parts["B"])])
+    given = parts["f"]
+    sources = [
+        str(one) if isinstance(one, int | float | Mapping) else terms_text(one)[0]
+        for one in (given if isinstance(given, Sequence) else [given])
+        if one != 0.0
+    ]
+    right = f"integral of ({' + '.join(sources)}) * v" if sources else "0"
+    return f"integral of {left} = {right}"

@@ -1,0 +1,104 @@
+"""States of sensors that respond slowly, as coefficients behind those of the fields.
+
+A sensor that sees z = G u shows y with tau y' = z - y. In a form, a measure of one point with
+weight one stands for it: there, u is the pair of what it sees and shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.fem.field_blocks import Block, Local
+from livepde.fem.measure import Measure
+from livepde.linalg import Array, IntArray
+
+
+@dataclass(frozen=True)
+class SensorState:
+    """A slow sensor.
+
+    Attributes
+    ----------
+    row
+        Function of the state space that returns G, what the sensor sees of it, shape (1, n).
+    time_constant
+        In the unit of time of the model; None: the unknown `time_constant[NAME]`.
+    """
+
+    row: Callable[[Any], sp.csr_array]
+    time_constant: float | None
+
+    @property
+    def unknown(self) -> bool:
+        return self.time_constant is None
+
+
+class Shown(NamedTuple):
+    """What a slow sensor sees and shows, in a form."""
+
+    seen: Any
+    shown: Any
+
+
+class SensorBlock(Block):
+    """The one coefficient of a slow sensor.
+
+    `number` is its place among all coefficients, `row` what it sees of the others, (1, number).
+    """
+
+    size = 1
+
+    def __init__(self, number: int, row: sp.csr_array) -> None:
+        self.row = sp.csr_array(row)
+        # Local coefficients are counted from the first one of their block.
+        self._dofs: IntArray = np.append(self.row.indices - number, 0).astype(np.int32)[:, None]
+
+    def dofs_on(self, measure: Measure) -> IntArray:
+        return self._dofs
+
+    def local(self, measure: Measure) -> Local:
+        def evaluate(_: str) -> Array:
+            both = np.zeros((2, len(self._dofs), 1, 1))
+            both[0, :-1, 0, 0], both[1, -1] = self.row.data, 1.0
+            return both
+
+        return Local(self._dofs, [("value", (2,))], evaluate)
+
+    def jet(self, parts: Local, values: Array) -> Shown:
+        return Shown(*values)
+
+    def prior(self) -> Array:
+        return np.zeros(1)  # completed by what it sees
+
+    def labels(self, name: str) -> tuple[str, ...]:
+        return ()
+
+
+@dataclass(frozen=True, eq=False)
+class SensorMeasure(Measure):
+    """A slow sensor as a measure: one point with the weight one."""
+
+    sensor: str = ""
+    members: IntArray | None = field(default_factory=lambda: np.zeros(1, dtype=np.int64))
+
+    @property
+    def on_boundary(self) -> bool:
+        return False
+
+    @cached_property
+    def shape(self) -> tuple[int, int]:
+        return 1, 1
+
+    @cached_property
+    def points(self) -> Array:
+        return np.zeros((self.mesh.dim(), 1, 1))
+
+    @cached_property
+    def weights(self) -> Array:
+        return np.ones((1, 1))
