@@ -110,14 +110,26 @@ def test_a_gap_is_a_pause(tmp_path: Path, seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize(("kind", "length"), [("leap", "3610 s"), ("small leap", "70 s")])
+@pytest.mark.parametrize(("kind", "length"), [("leap", "3600 s"), ("small leap", "60 s")])
 def test_a_clock_that_leaps_is_named(tmp_path: Path, kind: str, length: str, seed: int) -> None:
     """The readings go on as after one interval, which no gap does."""
     (finding,) = found_in(case(tmp_path, kind, seed))
     assert (finding.what, finding.severity) == ("clock", "caution")
-    assert f"time jumps by {length}" in finding.text
+    assert f"set forward by about {length} at" in finding.text
     assert "(sample 301)" in finding.text
+    assert f"add {length} to the earlier ones" in finding.causes[0].remedy
     assert finding.causes[0].kind == "clock"
+
+
+def test_a_leap_of_an_hour_in_dates_may_be_of_local_time(tmp_path: Path) -> None:
+    table = load(case(tmp_path, "leap")).read().raw
+    assert table is not None
+    times = xr.Dataset(coords={"time": ("time", table.t, {"units": "s"})})
+    (plain,) = sampling_findings(times, lambda: (table.t, table.values))
+    times.attrs["origin"] = "2025-03-30 01:10:00"
+    (dated,) = sampling_findings(times, lambda: (table.t, table.values))
+    assert "data.zone" in dated.causes[0].remedy
+    assert "data.zone" not in plain.causes[0].remedy
 
 
 @pytest.mark.slow
@@ -129,7 +141,7 @@ def test_a_live_run_names_a_clock_that_leaps(tmp_path: Path, monkeypatch: Any) -
     done = CliRunner().invoke(app, ["run", str(path), "--data", "-"], input=rows)
     assert done.exit_code == 0, done.output
     (report,) = tmp_path.glob("runs/*/report.md")
-    assert "(sample 151): time jumps by 70 s" in report.read_text()
+    assert "was set forward by about 60 s" in report.read_text()
 
 
 @pytest.mark.slow
@@ -176,7 +188,7 @@ def test_check_says_it(tmp_path: Path) -> None:
     path = case(tmp_path, "small leap")
     result = CliRunner().invoke(app, ["check", str(path)])
     assert result.exit_code == 0
-    assert "time jumps by 70 s" in " ".join(result.output.split())
+    assert "set forward by about 60 s" in " ".join(result.output.split())
 
 
 # --- parameters survive a pause ------------------------------------------------------------------

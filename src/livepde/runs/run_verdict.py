@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from livepde.dates import when
+from livepde.dates import dated, when
 from livepde.diagnostics.check_report import Table
 from livepde.laws.equation_tests import rested
 from livepde.laws.filter_state import pauses
@@ -52,6 +52,11 @@ SHORTEST = 20  # values at least to tell whether an estimate wanders
 LEFT_OUT = 0.25  # of a field's mean variance is that of modes that the law leaves out
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
 AFTER = " The state is re-estimated from there on. The unknowns are kept."
+HOUR = 3600.0  # seconds by which clocks are set forward in spring
+ZONE = (
+    "If the times are local and clocks were set forward here, set `data.zone`, such as "
+    "'Europe/Berlin'. "
+)
 OF_SENSORS = "start", "early"  # kinds of remarks that matter for sensors, too
 INPUT_KINDS = {
     "start": "first values were outliers and count as missing",
@@ -153,7 +158,7 @@ def sampling_findings(
             break  # of later steps nothing is known
         after = AFTER if anchors else ""
         if float(t[k]) in leaps:
-            found.append(_leapt(k, at, times, after))
+            found.append(_leapt(data, k, at, length - usual, after))
             continue
         text, _ = FINDINGS["pause"].filled(times=times, at=at, count=length / usual, after=after)
         found.append(Finding("pause", "note", text, "", length))
@@ -170,9 +175,15 @@ def _unit_changed(k: int, at: str, factor: float) -> Finding:
     return Finding("clock", "do not trust", text, "time", factor, causes=(cause,))
 
 
-def _leapt(k: int, at: str, times: str, after: str) -> Finding:
-    """Return that a clock leapt forward before a sample."""
-    text, remedy = FINDINGS["clock, leap"].filled(sample=k + 1, at=at, times=times, after=after)
+def _leapt(data: xr.Dataset, k: int, at: str, by: float, after: str) -> Finding:
+    """Return that a clock leapt forward before a sample, `by` more than a usual interval."""
+    times = f"{by:.6g} {data['time'].attrs.get('units', '')}".rstrip()
+    # In spring, a local time without its zone leaps by an hour.
+    dates = dated(data)
+    summer = dates is not None and abs(by * dates[1] - HOUR) < 0.1 * HOUR
+    text, remedy = FINDINGS["clock, leap"].filled(
+        sample=k + 1, at=at, times=times, after=after, zone=ZONE if summer else ""
+    )
     likely, _ = LIKELY["clock, leap"].filled(at=at, times=times)
     cause = Cause("clock", "time", likely, math.nan, remedy)
     return Finding("clock", "caution", text, "time", k, causes=(cause,))

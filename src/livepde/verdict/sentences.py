@@ -238,10 +238,10 @@ FINDINGS: dict[str, Sentence] = {
         "Divide the times from that row on by {factor:g}, or split the table there.",
     ),
     "clock, leap": Sentence(
-        "The clock was set at {at} (sample {sample}): time jumps by {times}, but the readings "
+        "The clock was set forward by about {times} at {at} (sample {sample}): the readings "
         "continue without a gap.{after}",
-        "If the later times are right, add {times} to the earlier ones. Otherwise subtract it from "
-        "the later ones.",
+        "{zone}If the later times are right, add {times} to the earlier ones. Otherwise subtract "
+        "it from the later ones.",
     ),
     "pause": Sentence("No sample for {times} until {at} ({count:.0f} usual intervals).{after}"),
     # --- steps and discretisation
