@@ -25,6 +25,7 @@ from livepde.streams.csvfile import header_of, how_written, read_csv
 from livepde.streams.intake import Intake
 from livepde.streams.sources import Follow
 from livepde.streams.table import Column, DataTable, JsonLines, read_json_lines, tabulated
+from livepde.units import other_time_unit
 
 BERLIN = ZoneInfo("Europe/Berlin")
 CLOCK = Clock("t", zone=BERLIN)
@@ -355,6 +356,24 @@ def test_numbers_that_count_from_a_date_are_dates(tmp_path, first, step, unit, f
     assert f"5 rows from {from_} to 2025-04-05 16:00:00" in said
     assert f"times are read as {unit}." in said
     assert f'time_unit = "{unit}"' in line
+
+
+@pytest.mark.parametrize(
+    ("date", "first"),
+    [
+        ("2023-06-01 00:00:00", "2023-06-01 10:00:00"),
+        ("2023-06-01T00:00:00 +02:00", "2023-06-01 08:00:00"),
+        ("2023-6-1 0:0:0.0 UTC", "2023-06-01 10:00:00"),
+        ("2023-06-01 UTC", "2023-06-01 10:00:00"),
+    ],
+)
+def test_times_in_the_convention_of_cf_are_dates(tmp_path, date, first):
+    stated = f"hours since {date}"
+    said, line = init_of(tmp_path, [repr(10 + k / 4) for k in range(5)], f"time [{stated}]")
+    assert f"5 rows from {first}" in said
+    assert f'time_unit = "{stated}"' in line
+    # A case that leaves the unit out does not read hours as seconds.
+    assert other_time_unit(f"time [{stated}]", "s") == stated
 
 
 def test_a_stated_unit_is_not_replaced_by_a_date(tmp_path):

@@ -36,6 +36,8 @@ AT_THE_END = re.compile(r"(?:_|^(?=\w{3}))([A-Za-z]+)$")  # time_s, minutes
 # power_kW, T_30cm degF, T_1 degF; not T_1 cm, which is a place
 AFTER_A_WORD = re.compile(r"(?:(?<=[^\W\d])[_ ]|(?<=\d)[_ ](?=deg))(deg[CF]|[kM]W|[mc]m|ft)$")
 OF_TIMES = (IN_BRACKETS, AFTER_SLASH, AT_THE_END)  # where the name of a column states their unit
+# hours since 2023-06-01 00:00:00, as the CF conventions write it
+SINCE = re.compile(r"\b(\w+ since \d{4}-\d{1,2}-\d{1,2}(?!\d)[^\[\]()]*)")
 OF_TIME = re.compile(r"[mu]?s|sec|min|hr?|d|(second|minute|hour|day|week|year)s?", re.I)
 QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
 
@@ -202,12 +204,24 @@ def unit_in(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
     return ""
 
 
+def counted_since(name: str) -> str:
+    """Return unit and date in the name of a column of times that count from a date; else empty.
+
+    >>> counted_since("time [hours since 2023-06-01 00:00:00]"), counted_since("s since start")
+    ('hours since 2023-06-01 00:00:00', '')
+    """
+    found = SINCE.search(name)
+    return found[1].strip() if found else ""
+
+
 def other_time_unit(name: str, unit: str) -> str:
     """Return the unit of time in the name of a column if it is not `unit`; else empty.
 
     >>> other_time_unit("time_min", "s"), other_time_unit("t [s]", "s")
     ('min', '')
     """
+    if unit and (counted := counted_since(name)):
+        return counted
     stated = (pattern.search(name) for pattern in OF_TIMES)
     if not (unit and any(found and OF_TIME.fullmatch(found[1]) for found in stated)):
         return ""  # before pint is loaded

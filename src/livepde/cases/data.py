@@ -98,10 +98,15 @@ def since_when(unit: str, where: str) -> tuple[str, datetime | None]:
 
     >>> since_when("d since 1899-12-30", "data.time_unit")
     ('d', datetime.datetime(1899, 12, 30, 0, 0))
+    >>> since_when("hours since 1990-1-1 0:0:0 UTC", "data.time_unit")
+    ('hours', datetime.datetime(1990, 1, 1, 0, 0, tzinfo=datetime.timezone.utc))
     """
     unit, since, origin = unit.partition(" since ")
+    # The CF conventions also allow single digits, and the name of the zone.
+    padded = re.sub(r"(?<![\d.])\d(?!\d)", "0\\g<0>", origin.strip())
+    date = re.sub(r"\s*(UTC|GMT|Z)$", "+00:00" if ":" in padded else "", padded)
     try:
-        return unit.strip(), datetime.fromisoformat(origin.strip()) if since else None
+        return unit.strip(), datetime.fromisoformat(date) if since else None
     except ValueError:
         text = f"got 'since {origin}'; expected a date, as in 'd since 1899-12-30'."
         raise CaseError(f"{where}: {text}") from None

@@ -23,7 +23,7 @@ from livepde.streams.cells import Missing, is_limit, is_missing, number_of
 from livepde.streams.clock import CALLED_TIME, ELAPSED, date_formats, elapsed_formats
 from livepde.streams.csvfile import Written, how_written
 from livepde.streams.table import JSON_LINES
-from livepde.units import OF_TIMES, conversion, unit_in
+from livepde.units import OF_TIMES, conversion, counted_since, unit_in
 
 HOUR = re.compile(r"\d+:\d{2}(:\d{2}(\.\d+)?)?( ?[AaPp][Mm])?")
 ROW_NUMBER = re.compile(r"(id|idx|index|n|no|nr|num|number|row|rec|record|sample|#)\.?", re.I)
@@ -183,7 +183,7 @@ def _sorted_out(
 
 def _unit_of_times(written: Written, name: str) -> str:
     """Return the unit of a column of numbers, perhaps with the date since which they count."""
-    if found := unit_in(name, "s", *OF_TIMES):
+    if found := counted_since(name) or unit_in(name, "s", *OF_TIMES):
         return found
     values, named = _values(name, written), DATED.search(name)
     for unit, least in COUNTED.items() if named else ():
@@ -256,7 +256,7 @@ def _most_like_times(numbers: Sequence[str], hours: Sequence[str], written: Writ
     `hours`: columns such as 0:10:00, which are times if they are elapsed times. Besides times of
     day, numbers are times only if their name says so.
     """
-    timed = [name for name in numbers if unit_in(name, "s", *OF_TIMES)]
+    timed = [n for n in numbers if counted_since(n) or unit_in(n, "s", *OF_TIMES)]
     values = {name: _values(name, written) for name in numbers}
     rising = [name for name, found in values.items() if (found[:-1] < found[1:]).all()]
     both = [name for name in timed if name in rising]
