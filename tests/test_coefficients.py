@@ -128,6 +128,24 @@ def test_an_unknown_that_varies_in_space_is_evaluated_at_each_step():
     np.testing.assert_allclose(found.q, expected.q, rtol=1e-10)  # 1/C Q and Q/C round differently
 
 
+def test_numbers_computed_beside_regions_with_their_own_priors():
+    own = {"soil": lp.Scalar(lp.LogNormal(0.5, std=0.1))}
+    layers = {"soil": lambda x: x[0] < 0.5, "rock": lambda x: x[0] >= 0.5}
+    unknowns = UNKNOWNS | {"k": lp.Piecewise(layers, lp.LogNormal(1.0, std=0.5), own=own)}
+    state = lp.Field(LINE, lp.linear(LINE), dirichlet={"right": 0.0})
+
+    def A(inverse):
+        return lambda q, u, v, x: q.k * inverse(q) * lp.dot(lp.grad(u), lp.grad(v))
+
+    plain = lp.Model(state, unknowns, A(lambda q: 1 / q.C))
+    named = lp.Model(
+        state, unknowns, A(lambda q: q.inverse), coefficients=lambda q: {"inverse": 1 / q.C}
+    )
+    u = np.random.default_rng(0).standard_normal(plain.X.dim)
+    found, expected = (model.A(u).matrix.toarray() for model in (named, plain))
+    assert found == pytest.approx(expected, rel=1e-12)
+
+
 def test_a_name_is_that_of_one_coefficient():
     with pytest.raises(ModelError, match="'k' is an unknown"):
         rod(named=True, coefficients=lambda q: {"k": q.k / q.C})

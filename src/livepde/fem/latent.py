@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import SpaceError
-from livepde.fem.fields import Declaration, Integrand, On, Scalars, placed
+from livepde.fem.fields import Declaration, Integrand, On, Scalars, declared, placed
 from livepde.fem.forms import STEP, Form, FormMatrices
 from livepde.fem.measure import START, Moment
 from livepde.fem.priors import Evolution, Identity, Normal, Transform
@@ -77,8 +77,8 @@ class Coefficients:
     @cached_property
     def space(self) -> FunctionSpace:
         """Space of the unknowns and of the numbers, of dimension p."""
-        more = dict.fromkeys(self.names, Normal(0.0, std=1.0))
-        return FunctionSpace.of({**self.parameter.unknowns, **more}, "q")
+        more = dict.fromkeys(self.names, declared(Normal(0.0, std=1.0)))
+        return FunctionSpace({**self.parameter.unknowns, **more}, single=False)
 
     def value(self, q: Array) -> Array:
         """Return (q, c(q)), shape (p,), for unknowns of shape (m,)."""
