@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
@@ -26,7 +27,7 @@ from livepde.errors import (
 from livepde.models import heat
 from livepde.observation import Averages, Moving, Slow
 from livepde.stepping import Advance, Alexander2, ForwardStage
-from livepde.verdict import Cause, Finding, ModelErrors, Verdict
+from livepde.verdict import Cause, Finding, Verdict
 
 ALPHA, TAU, NOISE = 0.1, 0.5, 0.01
 CELLS = 80  # of the truth
@@ -274,21 +275,24 @@ def test_a_late_sensor_may_be_a_slow_one(tmp_path):
     assert "no time constants" in [one.name for one in proposed(found, plain)]
 
 
-def test_the_evidence_of_other_readings_is_not_that_of_a_fit_that_fails():
-    """It moves by thousands with a few readings: a late clock lost to a slow sensor."""
-    errors = ModelErrors(8.0, 0.5, {}, ())
-    failed = Verdict.of([], errors=errors).to_dict()
-    base = VariantRun(
-        Variant("as stated"), verdict=failed, log_evidence=-313133.0, readings={"a": 361}
-    )
-    assert base.failed
-    late = VariantRun(
-        Variant("late"),
+def test_the_evidence_of_readings_that_a_late_variant_lacks_is_no_loss():
+    """That of a case which misses them moves by thousands: a late clock lost to a slow sensor."""
+    case = VariantRun(
+        Variant("as stated"),
         verdict=Verdict.of([]).to_dict(),
-        log_evidence=1700.0,
-        readings={"a": 354},
-        same_readings=-243056.0,
+        log_evidence=-313133.0,
+        readings={"a": 361, "b": 361},
     )
-    assert late.gained(base) == pytest.approx(1700.0 * 361 / 354 + 313133.0)
-    sound = VariantRun(Variant("as stated"), verdict=Verdict.of([]).to_dict(), log_evidence=1.0)
-    assert late.gained(sound) == pytest.approx(1700.0 + 243056.0)
+    late = replace(
+        case,
+        variant=Variant("late"),
+        log_evidence=1700.0,
+        readings={"a": 354, "b": 361},
+        same_readings=-243056.0,
+        densities={"a": 2.0, "b": math.nan},
+    )
+    assert late.gained(case) == pytest.approx(1700.0 + 7 * 2.0 + 313133.0)
+    # Readings that the case does not miss are noise: the evidence is that of the same ones.
+    sound = replace(case, log_evidence=1690.0)
+    close = replace(late, same_readings=1680.0)
+    assert close.gained(sound) == pytest.approx(20.0)

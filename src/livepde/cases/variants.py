@@ -30,6 +30,8 @@ from livepde.cases.set_aside import with_errors_of_set_aside
 from livepde.dates import since_1970
 from livepde.errors import CaseError, ModelError
 from livepde.fem.field_blocks import base_name
+from livepde.laws import SensitivityLaw
+from livepde.laws.assimilation import HALF_LOG
 from livepde.plots.style import modes_told
 from livepde.records import interval_95, scalars, used_errors
 from livepde.result import Result
@@ -46,6 +48,7 @@ if TYPE_CHECKING:
 
 EVERY = 1_000_000_000  # fields are not compared
 AS_STATED = "as stated"
+MISSED = 5.0  # of log density, from which the case misses a reading
 GAINED = 3.0  # of log evidence: strong evidence (Kass and Raftery 1995), 20 to 1
 SAME = 1e-9  # of the length of a run: times that differ by less are one moment
 WORSE = 0.02  # share by which the error of validation sensors may grow: about its own error
@@ -109,6 +112,8 @@ class VariantRun:
     # Log evidence of the case with these readings: None if they are those of the case, NaN if the
     # case has not all of them.
     same_readings: float | None = None
+    # Sensor -> log density of a usual reading, by its errors one step ahead.
+    densities: Mapping[str, float] = field(default_factory=dict)
     misfits: Mapping[str, float] = field(default_factory=dict)  # sensor -> misfit over noise
     # Sensor -> root mean square error one step ahead, second half of the samples.
     errors: Mapping[str, float] = field(default_factory=dict)  # assimilated
@@ -158,15 +163,21 @@ class VariantRun:
     def gained(self, base: VariantRun) -> float:
         """Return log evidence minus that of the case itself; NaN if other readings count."""
         if self.same_readings is not None:
-            if base.failed and self.readings.keys() == base.readings.keys():
-                # The evidence of a fit that fails moves by thousands with a few readings. Those
-                # that the variant lacks have the mean evidence of its own ones instead.
-                share = sum(base.readings.values()) / sum(self.readings.values())
-                return share * self.log_evidence - base.log_evidence
-            return self.log_evidence - self.same_readings
+            return self.log_evidence - self.same_readings + self._gained_by_others(base)
         if self.error or dict(self.readings) != dict(base.readings):
             return math.nan
         return self.log_evidence - base.log_evidence
+
+    def _gained_by_others(self, base: VariantRun) -> float:
+        """Return the log evidence that readings add which the variant lacks.
+
+        Where the case misses those, its evidence moves by thousands with a few of them, and other
+        variants gain that. For the variant they are usual readings then. Else they add nothing.
+        """
+        lacking = {name: n - self.readings.get(name, 0) for name, n in base.readings.items()}
+        usual = sum(n * self.densities.get(name, math.nan) for name, n in lacking.items() if n)
+        more = usual - (base.log_evidence - (self.same_readings or 0.0))
+        return more if more > MISSED * sum(lacking.values()) else 0.0
 
     def apart(self, base: VariantRun) -> list[str]:
         """Return the unknowns whose intervals in both runs have no point in common."""
@@ -323,12 +334,28 @@ def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun
         verdict=found.to_dict(),
         log_evidence=evidence + sum(volumes),
         readings=readings,
+        densities=_densities(prepared, channels),
         misfits=_misfits(data) if errors is None else dict(errors.sensors),
         errors=_later_errors(channels, "assimilated"),
         validation=_later_errors(channels, "validation"),
         estimates=_last_estimates(data, errors),
         unknowns=len(labels) + sum(modes),
     )
+
+
+def _densities(prepared: Prepared, channels: Mapping[str, ChannelErrors]) -> dict[str, float]:
+    """Return the log density of a usual reading of each sensor, by its errors one step ahead."""
+    noise, law, observed = math.nan, prepared.case.law, prepared.identifier.observed
+    if isinstance(law, SensitivityLaw) and isinstance(law.noise, int | float):
+        noise = law.noise
+    every = np.full(observed.size, noise) if observed.noise is None else observed.noise
+    columns, errors = columns_of(prepared.case), _later_errors(channels, "assimilated")
+    found = {}
+    for name, std in zip(observed.names, every.tolist(), strict=True):
+        square = 0.5 * (errors.get(name, math.nan) / std) ** 2
+        unit = abs(columns[name].factor) if name in columns else 1.0
+        found[name] = math.log(unit / std) - HALF_LOG - square
+    return found
 
 
 def _later_errors(channels: Mapping[str, ChannelErrors], role: str) -> dict[str, float]:
