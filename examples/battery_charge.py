@@ -63,7 +63,7 @@ def main(D: float = 3e-15) -> dict[str, float]:
 
     seen = lp.observation.Functionals(
         {
-            "mean": lambda q, c, x: 3.0 * x[0] ** 2 / R**3 * c / FULL,
+            "mean": lambda q, c, x: 3.0 / R * c / FULL,
             "surface": lp.On("right", lambda q, c, x: c / FULL),
         }
     )

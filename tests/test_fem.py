@@ -7,8 +7,9 @@ import pickle
 
 import numpy as np
 import pytest
+import scipy.sparse
 import skfem
-from factories import CASES, diffusion, laplace, line, product, reaction
+from factories import CASES, diffusion, laplace, line, observe, product, reaction
 from scipy.sparse.linalg import spsolve
 from skfem import (
     Basis,
@@ -110,6 +111,83 @@ def test_source_vector():
     basis = Basis(mesh, element, intorder=model.order)
     expected = LinearForm(lambda v, w: np.exp(w.x[0] * 0.7) * w.x[1] * v).assemble(basis)
     np.testing.assert_allclose(model.F(Moment(0.7)), expected, atol=1e-14)
+
+
+def radius(x):
+    return x[0]
+
+
+def around_an_axis(**options):
+    """Return a model in radius and height, written as in Cartesian coordinates."""
+    mesh = MeshTri().refined(2).with_defaults()
+    element = ElementTriP1()
+    parts = {name: lp.Field(mesh, element, weight=radius) for name in ("a", "b")} | options
+    return lp.Model(
+        parts,
+        {"k": lp.Normal(1.0, std=0.5)},
+        A=[
+            lambda q, u, v, x: q.k * (dot(grad(u.a), grad(v.a)) + (u.a - u.b) * (v.a - v.b)),
+            lp.On("right", lambda q, u, v, x: q.k * u.a * v.a),
+        ],
+        f={"a": lambda x, t: x[1], "b": 2.0},
+        initial=lambda q, v, x: q.k * v.a + x[0] * v.b,
+    )
+
+
+def test_all_integrals_have_the_volume_element_of_the_coordinates():
+    model = around_an_axis()
+    assert model.order == 4
+    mesh, element = model.mesh, ElementTriP1()
+    basis, wall = (
+        kind(mesh, element, intorder=4, **where)
+        for kind, where in ((Basis, {}), (FacetBasis, {"facets": mesh.boundaries["right"]}))
+    )
+    mass = BilinearForm(lambda u, v, w: w.x[0] * u * v)
+    stiff = BilinearForm(lambda u, v, w: w.x[0] * dot(grad(u), grad(v))).assemble(basis)
+    close(model.mass, scipy.sparse.kron(np.eye(2), mass.assemble(basis)))
+    u = np.random.default_rng(0).standard_normal((2, basis.N))
+    apart = mass.assemble(basis) @ (u[0] - u[1])
+    left = stiff @ u[0] + apart + mass.assemble(wall) @ u[0]
+    found = model.A(u.ravel()).matrix.toarray()[:, 0]
+    np.testing.assert_allclose(found, np.concatenate([left, -apart]), atol=1e-13)
+    sources = (lambda v, w: w.x[0] * w.x[1] * v, lambda v, w: 2.0 * w.x[0] * v)
+    expected = [LinearForm(source).assemble(basis) for source in sources]
+    np.testing.assert_allclose(model.F(START), np.concatenate(expected), atol=1e-14)
+    start = model.initial_state(np.array([3.0]), START).reshape(2, -1)
+    np.testing.assert_allclose(start, [np.full(basis.N, 3.0), mesh.p[0]], atol=1e-12)
+    amounts = {"all": lambda q, u, x: u.b, "wall": lp.On("right", lambda q, u, x: u.b)}
+    seen = observe(model, lp.observation.Functionals(amounts))
+    assert seen.predict(start.ravel(), np.ones(1), START) == pytest.approx([1 / 3, 1.0])
+
+
+@pytest.mark.parametrize(("power", "found"), [(0, []), (1, [1.0]), (2, [2.0])])
+def test_a_factor_of_volume_in_the_terms_is_found(power, found):
+    def layers(x):
+        return 1.0 + (x[0] > 0.5)
+
+    written = lp.Model(
+        lp.Field(line(8), ElementLineP1(), quadrature=4),
+        {"k": lp.Normal(1.0, std=0.5)},
+        A=lambda q, u, v, x: q.k * x[0] ** power * dot(grad(u), grad(v)),
+        M=lambda u, v, x: layers(x) * x[0] ** power * u * v,
+    )
+    assert [line.value for line in lp.diagnostics.check_model(written).failed] == found
+    material = lp.Model(written.state, written.parameter, A=written.physical_A.terms[0].integrand)
+    assert lp.diagnostics.check_model(material).ok
+
+
+def test_a_volume_element_that_makes_no_sense():
+    mesh = MeshTri().refined(2).with_defaults()
+    with pytest.raises(ModelError, match="must have one weight in common"):
+        around_an_axis(
+            a=lp.Field(mesh, ElementTriP1()), b=lp.Field(mesh, ElementTriP1(), weight=radius)
+        )
+    left = lp.Field(line(4), ElementLineP1(), weight=lambda x: x[0] - 0.5)
+    with pytest.raises(ModelError, match="weight must be 0 or more at each vertex"):
+        lp.Model(left, lp.Normal(), A=lambda q, u, v, x: q * u * v)
+    both = lp.Field(line(4), ElementLineP1(), weight=radius)
+    with pytest.raises(ModelError, match="weight is that of the state"):
+        lp.Model(both, {"k": both}, A=lambda q, u, v, x: q.k * u * v)
 
 
 def test_spaces_of_equal_size_are_not_confused():

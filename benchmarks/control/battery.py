@@ -71,7 +71,7 @@ def fillings() -> Functionals:
     """Return mean filling and filling at the surface: exact in the weights of the model."""
     return Functionals(
         {
-            "mean": lambda q, c, x: 3.0 * x[0] ** 2 / RADIUS**3 * c / FULL,
+            "mean": lambda q, c, x: 3.0 / RADIUS * c / FULL,
             "surface": On("right", lambda q, c, x: c / FULL),
         }
     )

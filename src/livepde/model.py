@@ -44,6 +44,7 @@ from livepde.fem import (
     terms_text,
     with_constants,
 )
+from livepde.fem.measure import unweighted
 from livepde.fem.meshes import halved
 from livepde.linalg import Array, IntArray
 from livepde.records import Layout, name_clashes
@@ -182,7 +183,8 @@ class Model(Shown):
         self.parameter_space = FunctionSpace.of(parameter, "q")
         self.inputs = tuple(inputs)
         self._check_parameter()
-        _ = self.state_space.fixed  # refuses boundary values that do not fit their field
+        # Refuse boundary values that do not fit their field, and weights that make no sense.
+        _ = self.state_space.fixed, self.state_space.weight
         x, q = self.state_space, self.parameter_space
         pair = {"u": x, "v": x}
         self.form_M = self._form("M", x.product if M is None else M, pair)
@@ -395,6 +397,8 @@ class Model(Shown):
             raise ModelError(f"state and unknowns are both called {sorted(both)}: rename one.")
         self._check_names()
         for name, block in self.parameter_space.fields.items():
+            if block.field.weight is not unweighted:
+                raise ModelError(f"parameter '{name}': weight is that of the state: leave it out.")
             if any(value != 0.0 for value in block.field.boundary_values):
                 raise ModelError(
                     f"parameter '{name}': only zero boundary values are possible; write a known "
@@ -435,9 +439,8 @@ class Model(Shown):
         if given := [field.quadrature for field in states if field.quadrature is not None]:
             return max(given)
         degrees = [block.field.element.maxdeg for block in self.parameter_space.fields.values()]
-        own = max(int(field.element.maxdeg) for field in states)
         # u, its test function, and q: the degrees of the factors add up.
-        return 2 * own + max([int(d) for d in degrees], default=0)
+        return max(field.order for field in states) + max([int(d) for d in degrees], default=0)
 
     @cached_property
     def state_block(self) -> FieldBlock:

@@ -119,8 +119,9 @@ def check_model(
     Linearity in q and in the test function v, transpose and adjoint (A(u)* r, xi)_Q = <A(u) xi, r>,
     derivatives by Taylor tests (the remainder f(u + s du) - f(u) - s f'(u) du falls like s^2, or
     vanishes for affine forms), the assembled matrices against plain quadrature of the integrand,
-    and the mass. Where components have no mass term, their equations must determine them. Print the
-    report, or call `raise_if_failed`, which raises `ModelError`.
+    and the mass. If mass and diffusion grow with x[0] as the volume around an axis or a point, the
+    state has to state it (`Field.weight`). Where components have no mass term, their equations must
+    determine them. Print the report, or call `raise_if_failed`, which raises `ModelError`.
 
     Parameters
     ----------
@@ -158,6 +159,7 @@ def check_model(
         *_adjoint(model, point),
         *_derivatives(model, point),
         *_mass(model),
+        *_volume_element(model),
         *_algebraic(model, point),
     ]
     return CheckReport("model", tuple(lines), ModelError)
@@ -452,6 +454,44 @@ def _mass(model: Model) -> list[Check]:
             "M = M^T", relative(M - M.T, M), ROUNDING, "M(u, v, x) must be symmetric in u and v."
         ),
         Check.at_most("M positive definite (failures)", line.value, 0, line.remedy),
+    ]
+
+
+def _volume_element(model: Model) -> list[Check]:
+    """Return a check that terms do not contain the volume element, which no field states then.
+
+    In each cell, mass and diffusion are proportional to the distance from an axis, or to its
+    square: a material that is so in both, cell by cell, is a cross-section, and as well a volume.
+    """
+    measure = model.form_M.terms[0].measure
+    x = measure.points[0]
+    if measure.name is not None or not measure.kept or (x <= 0.0).any():
+        return []
+    parts = model.form_M.owners("u")
+    values, slopes = (
+        [k for k, (_, what) in enumerate(parts) if what == part] for part in ("value", "grad")
+    )
+    q = model.parameter_space.prior
+    factors = [model.form_M.factor(k, k, 0.0) for k in values]
+    factors += [
+        model.physical_A.factor(k, k, 1.0, q=q) + model.form_B.factor(k, k, 1.0) for k in slopes
+    ]
+
+    def grows(factor: Array, power: int) -> bool:
+        each = np.broadcast_to(factor, x.size).reshape(x.shape) / x**power
+        same = np.ptp(each, axis=1) <= LINEARITY * np.abs(each).max(axis=1)
+        return bool(same.all() and each.any())
+
+    power = next((p for p in (1, 2) if all(grows(factor, p) for factor in factors)), 0)
+    return [
+        Check.at_most(
+            "power of x[0] in mass and diffusion, but not in `weight`",
+            power,
+            0,
+            f"Set weight=lambda x: {'x[0]' if power == 1 else 'x[0] ** 2'} of the state, and "
+            "leave this factor out of all terms. Otherwise means over regions are not means over "
+            "volumes.",
+        )
     ]
 
 

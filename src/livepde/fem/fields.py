@@ -20,7 +20,7 @@ from skfem import Mesh, MeshLine
 from skfem.element import Element
 
 from livepde.errors import SpaceError
-from livepde.fem.measure import Measure
+from livepde.fem.measure import Measure, unweighted
 from livepde.fem.priors import CONSTANT, Evolution, Normal, Prior, RandomWalk
 from livepde.fem.sobolev import Sobolev
 from livepde.linalg import Array
@@ -30,6 +30,7 @@ from livepde.showing import expression
 # with a probability of 2e-23.
 WITHIN = 10.0
 STANDARD = Normal()
+RADIAL = 2  # degree of the volume element where a coordinate is the distance from a point
 
 Integrand: TypeAlias = Callable[..., Any]
 """A weak form's integrand; see `Model` for the arguments."""
@@ -39,11 +40,6 @@ Source: TypeAlias = float | Callable[[Any, float], Any] | Mapping[str, Any]
 
 Predicate: TypeAlias = Callable[[Array], Any]
 """A subset of the domain: x of shape (d, ...) -> booleans of shape (...)."""
-
-
-def unweighted(x: Any) -> float:
-    """Return the volume element of Cartesian coordinates, one."""
-    return 1.0
 
 
 @dataclass(frozen=True)
@@ -289,9 +285,10 @@ class Field(_Declared):
         Pairs of boundaries of equal shape, as in (("left", "right"),), whose coefficients are
         identified.
     weight
-        Volume element of the coordinates, by which A, M, B and f are multiplied: `lambda x: x[0]`
-        where x[0] is the distance from an axis, its square where it is that from a point. Means
-        over regions, added fluxes and sources, and errors of the model have this factor, too.
+        Volume element of the coordinates of a state: `lambda x: x[0]` where x[0] is the distance
+        from an axis, its square where it is that from a point. All integrals have this factor,
+        those over a boundary, too: forms, means over regions and functionals are written without
+        it, as in Cartesian coordinates.
 
     Examples
     --------
@@ -316,6 +313,13 @@ class Field(_Declared):
     clamped: bool = False
     within: float = WITHIN
     weight: Callable[[Any], Any] = unweighted
+
+    @property
+    def order(self) -> int:
+        """Quadrature order of a product of two such functions with the volume element."""
+        if self.quadrature is not None:
+            return self.quadrature
+        return 2 * int(self.element.maxdeg) + (0 if self.weight is unweighted else RADIAL)
 
     @property
     def boundary_values(self) -> list[Any]:

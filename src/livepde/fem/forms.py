@@ -32,13 +32,12 @@ from livepde.errors import LivepdeError, ModelError
 from livepde.fem.elementwise import ElementTensor, Scatter, TensorTerm, scatter
 from livepde.fem.fields import Integrand, On, ignores, placed
 from livepde.fem.measure import START, Inputs, Measure, Moment, Place
-from livepde.fem.space import FunctionSpace, LocalSpace
+from livepde.fem.space import FunctionSpace, LocalSpace, volume_element
 from livepde.linalg import Array, IntArray, Pattern
 
 Tensor: TypeAlias = sp.csr_array | ElementTensor
 
-# Complex step. Its square is below rounding of any value, and no difference is formed that could
-# cancel digits.
+# Complex step: its square is below rounding of any value, and no difference cancels digits.
 STEP = 1e-30
 # Relative magnitude, compared with the largest value or the prior standard deviation of a
 # component, below which a value does not define the scale of a difference.
@@ -182,10 +181,11 @@ class Form(FormMatrices):
         self.nonlinear = nonlinear
         self.parameter = parameter
         self.terms: list[_Term] = []
+        weight = volume_element(spaces.values())
         for item, one in zip(items, given, strict=True):
             integrand, where = placed(item)
-            measure = where if isinstance(where, Measure) else Measure(mesh, order, where)
-            self.terms.append(_Term(integrand, measure, self.spaces, one))
+            at = where if isinstance(where, Measure) else Measure(mesh, order, where, weight=weight)
+            self.terms.append(_Term(integrand, at, self.spaces, one))
         self._inputs = Inputs(dict.fromkeys(inputs, 1.0))
         self._forget()
         self._moving: list[bool] = []  # terms that read time or inputs, and the nonlinear argument
@@ -328,8 +328,7 @@ class Form(FormMatrices):
 
     def _affine(self, slot: str, homogeneous: bool) -> bool:
         """Return True if the form is affine (linear, if homogeneous) in an argument."""
-        # Probing has a fixed seed: whether a form counts as affine must not differ between two
-        # runs.
+        # With a fixed seed: whether a form counts as affine must not differ between two runs.
         rng = np.random.default_rng(1)
         for term in (piece for whole in self.terms for piece in whole.samples()):
             values = term.drawn(rng)
@@ -554,8 +553,7 @@ class Form(FormMatrices):
         key = (rows, cols)[shifted]
         local = term.spaces[key]
         here = local.values(coefficients[key]) if key in coefficients else local.zeros()
-        # Fourth order in SHIFT: a difference of complex steps loses few digits, since each step is
-        # itself exact to rounding.
+        # Fourth order in SHIFT: each complex step is exact to rounding, so few digits are lost.
         near = evaluate(SHIFT) - evaluate(-SHIFT)
         far = evaluate(2.0 * SHIFT) - evaluate(-2.0 * SHIFT)
         difference = (8.0 * near - far) / (12.0 * SHIFT)

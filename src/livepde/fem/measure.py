@@ -208,6 +208,11 @@ def own(element: Element) -> Element:
     return element
 
 
+def unweighted(x: Any) -> float:
+    """Return the volume element of Cartesian coordinates, one."""
+    return 1.0
+
+
 # Number of quadrature points up to which shape functions evaluated on them are cached.
 KEPT = 300_000
 # Number of quadrature points of a piece of a larger measure, which bounds the size of temporary
@@ -221,6 +226,7 @@ class Measure:
 
     `members`: numbers of its cells, or of its facets on a boundary; default all.
     `thin`: true: only the first quadrature point of each, to probe an integrand.
+    `weight`: volume element of the coordinates, a function of points.
     """
 
     mesh: Mesh
@@ -228,6 +234,7 @@ class Measure:
     name: str | None = None
     members: IntArray | None = None
     thin: bool = False
+    weight: Callable[[Array], Any] = unweighted
 
     @property
     def on_boundary(self) -> bool:
@@ -332,12 +339,13 @@ class Measure:
 
     @cached_property
     def weights(self) -> Array:
-        """Quadrature weights, shape (elements, points)."""
+        """Quadrature weights with the volume element, shape (elements, points)."""
         if self.on_boundary:
-            return self._sides.weights
-        X, W = self._rule
-        dx: Array = np.abs(self.mapping.detDF(X, tind=self._where)) * W
-        return dx
+            dx = self._sides.weights
+        else:
+            X, W = self._rule
+            dx = np.abs(self.mapping.detDF(X, tind=self._where)) * W
+        return dx if self.weight is unweighted else dx * self.weight(self.points)
 
     @property
     def normal(self) -> Array | None:
@@ -438,7 +446,7 @@ def sizes(measure: Measure, region: Callable[[Array], Any]) -> tuple[float, floa
         whole = np.isin(np.arange(at.start, at.stop), cut, invert=True)
         exact += float(inside[whole].sum())
     if len(cut):
-        fine = FineMeasure(measure.mesh, measure.order, members=cut)
+        fine = FineMeasure(measure.mesh, measure.order, members=cut, weight=measure.weight)
         exact += sum(float((x.weights * region(x.points)).sum()) for _, x in fine.pieces())
     return plain, exact
 

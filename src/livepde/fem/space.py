@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import SimpleNamespace
@@ -26,7 +26,7 @@ from livepde.fem.fields import (
     declared,
     ignores,
 )
-from livepde.fem.measure import Measure, Moment
+from livepde.fem.measure import Measure, Moment, unweighted
 from livepde.fem.sensor_states import SensorBlock, SensorMeasure, SensorState
 from livepde.linalg import Array, IntArray, Mask, compact
 
@@ -321,6 +321,26 @@ class FunctionSpace:
             )
         return meshes[0]
 
+    @cached_property
+    def weight(self) -> Callable[[Array], Any]:
+        """Volume element of the coordinates of a state.
+
+        Raises `ModelError`: the components state different ones, or it is negative at a vertex.
+        """
+        points = self.mesh.p
+        given = [block.field.weight for block in self.fields.values()]
+        first, *others = (np.broadcast_to(one(points), points.shape[1:]) for one in given)
+        if not (np.isfinite(first).all() and (first >= 0.0).all() and first.any()):
+            raise ModelError(
+                "state: weight must be 0 or more at each vertex of the mesh, and not 0 everywhere; "
+                f"got {first.min():g} to {first.max():g}."
+            )
+        if any(not np.array_equal(first, other) for other in others):
+            raise ModelError(
+                f"state: the components {list(self.fields)} must have one weight in common."
+            )
+        return given[0]
+
     def product(self, u: Any, v: Any, x: Any) -> Any:
         """Return the L2 inner product of a state as an integrand: the sum over components."""
         products = {name: _product(block) for name, block in self.fields.items()}
@@ -550,3 +570,10 @@ def _single_density(source: Any, block: FieldBlock) -> Integrand:
         return lambda v, x: product(source(x, x.t if timed else 0.0), v)
     level = float(source)
     return lambda v, x: level * v
+
+
+def volume_element(spaces: Iterable[FunctionSpace]) -> Callable[[Array], Any]:
+    """Return the volume element of the coordinates, which the state among some spaces states."""
+    blocks = [block for space in spaces for block in space.fields.values()]
+    stated = [block.field.weight for block in blocks if block.field.weight is not unweighted]
+    return stated[0] if stated else unweighted

@@ -202,10 +202,8 @@ class ErrorColumns:
         stage = ForwardStage(model)
         places = PLACES if stage.symmetric or not stage.keeps else ()
 
-        weight = model.state_block.field.weight
-
         def stiffness(shape: Callable[[Any], Any]) -> Any:
-            return model.bilinear(lambda u, v, x: weight(x) * shape(x) * dot(grad(u), grad(v)))
+            return model.bilinear(lambda u, v, x: shape(x) * dot(grad(u), grad(v)))
 
         for k in range(1, 1 + modes):
             load = _minus(stiffness(self._mode(k)))
@@ -237,8 +235,7 @@ class ErrorColumns:
         return float(amount @ self.samples.start.u[0] / amount.sum())
 
     def _flow(self, axis: int, shape: Callable[[Any], Any]) -> Any:
-        weight = self.model.state_block.field.weight
-        return self.model.bilinear(lambda u, v, x: weight(x) * shape(x) * grad(u)[axis] * v)
+        return self.model.bilinear(lambda u, v, x: shape(x) * grad(u)[axis] * v)
 
     def _halves(self, axis: int) -> Callable[[Any], Any]:
         """Return a shape that tells two layers apart, from either side with the same size."""

@@ -79,13 +79,12 @@ def battery_particle(
 
     def diffusion(q: Any, c: Any, v: Any, x: Place) -> Any:
         mobility = q.D if slope is None else q.D * exp(q.slope * (c / c_max - 0.5))
-        return mobility * shell(x) * dot(grad(c), grad(v))
+        return mobility * dot(grad(c), grad(v))
 
     return Model(
-        Field(mesh, element or linear(mesh), unit="mol/m^3", weight=shell, quadrature=4),
+        Field(mesh, element or linear(mesh), unit="mol/m^3", weight=shell),
         unknowns,
         A=diffusion,
-        M=lambda c, v, x: shell(x) * c * v,
         f=On("right", lambda x, _: -x.inputs["I"] / (FARADAY * area)),
         inputs={"I": "A"},
         **BATTERY_PARTICLE.about(),

@@ -13,12 +13,12 @@ from livepde.errors import ModelError
 from livepde.fem import Field, On, Place, Scalar, Unknown, declared, dot, grad, linear
 from livepde.model import Model
 from livepde.models.description import (
-    AROUND_AXIS,
     Equation,
     Number,
     Option,
     Quantity,
     Variable,
+    around_axis,
     by_name,
     one_number,
 )
@@ -60,14 +60,14 @@ def borehole(
     """
     one_number("borehole", rho_c=rho_c)
     ends = {"right": T0}
-    state = Field(mesh, element or linear(mesh), dirichlet=ends, unit="degC", **AROUND_AXIS)
+    state = Field(mesh, element or linear(mesh), dirichlet=ends, unit="degC", weight=around_axis)
     if isinstance(rho_c, int | float):
         return Model(
             state,
             {"k": k, "R_b": R_b},
-            A=lambda q, u, v, x: q.k * x[0] * dot(grad(u), grad(v)),
-            M=lambda u, v, x: rho_c * x[0] * u * v,
-            f=On("left", lambda x, _: x.inputs["Q"] / (2 * pi * H)),
+            A=lambda q, u, v, x: q.k * dot(grad(u), grad(v)),
+            M=lambda u, v, x: rho_c * u * v,
+            f=On("left", lambda x, _: _heating(x, H)),
             inputs={"Q": "W"},
             **BOREHOLE.about(),
         )
@@ -76,14 +76,18 @@ def borehole(
         state,
         {"k": k, "R_b": R_b, "rho_c": rho_c},
         A=[
-            lambda q, u, v, x: q.diffusivity * x[0] * dot(grad(u), grad(v)),
-            On("left", lambda q, _, v, x: -x.inputs["Q"] / (2 * pi * H) * q.per_capacity * v),
+            lambda q, u, v, x: q.diffusivity * dot(grad(u), grad(v)),
+            On("left", lambda q, _, v, x: -_heating(x, H) * q.per_capacity * v),
         ],
         coefficients=lambda q: {"diffusivity": q.k / q.rho_c, "per_capacity": 1 / q.rho_c},
-        M=lambda u, v, x: x[0] * u * v,
         inputs={"Q": "W"},
         **BOREHOLE.about(),
     )
+
+
+def _heating(x: Place, H: float) -> Any:
+    """Return the power that enters through the wall, in W/m^2."""
+    return x.inputs["Q"] / (2 * pi * H * x[0])
 
 
 def fluid(H: float) -> Callable[[Any, Place], Any]:
@@ -199,33 +203,33 @@ def grouted_borehole(
     layered = _layered(mesh, r_p, r_b)
     thickness, around, rho_0 = r_p - float(mesh.p[0].min()), log(r_b / r_p), heat.prior.centre
     cold = {name: T0 for name in ("right", "end") if name in layered.boundaries}
-    state = Field(layered, linear(layered), dirichlet=cold, unit="degC", **AROUND_AXIS)
+    state = Field(layered, linear(layered), dirichlet=cold, unit="degC", weight=around_axis)
 
     def pipes(q: Any, u: Any, v: Any, x: Place) -> Any:
-        return thickness / (2 * pi * q.share * q.R_b) * _outwards(u, v)
+        return thickness / (2 * pi * q.share * q.R_b) * _outwards(u, v) / x[0]
 
     def grout(q: Any, u: Any, v: Any, x: Place) -> Any:
-        return around / (2 * pi * (1 - q.share) * q.R_b) * x[0] * dot(grad(u), grad(v))
+        return around / (2 * pi * (1 - q.share) * q.R_b) * dot(grad(u), grad(v))
 
     def ground(q: Any, u: Any, v: Any, x: Place) -> Any:
         # The weak form in the coordinate x of constant heat content, see above.
         more, radial = q.rho_c / rho_0, _outwards(u, v)
         square = r_b**2 + (x[0] ** 2 - r_b**2) / more
         along = dot(grad(u), grad(v)) - radial
-        return q.k * (more * square / x[0] * radial + x[0] / more * along)
+        return q.k * (more * square / x[0] ** 2 * radial + along / more)
 
     return Model(
         state,
         {"k": k, "rho_c": rho_c, "R_b": R_b, "share": share},
         A=[On("pipes", pipes), On("grout", grout), On("ground", ground)],
         M=[
-            On("left", lambda u, v, x: C_f / (2 * pi) * u * v),
-            On("pipes", lambda u, v, x: C_p / (2 * pi * thickness) * u * v),
-            On("grout", lambda u, v, x: C_g * x[0] * u * v),
-            On("wall", lambda u, v, x: C_c / (2 * pi) * u * v),
-            On("ground", lambda u, v, x: rho_0 * x[0] * u * v),
+            On("left", lambda u, v, x: C_f / (2 * pi * x[0]) * u * v),
+            On("pipes", lambda u, v, x: C_p / (2 * pi * thickness * x[0]) * u * v),
+            On("grout", lambda u, v, x: C_g * u * v),
+            On("wall", lambda u, v, x: C_c / (2 * pi * x[0]) * u * v),
+            On("ground", lambda u, v, x: rho_0 * u * v),
         ],
-        f=On("left", lambda x, _: x.inputs["Q"] / (2 * pi * H)),
+        f=On("left", lambda x, _: _heating(x, H)),
         inputs={"Q": "W"},
         **GROUTED_BOREHOLE.about(),
     )

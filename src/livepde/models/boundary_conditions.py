@@ -185,21 +185,16 @@ class _Terms:
         self._add(where, lambda q, _, v, x: -amount(q, x) * inside(x) * v, value)
 
     def _add(self, where: str | None, plain: Callable[..., Any], *amounts: Amount) -> None:
-        weight = self.model.state_block.field.weight
-
-        def term(q: Any, u: Any, v: Any, x: Place) -> Any:
-            return plain(q, u, weight(x) * v, x)
-
         def known(u: Any, v: Any, x: Place) -> Any:
-            return term(None, u, v, x)
+            return plain(None, u, v, x)
 
         def driving(_: Any, v: Any, x: Place) -> Any:
-            return term(None, None, v, x)
+            return plain(None, None, v, x)
 
         # B and f may not read q, so a term belongs to A as soon as one amount is an unknown.
         form: Callable[..., Any]
         if self.per is not None or any(isinstance(one, str | Multiple) for one in amounts):
-            form, terms = term, self.A
+            form, terms = plain, self.A
         else:
             form, terms = driving if ignores(plain, 1) else known, self.B
         terms.append(form if where is None else On(where, form))
@@ -249,7 +244,8 @@ def _region(model: Model, name: str, over: Any) -> tuple[str | None, Callable[[A
     # The predicate is tried at the mean of the vertices of each cell.
     if not np.any(over(model.mesh.p[:, model.mesh.t].mean(axis=1))):
         raise ModelError(f"source '{name}': no cell of the mesh lies in it.")
-    size, exact = sizes(Measure(model.mesh, model.order), over)
+    measure = Measure(model.mesh, model.order, weight=model.state_space.weight)
+    size, exact = sizes(measure, over)
     if abs(size - exact) > MISSED * exact:
         warnings.warn(
             f"source '{name}': its border crosses cells of the mesh, which integrate it over "

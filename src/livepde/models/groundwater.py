@@ -13,11 +13,11 @@ from livepde.fem import Channel, Field, On, Piecewise, Place, Unknown, dot, grad
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.models.description import (
-    AROUND_AXIS,
     Equation,
     Number,
     Option,
     Variable,
+    around_axis,
     by_name,
     everywhere,
     one_number,
@@ -65,15 +65,15 @@ def pumping_test(
     everywhere("pumping_test", mesh, k=k)
     require_positive("pumping_test: b, the thickness,", b, ModelError)
     ends = {"right": 0.0}
-    state = Field(mesh, element or linear(mesh), dirichlet=ends, unit="m", **AROUND_AXIS)
+    state = Field(mesh, element or linear(mesh), dirichlet=ends, unit="m", weight=around_axis)
     terms: list[Any] = [
-        lambda q, u, v, x: q.diffusivity * x[0] * dot(grad(u), grad(v)),
-        On("left", lambda q, _, v, x: -x.inputs["Q"] / (2 * pi * b) * q.per_storage * v),
+        lambda q, u, v, x: q.diffusivity * dot(grad(u), grad(v)),
+        On("left", lambda q, _, v, x: -x.inputs["Q"] / (2 * pi * b * x[0]) * q.per_storage * v),
     ]
     unknowns = {"k": k, "Ss": Ss}
     if leakance is not None:
         unknowns["leakance"] = leakance
-        terms.append(lambda q, u, v, x: q.leaked * x[0] * u * v)
+        terms.append(lambda q, u, v, x: q.leaked * u * v)
 
     def coefficients(q: Any) -> dict[str, Any]:
         found = {"diffusivity": q.k / q.Ss, "per_storage": 1 / q.Ss}
@@ -84,7 +84,6 @@ def pumping_test(
         unknowns,
         A=terms,
         coefficients=coefficients,
-        M=lambda u, v, x: x[0] * u * v,
         inputs={"Q": "m^3/s"},
         **PUMPING_TEST.about(unknowns),
     )

@@ -27,6 +27,7 @@ class Functionals(Observation):
     """Integral observations, z_k = integral of g_k(q, u, x), for any integrand g of a weak form.
 
     The derivatives in u and q are taken by a complex step, as for `Model`: exact for analytic g.
+    Integrals have the volume element of the state (`Field.weight`).
 
     Parameters
     ----------
@@ -94,12 +95,8 @@ class FunctionalsObserved(Observed):
         if self.observation.order is not None:
             return self.observation.order
         fields = [block.field for block in self.state.fields.values()]
-        orders = [
-            2 * int(field.element.maxdeg) if field.quadrature is None else field.quadrature
-            for field in fields
-        ]
         degrees = [int(block.field.element.maxdeg) for block in self.parameter.fields.values()]
-        return max(orders) + max(degrees, default=0)
+        return max(field.order for field in fields) + max(degrees, default=0)
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
         uq = np.concatenate([u, q])

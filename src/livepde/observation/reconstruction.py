@@ -282,8 +282,8 @@ def penalty_matrix(norm: str | Integrand, observed: Observed, basis: Array) -> s
     inside = _inside(block, basis) if observed.observation.nodal else None
 
     def matrix(integrand: Any) -> sp.csr_array:
-        order = block.field.quadrature or 2 * int(block.field.element.maxdeg)
-        form = Form("norm", integrand, {"u": space, "v": space}, block.field.mesh, order)
+        pair = {"u": space, "v": space}
+        form = Form("norm", integrand, pair, block.field.mesh, block.field.order)
         if not form.constant:
             raise ObservationError("Tikhonov: the norm may not depend on time or inputs.")
         return (form if inside is None else form.on(np.flatnonzero(inside))).matrix("v", "u")

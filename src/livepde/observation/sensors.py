@@ -467,12 +467,12 @@ class Averages(Observation):
             raise ObservationError(
                 f"Averages: region '{name}' is '{where}'; the mesh names {known or 'nothing'}."
             )
-        order = max(2 * int(block.field.element.maxdeg), block.field.quadrature or 0)
-        measure = Measure(mesh, order, where)
+        order = max(2 * int(block.field.element.maxdeg), block.field.order)
+        measure = Measure(mesh, order, where, weight=weight)
         if isinstance(region, str):
-            size, row = _integral(block, measure, lambda x, _: weight(x))
+            size, row = _integral(block, measure, lambda x, _: 1.0)
             if size == 0.0:  # a boundary on the axis
-                size, row = _integral(block, measure, lambda x, _: 1.0)
+                size, row = _integral(block, Measure(mesh, order, where), lambda x, _: 1.0)
         else:
             size, row = _integral_inside(block, measure, region)
         if size <= 0:
@@ -482,16 +482,13 @@ class Averages(Observation):
 
 def _integral_inside(block: FieldBlock, measure: Measure, region: Predicate) -> tuple[float, Array]:
     """Return the integrals over a region; cells that its border crosses are divided."""
-    mesh, weight = block.field.mesh, block.field.weight
-    cut = crossed(measure, region)
-    size, row = _integral(
-        block, measure, lambda x, cells: weight(x) * region(x) * ~np.isin(cells, cut)
-    )
+    mesh, cut = block.field.mesh, crossed(measure, region)
+    size, row = _integral(block, measure, lambda x, cells: region(x) * ~np.isin(cells, cut))
     # A region between the quadrature points of one cell is looked for on finer parts.
     members = cut if size > 0 or len(cut) else np.arange(mesh.nelements)
     if len(members):
-        fine = FineMeasure(mesh, measure.order, members=members)
-        more, added = _integral(block, fine, lambda x, _: weight(x) * region(x))
+        fine = FineMeasure(mesh, measure.order, members=members, weight=measure.weight)
+        more, added = _integral(block, fine, lambda x, _: region(x))
         size, row = size + more, row + added
     return size, row
 

@@ -12,16 +12,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeAlias, cast
+from typing import NamedTuple, TypeAlias, cast
 
 import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ObservationError
 from livepde.fem import Inputs, Moment, On, lengths
-from livepde.fem.fields import unweighted
+from livepde.fem.measure import unweighted
 from livepde.linalg import Array, IntArray, row_product
-from livepde.model import Model
+from livepde.model import Model, mass_form
 from livepde.observation import CombinedObserved, Observed, Points
 from livepde.stepping import ForwardStage
 from livepde.verdict.ledger import WINDOWS
@@ -214,10 +214,8 @@ def boundary_lifts(model: Model) -> dict[str, Array]:
 def flux_loads(model: Model, most: int | None = None) -> dict[str, Array]:
     """Return loads of a flux of one, (n,), through those of `most` boundaries without a value."""
     ones, found = model.state_space.interpolate(1.0), {}
-    weight = model.state_block.field.weight
     for name in [str(one) for one in model.mesh.boundaries or {}][:most]:
-        form: Any = On(name, lambda u, v, x: weight(x) * u * v)
-        load = model.bilinear(form) @ ones
+        load = model.bilinear(On(name, mass_form)) @ ones
         if load.sum() > 0.0 and not load[model.X.free == 0.0].any():
             found[name] = load
     return found
@@ -533,8 +531,7 @@ def averages_on_line(model: Model) -> bool:
 
     Elsewhere nobody knows over which direction; along a radius none does, as wells do not.
     """
-    fields = [block.field for block in model.state_space.fields.values()]
-    return model.mesh.dim() == 1 and all(one.weight is unweighted for one in fields)
+    return model.mesh.dim() == 1 and model.state_space.weight is unweighted
 
 
 def sensor_averages(model: Model, observed: Observed) -> sp.csr_array:
