@@ -327,6 +327,24 @@ def test_stabilising_term_decays_q():
         np.testing.assert_allclose(estimate.q, q0 / (1 + 0.7 * 0.5) ** k, atol=1e-9)
 
 
+def test_stabilising_term_draws_a_logarithm_to_its_prior_in_every_unit():
+    def last(unit):
+        mesh = line(6)
+        model = lp.Model(
+            lp.Field(mesh, ElementLineP1(), dirichlet={"left": 0.0}),
+            {"k": lp.LogNormal(0.8 * unit, std=0.3 * unit)},
+            A=lambda q, u, v, x: q.k / unit * lp.dot(lp.grad(u), lp.grad(v)),
+            f=1.0,
+        )
+        ident = identifier(model, lp.GradientLaw(sigma=0.7, newton=EXACT), q0={"k": 2.0 * unit})
+        nothing = np.full(ident.observed.size, np.nan)
+        ident.step(0.5, nothing)
+        return ident.step(1.0, nothing).q[0] / unit
+
+    assert last(1.0) == pytest.approx(0.8 * 2.5 ** (1.35**-2), rel=1e-9)
+    assert last(1e-5) == pytest.approx(last(1.0), rel=1e-9)
+
+
 @pytest.mark.slow
 def test_nu_damps_the_unobserved_part():
     with pytest.warns(UserWarning, match="negative at the prior mean, which is ill-posed"):

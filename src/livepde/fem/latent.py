@@ -266,6 +266,18 @@ class Latent:
         return prior
 
     @cached_property
+    def origin(self) -> Array:
+        """Latent coefficients of q = 0, shape (dim,); the prior mean where q has a transform.
+
+        The zero of a logarithm depends on the unit of q.
+        """
+        origin = self.prior.copy()
+        for p in self.parts.values():
+            if isinstance(p.transform, Identity):
+                origin[p.part] = 0.0
+        return origin
+
+    @cached_property
     def deviations(self) -> Array:
         """Prior standard deviation of each latent coefficient, shape (dim,)."""
         return self._filled([p.unknown.prior.latent_std for p in self.parts.values()])

@@ -309,7 +309,8 @@ class GradientLaw(Law[GradientParts, GradientState]):
         Weight of P N P u >= 0. It draws P u to zero, not to the truth: needed where the process
         does not damp the unobserved part (D < 0), and it may help or harm where it does.
     sigma
-        Stabilising term of (noisy_q), >= 0.
+        Stabilising term of (noisy_q), >= 0. It draws q to zero, and the logarithm of a positive
+        unknown to its prior median.
     M_op, N_op
         Integrands (u, v, x) of M and N of (MN1), (MN2); default u v + grad u . grad v.
         `diffusion_operator(D)` is the paper's, with |D|.

@@ -162,11 +162,11 @@ class StageForms:
 class Metric:
     """Weights of the second line of a stage, an equation of dual vectors of Q.
 
-        weight G_Q (q_t + sigma q - K (q - prior)) + J (q - c_q) = A(w)^T r + load
+        weight G_Q (q_t + sigma (q - q_0) - K (q - prior)) + J (q - c_q) = A(w)^T r + load
 
-    with q_t = (q - c_q)/h, the Gram matrix G_Q, and the generator K of unknowns that move by
-    themselves. With J = 0 and without load it is (noisy_q), and with sigma = 0 (est_exact_q), for
-    weight = 1/gain.
+    with q_t = (q - c_q)/h, the Gram matrix G_Q, the generator K of unknowns that move by
+    themselves, and q_0 = 0 (`Latent.origin`). With J = 0 and without load it is (noisy_q), and with
+    sigma = 0 (est_exact_q), for weight = 1/gain.
     """
 
     weight: float  # 1/gain, >= 0
@@ -341,7 +341,7 @@ class StageTerms:
         """
         metric, latent = problem.metric, self.forms.model.latent
         change = q - problem.c[self.n :]
-        rate = change / problem.h + metric.sigma * q
+        rate = change / problem.h + metric.sigma * (q - latent.origin)
         if self.moves:
             rate = rate - latent.generator @ (q - latent.prior)
         learned: Array = metric.weight * self.dual(rate)
