@@ -18,7 +18,9 @@ from livepde import cases
 from livepde.cases.new_case import write_template
 from livepde.cases.preview import Preview, preview
 from livepde.cases.read import parse
+from livepde.cases.remedies import with_intervals
 from livepde.cases.schema import SensitivitySpec
+from livepde.cases.variants import Variant, VariantRun, proposed
 from livepde.fem import Inputs, Moment
 from livepde.runs import checks_of, drive, measures, tables
 from livepde.units import convert
@@ -277,7 +279,8 @@ def test_gradient_law_on_averages(rod):
                ('at = "30 cm", noise = "0.05 K"', 'over = ["28 cm", "32 cm"]'))  # fmt: skip
     prepared, data = result_of(path)
     assert isinstance(prepared.case.law, lp.GradientLaw)
-    assert not prepared.case.notes
+    (note,) = prepared.case.notes
+    assert "no intervals" in note
     assert preview(prepared, prepared.stream) == Preview()
     assert (data.status == 0).all()
 
@@ -329,6 +332,22 @@ def test_gradient_law_on_points_gets_a_note(rod):
     assert isinstance(
         cases.load(rod(("gain = 1e-12", "mu = 2"))).law.damping, lp.laws.ConstantDamping
     )
+
+
+def test_gradient_law_has_no_intervals_and_says_which_settings_have(rod):
+    path = rod(GRADIENT)
+    prepared = cases.load(path).prepare()
+    settings = with_intervals(prepared.case)
+    assert settings == ("law.kind=sensitivity", "law.gain=")
+    assert "with `--set law.kind=sensitivity --set law.gain=`." in prepared.case.notes[-1]
+    base = VariantRun(Variant("as stated"))
+    assert proposed(prepared, base) == [Variant("Kalman filter", settings)]
+    other = cases.load(path, settings=parse(settings))
+    assert isinstance(other.law, lp.SensitivityLaw)
+    assert not with_intervals(other)
+    noiseless = cases.load(rod((', noise = "0.05 K"', ""))).prepare()  # of one: all or none
+    assert "state the `noise` of each sensor" in noiseless.case.notes[-1]
+    assert not proposed(noiseless, base)
 
 
 def test_sensitivity_options(rod):

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from livepde.cases.case import Prepared, load
-from livepde.cases.case_channels import columns_of
+from livepde.cases.case_channels import columns_of, noise_of
 from livepde.cases.data import clock_of, delays
 from livepde.cases.process import unread_without
 from livepde.cases.read import parse, settings_in, toml_key, toml_value
@@ -24,6 +24,7 @@ from livepde.cases.remedies import (
     later_start,
     switching,
     usual_shift,
+    with_intervals,
     with_settings,
 )
 from livepde.cases.set_aside import with_errors_of_set_aside
@@ -564,6 +565,8 @@ def _candidates(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
         name = NAMES.get(cause.kind, cause.kind + " of {}").format(cause.subject)
         yield Variant(name, settings_in(cause.setting))
     if case.spec.law.kind != "sensitivity":
+        if noise_of(case):
+            yield Variant("Kalman filter", with_intervals(case))
         return
     yield from _process(prepared, base)
     yield from _layers(case)

@@ -70,7 +70,7 @@ POWER = 2  # of the number of a sample, that weighs it
 UNTESTED = (
     "the mesh and the time step: this law does not estimate their errors",
     "a refit of all samples: this law has none",
-    "intervals: this law has no covariance",
+    "intervals: GradientLaw has no covariance, SensitivityLaw has one",
     "correlation of the noise in time",
 )
 OUTSIDE = "the process outside the observed part"
