@@ -39,7 +39,7 @@ from livepde.streams import (
     read_json_lines,
     tabulated,
 )
-from livepde.streams.csvfile import header_of
+from livepde.streams.csvfile import header_of, read_long_csv
 from livepde.streams.gaps import fill_table
 from livepde.streams.intake import Habit, Policy
 from livepde.streams.mqtt import Broker, MqttSink, MqttSource
@@ -163,7 +163,16 @@ def read_data(case: CaseContent, source: str | Iterable[str] | None) -> DataTabl
     # before its start once they are corrected: a stated state is not that of their time.
     together = interpolates(case) or bool(delays(case))
     sensors, where = case.roles(*SENSORS), case.where("data.file")
-    joined = join_tables(tables, clock.second, sensors, needed, where, between, together=together)
+    joined = join_tables(
+        tables,
+        clock.second,
+        sensors,
+        needed,
+        where,
+        between,
+        together=together,
+        profile=sensors if interpolates(case) else (),
+    )
     return _until_stop(case, clock, joined)
 
 
@@ -178,7 +187,33 @@ def _tables(
     if source is None and case.reader is not None:
         return [_from_reader(case, case.reader, columns, clock)]
     path = data_file(case) if source is None else Path(source)
+    if spec.long:
+        return _of_sensors(case, path, columns, clock, spec.long)
     return [_read(path, columns, clock, spec)]
+
+
+def _of_sensors(
+    case: CaseContent,
+    path: Path,
+    columns: Mapping[str, Column],
+    clock: Clock,
+    long: tuple[str, str],
+) -> list[DataTable]:
+    """Return a file with a row for each reading as tables, one for each channel."""
+    spec = case.spec.data
+    if path.suffix in (".parquet", *JSON_LINES):
+        text = f"{path} is not a CSV file; only CSV files can have a row for each reading."
+        raise case.error("data.sensor", text)
+    for name, column in columns.items():
+        if column.noise_of or len(column.names) > 1:
+            key, owner = ("noise_column", column.noise_of) if column.noise_of else ("columns", name)
+            text = "requires a table with a column for each sensor: leave it out."
+            raise case.error(f"channels.{owner}.{key}", text)
+    # Which rows are needed is decided once they are joined.
+    columns = {name: replace(column, needed=False) for name, column in columns.items()}
+    written: dict[str, Any] = {"separator": spec.separator, "encoding": spec.encoding}
+    rows: dict[str, Any] = {"every": spec.every, "missing": spec.missing, "skip": spec.skip}
+    return read_long_csv(path, columns, clock, long, **rows, **written)
 
 
 def _until_stop(case: CaseContent, clock: Clock, table: DataTable) -> DataTable:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta, tzinfo
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,8 @@ from livepde.linalg import Array
 from livepde.streams import Clock, Column, DataTable, read_csv
 from livepde.streams.cells import Missing, is_limit, is_missing, number_of
 from livepde.streams.clock import CALLED_TIME, ELAPSED, date_formats, elapsed_formats
-from livepde.streams.csvfile import Written, how_written
+from livepde.streams.csvfile import Written, how_written, read_long_csv, texts_of
+from livepde.streams.join import join_tables
 from livepde.streams.table import JSON_LINES
 from livepde.units import OF_TIMES, conversion, counted_since, unit_in
 
@@ -35,6 +36,9 @@ COUNTED = {
 }
 LATEST = 2.7  # times the least number: the year 2051, or 2169 of Excel
 DATED = re.compile(r"^t\b|time|date|datum|zeit|temps", re.I)
+VALUED = re.compile(r"val|wert|reading|result|state", re.I)  # column of values of all sensors
+UNITS = re.compile(r"unit|einheit|unité|eenheid", re.I)  # column of their units
+MOSTLY = 0.9  # of the rows of a sensor that have moments of their own
 VALUES = {"number", "date", "hour"}  # kinds of cells that a header does not have
 
 
@@ -53,6 +57,8 @@ class Measured:
     missing: tuple[float | str, ...] = ()  # stated to mean a missing value, of the first table
     counted: str = ""  # unit and date since which times count that are numbers; empty: none
     more: tuple[Measured, ...] = ()  # tables that are joined to this one by time
+    long: tuple[str, str] | None = None  # columns of sensors and values, if each row is a reading
+    units: Mapping[str, str] = field(default_factory=dict)  # of the sensors of such a table
 
     @property
     def tables(self) -> tuple[Measured, ...]:
@@ -80,6 +86,11 @@ class Measured:
                 "numbers. Use the same format in both."
             )
         return replace(self, more=(*self.more, other))
+
+    def titled(self, name: str) -> str:
+        """Return the name of a column with the unit that another column states for it."""
+        unit = self.units.get(name, "")
+        return f"{name} [{unit}]" if unit else name
 
     @property
     def is_of_numbers(self) -> bool:
@@ -119,13 +130,16 @@ def measured(
     zone: tzinfo = UTC,
     missing: tuple[float | str, ...] = (),
     stated: str = "",
+    sensor: str = "",
+    value: str = "",
 ) -> Measured:
     """Read a CSV file of which nothing is known.
 
     `time_unit`: the unit of time of the equation. `time_format`: of dates; empty: found from the
     cells. `skip`: lines before the header; None: found from the lines. `zone`: of dates
     without one. `missing`: numbers and texts that mean a missing value. `stated`: the unit of the
-    times; empty: found from their name and their numbers.
+    times; empty: found from their name and their numbers. `sensor`, `value`: columns of a table
+    with a row for each reading; empty: found from the texts.
     """
     if table.suffix in (*JSON_LINES, ".parquet"):
         raise SampleError(f"{table}: expected a CSV file with a header.")
@@ -137,20 +151,77 @@ def measured(
     columns, row_numbers, texts = _sorted_out(kinds, time, written)
     if not columns:
         raise SampleError(f"{table}: no column but the times, '{time[0]}', contains numbers.")
-    samples = read_csv(
-        table,
-        columns,
-        replace(clock, zone=zone),
-        separator=written.separator,
-        encoding=written.encoding,
-        skip=written.skip,
-        missing=missing,
-    )
+    zoned, long = replace(clock, zone=zone), None
+    units: Mapping[str, str] = {}
+    how: dict[str, Any] = {"separator": written.separator, "encoding": written.encoding}
+    how |= {"skip": written.skip, "missing": missing}
+    if found := _readings(table, written, zoned, list(columns), texts, sensor, value):
+        long, units = (found.sensor, found.value), found.units
+        columns = {name: Column((name,), decimal=written.decimal) for name in found.names}
+        parts = read_long_csv(table, columns, zoned, long, **how)
+        samples = join_tables(parts, 1.0, list(columns), (), f"{table}", together=False)
+        row_numbers, texts = (), ()
+    else:
+        samples = read_csv(table, columns, zoned, **how)
     counted, steps = (unit, "s") if clock.since else ("", unit)
     steps = time_unit and (steps or BLANK)
-    return Measured(
-        table, written, time, clock.format, steps, samples, row_numbers, texts, missing, counted
-    )
+    known = (samples, row_numbers, texts, missing, counted)
+    return Measured(table, written, time, clock.format, steps, *known, long=long, units=units)
+
+
+@dataclass(frozen=True)
+class _Readings:
+    """Columns of a table with a row for each reading, and the sensors in it."""
+
+    sensor: str
+    value: str
+    names: tuple[str, ...]
+    units: Mapping[str, str]  # of sensors, if a column states them
+
+
+def _readings(
+    table: Path,
+    written: Written,
+    clock: Clock,
+    numbers: Sequence[str],
+    texts: Sequence[str],
+    sensor: str,
+    value: str,
+) -> _Readings | None:
+    """Return how a table has a row for each reading; None if it has a column for each sensor.
+
+    Its times repeat, but not those of each text in some column. `sensor`, `value`: stated columns.
+    """
+    asked = [sensor] if sensor else list(texts)
+    if not asked:
+        return None
+    how = (written.separator, written.encoding, clock, written.skip)
+    _, cells = texts_of(table, [*clock.names, *asked, *texts], *how)
+    moments = list(zip(*(cells[name] for name in clock.names), strict=True))
+    if not sensor and len(set(moments)) == len(moments):
+        return None
+    for name in asked:
+        names = [cell.strip() for cell in cells[name]]
+        known = tuple(filter(None, dict.fromkeys(names)))
+        apart = len({*zip(names, moments, strict=True)})
+        # An hour that clocks show twice repeats some moments of a sensor.
+        if not sensor and (len(known) < 2 or apart < MOSTLY * len(moments)):
+            continue
+        values = [value] if value else [one for one in numbers if VALUED.search(one)]
+        values = values or [one for one in numbers if one != sensor]
+        if len(values) != 1:
+            raise SampleError(
+                f"{table}: each row is a reading of '{name}': set data.value to the column of "
+                f"values{', perhaps ' if values else ''}{' or '.join(values)}."
+            )
+        pairs = (
+            {*zip(names, (cell.strip() for cell in cells[other]), strict=True)}
+            for other in texts
+            if UNITS.search(other)
+        )
+        units = next((dict(pair) for pair in pairs if len(pair) == len(known)), {})
+        return _Readings(name, values[0], known, units)
+    return None
 
 
 def _clock(

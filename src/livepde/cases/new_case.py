@@ -221,6 +221,8 @@ def _written(table: Measured, folder: Path) -> dict[str, Any]:
     found["time"] = table.time[0] if len(table.time) == 1 else list(table.time)
     if unit := table.counted or (table.time_unit if table.is_of_numbers else ""):
         found["time_unit"] = unit
+    if table.long:
+        found["sensor"], found["value"] = table.long
     found |= {"time_format": table.time_format, "separator": written.separator}
     return found | {"decimal": written.decimal, "encoding": written.encoding}
 
@@ -302,7 +304,7 @@ def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
         if entry := _input_of(name, inputs):
             found.append(_input(table, entry, name, inputs.pop(entry).unit))
         else:
-            found.append(_sensor(equation, label, name, values))
+            found.append(_sensor(equation, label, name, table.titled(name), values))
     found = [_by_unit(table, item, found, inputs) for item in found]
     for item in found:
         inputs.pop(item.name, None)
@@ -342,7 +344,7 @@ def _labels(columns: Iterable[str]) -> list[str]:
 
 def _input(table: Measured, entry: str, name: str, model_unit: str) -> FoundChannel:
     """Return an input with the unit that the name of its column states."""
-    unit, values = _stated(name, model_unit), table.columns[name]
+    unit, values = _stated(table.titled(name), model_unit), table.columns[name]
     given = {"role": "input", "column": name, **({"unit": unit} if unit else {})}
     comment = _range(values)
     samples = next(one.samples for one in table.tables if name in one.samples.names)
@@ -375,9 +377,9 @@ def _stated(name: str, unit: str) -> str:
     return "" if found == unit else found
 
 
-def _sensor(equation: Equation, key: str, name: str, values: Array) -> FoundChannel:
+def _sensor(equation: Equation, key: str, column: str, name: str, values: Array) -> FoundChannel:
     """Return a sensor with the place and the unit that the name of its column states."""
-    told, given = [_range(values)], {"role": "sensor", "column": name}
+    told, given = [_range(values)], {"role": "sensor", "column": column}
     place, fraction = PLACE.search(name), FRACTION.search(name)
     at: Any = _open(equation.length_unit)
     if equation.dimension > 1:
@@ -399,11 +401,11 @@ def _sensor(equation: Equation, key: str, name: str, values: Array) -> FoundChan
         given["quantity"] = "flux"
         told.append('flux along x, at an end: at = "left" or "right"')
         given |= {"unit": stated} if conversion(stated, flux, name) != Affine() else {}
-        return FoundChannel(key, given, (name,), ", ".join(told))
+        return FoundChannel(key, given, (column,), ", ".join(told))
     model = equation.state.unit
     same = converts(unit, model) and conversion(unit, model, name) == Affine()  # °C
     given |= {"unit": unit} if unit and not same else {}
-    return FoundChannel(key, given, (name,), ", ".join(told))
+    return FoundChannel(key, given, (column,), ", ".join(told))
 
 
 def _unit_of_sensor(name: str, unit: str) -> str:

@@ -186,6 +186,8 @@ class DataSpec(Spec):
     time: Name | tuple[Name, Name] = "time"
     time_unit: str | None = None
     time_format: TimeFormat = ""
+    sensor: Name | None = None
+    value: Name | None = None
     zone: Name = "UTC"
     start: Instant | None = None
     stop: Instant | None = None
@@ -208,10 +210,23 @@ class DataSpec(Spec):
     @model_validator(mode="after")
     def _live_source(self) -> DataSpec:
         if self.live and self.is_of_file:
-            raise ValueError("skip and a time in two columns are only valid with a file")
+            raise ValueError("skip, sensor and a time in two columns are only valid with a file")
         if self.live and self.every > 1:
             raise ValueError("every requires complete data, not a live source")
         return self
+
+    @model_validator(mode="after")
+    def _long_table(self) -> DataSpec:
+        if (self.sensor is None) != (self.value is None):
+            raise ValueError("sensor and value are two columns of one table: name both")
+        if self.long and (isinstance(self.file, tuple) or self.reader is not None):
+            raise ValueError("sensor and value require a single file")
+        return self
+
+    @property
+    def long(self) -> tuple[str, str] | None:
+        """The columns of sensors and of values of a table with a row for each reading."""
+        return None if self.sensor is None or self.value is None else (self.sensor, self.value)
 
     def of(self, file: FileSpec) -> DataSpec:
         """Return the table of one of several files."""
@@ -225,8 +240,8 @@ class DataSpec(Spec):
 
     @property
     def is_of_file(self) -> bool:
-        """Whether keys state what only a complete file has: titles, or two columns of times."""
-        return not self.follow and (self.skip > 0 or len(self.times) > 1)
+        """Whether keys state what only a complete file has, such as titles or columns of times."""
+        return bool(self.long) or (not self.follow and (self.skip > 0 or len(self.times) > 1))
 
     @property
     def live(self) -> bool:

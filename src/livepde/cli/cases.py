@@ -103,6 +103,7 @@ def _begin(
     missing = missing_in(changes.pop("data.missing", None), "--set data.missing")
     how: dict[str, Any] = {"time_format": time_format, "skip": skip, "zone": zone}
     how |= {"missing": missing, "stated": str(changes.get("data.time_unit") or "")}
+    how |= {key: str(changes.get(f"data.{key}") or "") for key in ("sensor", "value")}
     first, *others = (measured(file, equation.time_unit, **how) for file in data)
     read = reduce(Measured.joined, others, first)
     files = new_case.files_for(read, case.parent, equation)

@@ -6,6 +6,7 @@ import codecs
 import csv
 import io
 import stat
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, islice
@@ -98,11 +99,69 @@ def read_csv(
         No such file or column; text or infinity in a channel; times that do not increase. The
         message names file, row (the header is row 1) and column.
     """
-    path, decimals = Path(path), table.decimal_marks(columns)
-    needed = list(dict.fromkeys([*clock.names, *decimals]))
+    path = Path(path)
+    needed = [*clock.names, *table.decimal_marks(columns)]
+    rows, cells = texts_of(path, needed, separator, encoding, clock, skip)
+    return _to_table(path, rows, cells, columns, clock, every, missing)
+
+
+def read_long_csv(
+    path: str | Path,
+    columns: Mapping[str, table.Column],
+    clock: Clock,
+    long: tuple[str, str],
+    *,
+    every: int = 1,
+    missing: Missing = (),
+    separator: str = ",",
+    encoding: str = UTF_8,
+    skip: int = 0,
+) -> list[table.DataTable]:
+    """Read channels from a CSV file with a row for each reading (long format), as a table each.
+
+    Parameters
+    ----------
+    columns
+        Channel -> its sensor, as a column with this name.
+    long
+        Columns that contain the names of the sensors, and their values.
+    clock, every, missing, separator, encoding, skip
+        As for `read_csv`.
+
+    Raises
+    ------
+    DataError
+        As `read_csv`; no row of a sensor.
+    """
+    path, (named, valued) = Path(path), long
+    rows, cells = texts_of(path, [*clock.names, named, valued], separator, encoding, clock, skip)
+    places: defaultdict[str, list[int]] = defaultdict(list)
+    for k, name in enumerate(cells[named]):
+        places[name.strip()].append(k)
+    found = []
+    for channel, column in columns.items():
+        (name,) = column.names
+        if name not in places:
+            text = f"{path}, column '{named}': there is no sensor '{name}'"
+            raise SampleError(f"{text}{table.hint(name, list(places))}")
+        own = places[name]
+        texts = {time: tuple(cells[time][k] for k in own) for time in clock.names}
+        texts[name] = tuple(cells[valued][k] for k in own)
+        lines = [rows[k] for k in own]
+        found.append(_to_table(path, lines, texts, {channel: column}, clock, every, missing))
+    return found
+
+
+def texts_of(
+    path: Path, needed: Sequence[str], separator: str, encoding: str, clock: Clock, skip: int
+) -> tuple[list[int], dict[str, tuple[str, ...]]]:
+    """Return the numbers of the rows of a CSV file, and the texts in some columns.
+
+    Raises `DataError`.
+    """
     try:
         _check_text(path)
-        rows, cells = _cells(path, needed, separator, encoding, clock, skip)
+        rows, cells = _cells(path, [*dict.fromkeys(needed)], separator, encoding, clock, skip)
     except FileNotFoundError:
         raise table.no_file(path) from None
     except UnicodeError as error:
@@ -111,6 +170,20 @@ def read_csv(
         raise DataError(f"{path} cannot be read as a CSV file: {error}.") from error
     if not rows:
         raise DataError(f"{path}: has no rows below its header.")
+    return rows, cells
+
+
+def _to_table(
+    path: Path,
+    rows: Sequence[int],
+    cells: Mapping[str, Sequence[str]],
+    columns: Mapping[str, table.Column],
+    clock: Clock,
+    every: int,
+    missing: Missing,
+) -> table.DataTable:
+    """Return the channels in the texts of numbered rows."""
+    decimals = table.decimal_marks(columns)
     stamps = [" ".join(parts) for parts in zip(*(cells[name] for name in clock.names), strict=True)]
     times, dates = read_times(stamps, clock, lambda k: f"{path}, row {rows[k]}, column")
 

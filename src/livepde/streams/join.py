@@ -18,6 +18,7 @@ from livepde.stepping import Between
 from livepde.streams.table import DataTable
 
 EARLY = "early"  # kind of the remark on readings before another file begins
+PAUSE = 5.0  # usual intervals, beyond which readings are far apart
 SAME = 1e-10  # of the whole time: times that differ by less are one moment
 
 
@@ -30,6 +31,7 @@ def join_tables(
     between: Mapping[str, Between] | None = None,
     *,
     together: bool,
+    profile: Collection[str] = (),
 ) -> DataTable:
     """Merge the rows of several tables in order of time; absent channels are missing values.
 
@@ -43,6 +45,8 @@ def join_tables(
     `where`: name of the data, for messages.
     `between`: channel -> how it behaves between two readings; a line if it is left out.
     `together`: the tables of sensors must have begun, too.
+    `profile`: sensors that an initial profile is made of. In the first row they have the value on
+    the line between their readings before and after it, unless these are far apart.
     Raises `DataError`: some times are dates and some numbers; or the tables have no time in common.
     """
     times, first = _on_one_clock(tables, second, where)
@@ -59,9 +63,11 @@ def join_tables(
     begin = int(usable.argmax())
     kinds: Any = np.array([between.get(name, "line") for name in names])
     # A run needs each input at its start, where a slower logger may have no row.
-    for k in np.flatnonzero(~sensed & ~known[begin] & known.any(axis=0)):
+    opened = ~sensed | joined.columns.isin(list(profile))
+    for k in np.flatnonzero(opened & ~known[begin] & known.any(axis=0)):
         at = known[:, k]
-        values[begin, k] = _opening(t[begin], t[at], values[at, k], kinds[k])
+        if not sensed[k] or _is_amid(t[begin], t[at]):
+            values[begin, k] = _opening(t[begin], t[at], values[at, k], kinds[k])
     inputs = values[begin:, [names.index(name) for name in needed]]
     kept = np.isfinite(inputs).all(axis=1)
     if not kept.any():
@@ -134,6 +140,12 @@ def not_late(
             t, own = np.append(table.t[:1], t), np.vstack([np.full((1, 1), np.nan), own])
         found.append(replace(table, t=t, values=own, names=(name,), remarks={}))
     return found
+
+
+def _is_amid(t: float, times: Array) -> bool:
+    """Return whether a time is between two of several, which are not far apart."""
+    k, steps = int(np.searchsorted(times, t)), np.diff(times)
+    return bool(0 < k < len(times) and steps[k - 1] <= PAUSE * np.median(steps))
 
 
 def _opening(t: float, times: Array, values: Array, between: Between) -> float:

@@ -504,6 +504,8 @@ def _disorder(where: str, t: float, last: float, clock: Clock | None) -> TimeOrd
     how, remedy = "earlier than the one before", "sort the rows."
     if t == last:
         how, remedy = "that of the one before", "drop repeated rows."
+        if clock is not None:
+            remedy += " If each row is a reading of one sensor, set `data.sensor` and `data.value`."
     if clock is not None and clock.zone is UTC and last - t <= HOUR * clock.second:
         zone = "`data.zone`, such as 'Europe/Berlin'"
         remedy += f" If clocks were set back here, set {zone}."
