@@ -18,14 +18,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from livepde.cases.case_channels import columns_of, interpolates
 from livepde.cases.case_content import CaseContent, check_options, load_code, own_code
-from livepde.cases.schema import (
-    SENSORS,
-    BrokerSpec,
-    CaseSpec,
-    DataSpec,
-    FileSpec,
-    NodesSpec,
-)
+from livepde.cases.data_schema import BrokerSpec, DataSpec, FileSpec, NodesSpec
+from livepde.cases.schema import SENSORS, CaseSpec
 from livepde.cases.values import MissingValue
 from livepde.dates import since_1970
 from livepde.errors import CaseError

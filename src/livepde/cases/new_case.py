@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from livepde.cases import schema as tables
+from livepde.cases.data_schema import DataSpec
 from livepde.cases.measured import Measured, measured
 from livepde.cases.read import BLANK, beside, toml_line
-from livepde.cases.schema import CaseSpec, DataSpec
+from livepde.cases.schema import CaseSpec
 from livepde.errors import RunError
 from livepde.linalg import Array
 from livepde.models import EQUATIONS, Equation, Variable

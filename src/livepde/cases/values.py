@@ -1,4 +1,4 @@
-"""Types of single values in a case file, as pydantic reads them and the JSON schema has them."""
+"""Types of tables and values in a case file, as pydantic reads them and the JSON schema has them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,26 @@ from contextlib import suppress
 from datetime import date, datetime
 from typing import Annotated, Any, TypeAlias
 
-from pydantic import AfterValidator, BeforeValidator, Field, GetJsonSchemaHandler, WithJsonSchema
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetJsonSchemaHandler,
+    WithJsonSchema,
+)
 from pydantic_core import CoreSchema
 
 from livepde.diagnostics.check_report import Bound, Sense
 from livepde.streams.cells import number_of
 from livepde.streams.clock import ELAPSED
+
+
+class Spec(BaseModel):
+    """A table of the case file: unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=False)
 
 
 def _quantity(value: Any) -> Any:
