@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.cases import schema as tables
+from livepde.cases import data_schema, schema
 from livepde.cases.data_schema import DataSpec
 from livepde.cases.measured import Measured, measured
 from livepde.cases.read import BLANK, beside, toml_line
@@ -36,16 +36,17 @@ MEANINGS: dict[str, dict[str, str]] = tomllib.loads(
 
 def case_schema() -> dict[str, Any]:
     """Return the JSON schema of a case file, with the meaning and the default of each key."""
-    schema = CaseSpec.model_json_schema(by_alias=True)
-    for name, table in [("CaseSpec", schema), *schema["$defs"].items()]:
+    found = CaseSpec.model_json_schema(by_alias=True)
+    tables = vars(data_schema) | vars(schema)
+    for name, table in [("CaseSpec", found), *found["$defs"].items()]:
         summary, meanings = documented(table.get("description", ""))
         table["description"] = summary
-        for base in reversed(getattr(tables, name).__mro__):
+        for base in reversed(tables[name].__mro__):
             meanings |= MEANINGS.get(base.__name__, {})
         for key, value in table["properties"].items():
             if key in meanings:
                 value["description"] = meanings[key]
-    return {"$schema": DIALECT, **schema, "title": "A case of livepde"}
+    return {"$schema": DIALECT, **found, "title": "A case of livepde"}
 
 
 @cache

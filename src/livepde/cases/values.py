@@ -1,4 +1,4 @@
-"""Types of tables and values in a case file, as pydantic reads them and the JSON schema has them."""
+"""Types of tables and values in a case file, as pydantic reads them and a JSON schema has them."""
 
 from __future__ import annotations
 
