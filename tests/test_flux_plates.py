@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,16 @@ from factories import observe, rates
 
 import livepde as lp
 from benchmarks import first_hour
-from livepde.cases import load
+from livepde.cases import case_channels, load
+from livepde.cases.new_case import write_template
+from livepde.cases.remedies import freed
 from livepde.errors import CaseError, ObservationError
 from livepde.fem import Inputs, Moment
 from livepde.laws.shadow_kinds import HalvedMesh
-from livepde.models import conduction
+from livepde.models import EQUATIONS, conduction
 from livepde.observation import Combined, FluxPlates
 from livepde.runs.summary import LAYERS, SURFACES, resistance, tables
+from livepde.verdict import Cause
 from livepde.verdict.model_errors import Allowed, ModelErrors
 
 REPORTS = Path(__file__).parent / "reports"
@@ -179,7 +183,8 @@ FISHER = [
     ("changes", "text"),
     [
         ([('at = "left", noise', "noise")], "needs at = the name of an end"),
-        ([('at = "left", noise', 'at = "left", offset = "1 K", noise')], "offset is not possible"),
+        ([('at = "left", noise', 'at = "left", at_std = "1 mm", noise')], "at_std is not possible"),
+        ([("[channels]", '[law]\nnoise = "0.1 K"\n[channels]')], "q measures a flux. Leave it out"),
         ([('at = "left", noise', 'at = "top", noise')], "channels.q.at"),
         ([('role = "sensor"', 'role = "input"')], "requires a sensor"),
         ([('noise = "0.3 W/m^2"', 'noise = "0.3 K"')], "channels.q.noise"),
@@ -217,6 +222,27 @@ def test_a_scale_of_the_plate_may_be_unknown(tmp_path: Path) -> None:
     estimate = prepared.identifier.run(prepared.stream).last
     assert estimate is not None
     assert estimate["gain[q]"].std == pytest.approx(0.03, rel=0.05)
+
+
+def test_an_offset_of_the_plate_may_be_unknown(tmp_path: Path) -> None:
+    first_hour.write(tmp_path, "wall")
+    stated = ('at = "left", noise', 'at = "left", offset = "2 W/m^2", noise')
+    assert case_channels.unknowns_of(load(case(tmp_path, stated)))["offset"].unit == "W/m^2"
+    note = Cause("offset", "q", "", size=1.0)
+    assert freed(load(case(tmp_path)).prepare(), note) == ('channels.q.offset="2 W/m^2"',)
+    assert not freed(load(case(tmp_path)).prepare(), Cause("position", "q", "", size=0.01))
+    sensor = 'T_mid = { role = "sensor", column = "T_inside", at = 0.1, offset = "1 K", noise = 1 }'
+    with pytest.raises(CaseError, match="all share one prior"):
+        load(case(tmp_path, stated, ("[channels]", f"[channels]\n{sensor}")))
+
+
+def test_init_opens_the_noise_of_each_kind_of_sensor(tmp_path: Path) -> None:
+    table = tmp_path / "wall.csv"
+    table.write_text("time_s,T_in [degC],q [W/m2]\n0,20,5\n60,20,6\n120,21,5\n")
+    write_template(tmp_path / "new", table, EQUATIONS["conduction"])
+    text = (tmp_path / "new" / "case.toml").read_text()
+    assert text.count('noise = "? K"') == text.count('noise = "? W/m^2"') == 1
+    assert "law" not in tomllib.loads(text)
 
 
 # --- R and U -------------------------------------------------------------------------------------

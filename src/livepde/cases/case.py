@@ -525,6 +525,11 @@ def _chosen(kind: type[Options], given: bool | Options) -> Options | None:
 def _noise(case: CaseContent, spec: SensitivitySpec) -> float | str | None:
     """Return the noise of the law, which needs it here or from every sensor."""
     if spec.noise is not None and spec.noise != "auto":
+        if plates := [name for name, item in case.roles("sensor").items() if item.is_flux]:
+            text = (
+                f"is the noise of all sensors, but {plates[0]} measures a flux. Leave it out, and "
+            )
+            raise case.error("law.noise", text + "state the `noise` of every sensor.")
         return case.positive(spec.noise, case.equation.state.unit, "law.noise")
     if case_channels.noise_of(case) is None:
         if spec.noise == "auto":

@@ -562,8 +562,14 @@ def unknowns_of(case: CaseContent) -> dict[str, fem.Unknown]:
     # Differences of a temperature are in K.
     unit = "K" if state == "degC" else state
     if offsets := _stated(case, "offset", "sensor"):
+        first, *others = map(case.unit, offsets)
+        for name, other in zip(list(offsets)[1:], others, strict=True):
+            if other != first:
+                text = f"is in {other}, and other offsets are in {first}; all share one prior."
+                raise case.error(f"channels.{name}.offset", text)
         prior = fem.Normal(0.0, _common(case, offsets, "offset"))
-        found["offset"] = fem.Scalars(tuple(offsets), prior, unit=unit)
+        own = unit if first == state else first
+        found["offset"] = fem.Scalars(tuple(offsets), prior, unit=own)
     # A gain is a factor without a unit, 1 for an exact sensor.
     if gains := _stated(case, "gain", "sensor"):
         found["gain"] = fem.Scalars(tuple(gains), fem.Normal(1.0, _common(case, gains, "gain")))

@@ -19,7 +19,7 @@ from livepde.cases import data_schema, schema
 from livepde.cases.data_schema import DataSpec
 from livepde.cases.measured import Measured, measured
 from livepde.cases.read import BLANK, beside, toml_line
-from livepde.cases.schema import CaseSpec
+from livepde.cases.schema import FLUX, CaseSpec
 from livepde.errors import RunError
 from livepde.linalg import Array
 from livepde.models import EQUATIONS, Equation, Variable
@@ -72,6 +72,7 @@ LAST = re.compile(r"_(?P<unit>[A-Za-z][A-Za-z0-9]*)$")  # T_air_degF
 NO_UNITS = {*string.ascii_letters, "in"}  # at the end of a sensor's name: T_K, T_in
 NUMBERED = re.compile(r"(.*?)(\d+)")  # u_17
 PLACES = "places.csv"  # the table of positions that is written beside the case
+NOISE = "standard deviation of a single reading"
 FAMILY = 8  # so many numbered columns become one line of [channels]
 HEAD = """\
 #:schema ./livepde.schema.json
@@ -121,6 +122,9 @@ def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
     if equation.spacing == "geometric" and table.samples.origin is None and first > 0.0:
         data["t0"] = _open(table.time_unit)
         told.append("t0: when the process began, at rest")
+    # Without a flux among the sensors, one noise is that of all.
+    mixed = any(item.given.get("quantity") == FLUX for item in found)
+    found = [_with_noise(equation, item, noise) for item in found] if mixed else found
     lines = [
         *_top(table, equation, given),
         *_inline("mesh", _mesh(equation)),
@@ -128,14 +132,25 @@ def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
         *_contents(table),
         *_unknowns(equation, given),
         *_constants(found),
-        *_inline("law", {"noise": noise}, "standard deviation of a single reading"),
+        *_inline("law", {} if mixed else {"noise": noise}, NOISE),
         *_steps(table, equation),
         "",
         "[channels]",
-        *_channels(equation, found),
+        *_channels(
+            equation, [_with_noise(equation, one, noise) if mixed else one for one in found]
+        ),
     ]
     text = "\n".join(lines)
     return f"{HEAD.format(case=folder / 'case.toml')}{OPEN}{text}\n"
+
+
+def _with_noise(equation: Equation, item: FoundChannel, noise: str) -> FoundChannel:
+    """Return a channel; if it is a sensor, with its own noise."""
+    if not item.is_sensor:
+        return item
+    if equation.fluxes and item.given.get("quantity") == FLUX:
+        noise = _open(equation.fluxes.flux)
+    return replace(item, given={**item.given, "noise": noise})
 
 
 def _open(unit: str, number: str = BLANK) -> str:
@@ -400,7 +415,7 @@ def _sensor(equation: Equation, key: str, column: str, name: str, values: Array)
     stated = unit.removeprefix(BLANK).strip()
     flux = equation.fluxes.flux if equation.fluxes and equation.conductivity else ""
     if unit.startswith(BLANK) and flux and converts(stated, flux):
-        given["quantity"] = "flux"
+        given["quantity"] = FLUX
         told.append('flux along x, at an end: at = "left" or "right"')
         given |= {"unit": stated} if conversion(stated, flux, name) != Affine() else {}
         return FoundChannel(key, given, (column,), ", ".join(told))

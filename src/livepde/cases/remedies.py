@@ -208,10 +208,13 @@ def _of_sensor(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     channel = channels.get(cause.subject)
     if channel is None:
         return _stated(case, cause)
-    if getattr(channel, key) is not None or (key == "at_std" and not channel.is_point):
+    placed = channel.is_point and not channel.is_flux
+    if getattr(channel, key) is not None or (key == "at_std" and not placed):
         return ()
-    others = (getattr(item, key) for item in channels.values())
-    given = next((value for value in others if value is not None), None)
+    others = {name: value for name, item in channels.items() if (value := getattr(item, key))}
+    if key == "offset" and any(case.unit(name) != case.unit(cause.subject) for name in others):
+        return ()  # all offsets share one prior
+    given = next(iter(others.values()), None)
     if given is None:
         given = _usual_std(prepared, cause)
     if given is None:

@@ -268,7 +268,7 @@ class ChannelSpec(Spec):
             raise ValueError(
                 'quantity = "flux" needs at = the name of an end, as "left", or a position'
             )
-        keys = {"offset", "correlated", "at_std", "of", "component", "time_constant"}
+        keys = {"correlated", "at_std", "of", "component", "time_constant"}
         if own := keys & self.model_fields_set:
             raise ValueError(f'{own.pop()} is not possible with quantity = "flux": leave it out')
         return self

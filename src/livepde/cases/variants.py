@@ -616,7 +616,9 @@ def _sensors(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     # All positions share one prior, which is plausible for each of them.
     shifts = [usual_shift(prepared, name) for name in prepared.case.sensors]
     for kind, size in (("offset", _usual_error(base)), ("position", min(shifts, default=math.nan))):
-        causes = [Cause(kind, name, "", size=size) for name in prepared.case.sensors]
+        # Errors of the state say nothing about plates, which measure a flux.
+        sensors = [n for n, one in prepared.case.roles("sensor").items() if not one.is_flux]
+        causes = [Cause(kind, name, "", size=size) for name in sensors]
         settings = [setting for cause in causes for setting in freed(prepared, cause)]
         if settings and len(causes) > 1:
             yield Variant(f"{kind}s of all sensors", tuple(settings))
