@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -264,6 +265,17 @@ def test_an_unknown_over_orders_of_magnitude_has_a_logarithmic_axis() -> None:
     data["k"][0] = 300.0
     data["k_low"], data["k_high"] = data["k"] / 2.0, 2.0 * data["k"]
     assert panel(plots.overview(data), "k").get_yscale() == "log"
+
+
+@pytest.mark.parametrize("span", [200.0, 4 * 3600.0, 4 * DAY, 1400 * DAY])
+def test_dates_of_any_span_have_ticks(span: float) -> None:
+    data = dataset(span=span, unit="s").assign_attrs(origin="2024-10-25 06:00:00")
+    ax = plots.style.panel(None)
+    ax.plot(plots.style.time_values(data, data["time"].values), data["time"].values)
+    plots.style.time_axis(ax, data)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of a locator that finds no interval
+        assert 3 <= len(ax.get_xticks()) <= 8
 
 
 # --- measured and expected -----------------------------------------------------------------------

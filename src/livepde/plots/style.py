@@ -230,7 +230,8 @@ def time_axis(ax: Axes, data: xr.Dataset) -> None:
         import matplotlib.dates
 
         dates: Any = matplotlib.dates  # has no types
-        locator = dates.AutoDateLocator(maxticks=7)
+        # With its default of 5 ticks at least, no interval suits 3 to 5 days, hours or minutes.
+        locator = dates.AutoDateLocator(minticks=3, maxticks=7)
         ax.xaxis.set_major_locator(locator)
         ax.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
 
