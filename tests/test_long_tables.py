@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pandas as pd
@@ -12,6 +14,7 @@ from typer.testing import CliRunner
 from livepde.cases import load
 from livepde.cli import app
 from livepde.errors import CaseError, DataError
+from livepde.runs import input_findings
 
 CASE = """\
 equation = "heat"
@@ -104,3 +107,11 @@ def test_what_cannot_be_read_is_said(tmp_path: Path) -> None:
         read(tmp_path, long.replace({"name": {"hot": "hot2"}}), LONG)
     with pytest.raises(CaseError, match="sensor and value are two columns"):
         read(tmp_path, long, ', sensor = "name"')
+
+
+def test_a_note_calls_a_sensor_a_sensor() -> None:
+    counts = {("early", "T_1"): 1, ("interpolated", "hot"): 2}
+    journal: Any = MagicMock(counts=counts, __len__=lambda _: 9)
+    first, second = (found.text for found in input_findings(journal, ["hot"]))
+    assert first == "Input hot: 2 missing values were interpolated."
+    assert second.startswith("Sensor T_1: 1 first values were earlier")

@@ -114,7 +114,8 @@ def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
         elif counts.get("ended"):
             sentence = FINDINGS["input, ended"]
         skip = channel_setting(name, "missing", '"skip"')
-        text, remedy = sentence.filled(name=name, counts=", ".join(parts), skip=skip)
+        what = "Input" if name in driving else "Sensor"
+        text, remedy = sentence.filled(kind=what, name=name, counts=", ".join(parts), skip=skip)
         found.append(Finding("input", "note", text, name, held, remedy=remedy))
     return found
 

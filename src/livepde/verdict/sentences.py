@@ -202,12 +202,12 @@ FINDINGS: dict[str, Sentence] = {
         "The effect on the estimates is unknown.",
         "Interpolate {name} where the next value is known, or sample it more often.",
     ),
-    "input, counts": Sentence("Input {name}: {counts}."),
+    "input, counts": Sentence("{kind} {name}: {counts}."),
     "input, bridged": Sentence(
-        "Input {name}: {counts}.", "To leave out the rows in the gaps of {name}, set `{skip}`."
+        "{kind} {name}: {counts}.", "To leave out the rows in the gaps of {name}, set `{skip}`."
     ),
     "input, ended": Sentence(
-        "Input {name}: {counts}.", "To end the run at the last value of {name}, set `data.stop`."
+        "{kind} {name}: {counts}.", "To end the run at the last value of {name}, set `data.stop`."
     ),
     "start, missed": Sentence(
         "The first readings miss the stated initial state by {missed} (root mean square).",
@@ -360,7 +360,7 @@ LIKELY: dict[str, Sentence] = {
     ),
     "exchange": Sentence(
         "the columns {name} and {other} may be exchanged",
-        "Exchange the columns {name} and {other}.",
+        "Check the columns of {name} and {other}. If they are exchanged, correct the case.",
     ),
     "disagreement": Sentence(
         "{name} may be at another position, or measure another quantity, than configured"
