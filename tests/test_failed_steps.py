@@ -202,3 +202,11 @@ def test_members_keep_what_holds_though_their_step_fails():
     assert fleet.identifier(0).step(0.9, [math.nan, math.nan]).u == pytest.approx(
         alone.step(0.9, [math.nan, math.nan]).u
     )
+
+
+def test_a_singular_step_says_its_remedy_once():
+    text = "The 3 by 3 matrix is singular: check the model's forms, or take a smaller time step."
+    assert str(numerical(LinearAlgebraError(text))) == (
+        "singular: The 3 by 3 matrix is singular. Check the model's forms at the current estimate, "
+        "or reduce `dt_max`."
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -332,7 +333,8 @@ def numerical(error: Exception) -> Status | None:
     if isinstance(error, StepFailed):
         return Status.of(error)
     if isinstance(error, LinearAlgebraError | np.linalg.LinAlgError | ZeroDivisionError):
-        return Status("singular", text)
+        # A status has its remedy, which a solver words as "check the model's forms".
+        return Status("singular", re.split(r"[:.] check", text, flags=re.IGNORECASE)[0])
     if isinstance(error, RuntimeError) and "singular" in text:
         return Status("singular", text)
     # SciPy says "array must not contain infs or NaNs".
