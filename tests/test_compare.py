@@ -742,6 +742,7 @@ channels.T = { role = "sensor", column = "T", quantity = "fluid" }
     [
         (0, 72, "caution", 'grouted_borehole".*: `data.assimilate_from="27 h"`. Check the clock'),
         (0, 50, "caution", 'grouted_borehole"` contains. Check'),  # 27 h is more than half of it
+        (25, 72, "caution", 'grouted_borehole"` contains. Check'),  # nearly as late
         (30, 72, "do not trust", 'grouted_borehole"` contains. Check'),  # begins later already
         (0, 72, "trusted", "^Check the clock"),
     ],

@@ -93,10 +93,12 @@ def later_start(prepared: Prepared) -> str:
     }
     after = case.equation.settles({**case.options, **priors}, float(case.mesh.p[0].min()))
     begin, end = prepared.t0, float(table.t[-1])
-    if not prepared.assimilate_from < begin + after < 0.5 * (begin + end):
+    # A start that is nearly as late already gains nothing.
+    if not 1.2 * prepared.assimilate_from < begin + after < 0.5 * (begin + end):
         return ""
-    hours = conversion(case.equation.time_unit, "h", "a later start").factor * (begin + after)
-    return f"data.assimilate_from={toml_value(f'{hours:.2g} h')}"
+    seconds = conversion(case.equation.time_unit, "s", "a later start").factor * (begin + after)
+    unit, length = ("h", 3600.0) if seconds >= 3600.0 else ("s", 1.0)
+    return f"data.assimilate_from={toml_value(f'{seconds / length:.2g} {unit}')}"
 
 
 def after_gaps(verdict: Verdict, inputs: Iterable[Finding]) -> Verdict:
