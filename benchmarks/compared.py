@@ -20,8 +20,10 @@ from benchmarks.first_hour import FOLDER, TABLES, save
 from benchmarks.jobs import each
 from benchmarks.wrong_channels import FAULTS, Fault, with_fault
 from livepde.cases import load
+from livepde.cases.proposals import proposed
 from livepde.cases.read import parse
-from livepde.cases.variants import AS_STATED, Variant, proposed, recommended, run_variant
+from livepde.cases.recommendation import recommended
+from livepde.cases.variants import AS_STATED, Variant, run_variant
 from livepde.diagnostics.check_report import Check, Table
 from livepde.runs import Outcome
 

@@ -17,10 +17,11 @@ import livepde as lp
 from livepde import cases
 from livepde.cases.new_case import write_template
 from livepde.cases.preview import Preview, preview
+from livepde.cases.proposals import proposed
 from livepde.cases.read import parse
 from livepde.cases.remedies import with_intervals
 from livepde.cases.schema import SensitivitySpec
-from livepde.cases.variants import Variant, VariantRun, proposed
+from livepde.cases.variants import Variant, VariantRun
 from livepde.fem import Inputs, Moment
 from livepde.runs import checks_of, drive, measures, tables
 from livepde.units import convert

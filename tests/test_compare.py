@@ -19,18 +19,11 @@ from factories import short_rod
 from benchmarks.first_hour import FOLDER
 from livepde import cases
 from livepde.cases.case import with_members
+from livepde.cases.proposals import proposed
 from livepde.cases.read import _with, apply, filled, parse, read_toml
+from livepde.cases.recommendation import conclusions, recommended
 from livepde.cases.remedies import NO_SETTING, freed, with_settings
-from livepde.cases.variants import (
-    LastEstimate,
-    Variant,
-    VariantRun,
-    conclusions,
-    proposed,
-    recommended,
-    run_variant,
-    variant_of,
-)
+from livepde.cases.variants import LastEstimate, Variant, VariantRun, run_variant, variant_of
 from livepde.errors import CaseError
 from livepde.verdict import Cause, Finding, ModelErrors, Verdict
 from livepde.verdict.sentences import estimating

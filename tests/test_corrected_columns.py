@@ -10,8 +10,9 @@ import pytest
 from factories import short_rod
 
 from livepde import cases
+from livepde.cases.recommendation import recommended
 from livepde.cases.remedies import with_settings
-from livepde.cases.variants import GAINED, Variant, recommended, run_variant
+from livepde.cases.variants import GAINED, Variant, run_variant
 from livepde.errors import CaseError
 from livepde.samples import noise_channel
 from livepde.verdict import Cause, Finding, Verdict

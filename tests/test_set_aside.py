@@ -11,8 +11,9 @@ import pytest
 from benchmarks.first_hour import FOLDER, TABLES, save
 from benchmarks.wrong_channels import Fault, with_fault
 from livepde.cases.case import load
+from livepde.cases.proposals import proposed
 from livepde.cases.set_aside import _Sensor
-from livepde.cases.variants import AS_STATED, Variant, proposed, run_variant
+from livepde.cases.variants import AS_STATED, Variant, run_variant
 from livepde.verdict import Verdict
 
 T = np.arange(200.0)

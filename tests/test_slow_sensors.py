@@ -14,9 +14,10 @@ from factories import ROD_CASE
 
 import livepde as lp
 from livepde import cases
+from livepde.cases.proposals import proposed
 from livepde.cases.read import parse
 from livepde.cases.remedies import freed, with_settings
-from livepde.cases.variants import Variant, VariantRun, proposed
+from livepde.cases.variants import Variant, VariantRun
 from livepde.errors import (
     CaseError,
     ConfigurationError,

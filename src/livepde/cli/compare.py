@@ -20,18 +20,10 @@ from threadpoolctl import threadpool_limits
 from livepde import runs
 from livepde.atomic_write import write_bytes
 from livepde.cases.case import with_members
+from livepde.cases.proposals import MOST, proposed
 from livepde.cases.read import filled, parse, read_text
-from livepde.cases.variants import (
-    AS_STATED,
-    MOST,
-    Variant,
-    VariantRun,
-    conclusions,
-    proposed,
-    recommended,
-    run_variant,
-    variant_of,
-)
+from livepde.cases.recommendation import conclusions, recommended
+from livepde.cases.variants import AS_STATED, Variant, VariantRun, run_variant, variant_of
 from livepde.cli.options import (
     CodeOption,
     DataOption,

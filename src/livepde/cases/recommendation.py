@@ -1,0 +1,162 @@
+"""Which variant of a case is recommended, and sentences on it and the others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+
+from livepde.cases.variants import GAINED, VariantRun
+
+WORSE = 0.02  # share by which the error of validation sensors may grow: about its own error
+USABLE = ("trusted", "caution")
+
+
+def recommended(base: VariantRun, others: Sequence[VariantRun]) -> VariantRun:
+    """Return the variant with the best evidence that predicts the validation sensors no worse.
+
+    Among variants of similar evidence it is the one with the fewest unknowns, and a usable one goes
+    first. It is the case itself if none has strong evidence against it, or if none of those can be
+    used and it can. Variants of similar evidence that exclude its estimates are its rivals: which
+    one is right the data cannot tell, as a scale of one of two sensors. Variants that cannot be
+    used may yet explain the data better: then the recommended one is not trusted, as it lacks
+    something, too.
+    """
+    ahead = _ahead(base, others)
+    if not ahead:
+        return base
+    usable = [one for one in ahead if one.level in USABLE]
+    if not usable:
+        usable = [base] if base.level in USABLE else ahead
+    best = usable[0].gained(base)
+    near = [one for one in usable if one.gained(base) > best - GAINED]
+    chosen = min(near, key=lambda one: (one.unknowns, -one.gained(base)))
+    rivals = [one for one in near if one.apart(chosen)]
+    better = tuple(one.variant.name for one in ahead if one.gained(base) > best + GAINED)
+    found = chosen.beside(rivals) if rivals else chosen
+    return replace(found, better=better) if better else found
+
+
+def _ahead(base: VariantRun, others: Sequence[VariantRun]) -> list[VariantRun]:
+    """Return variants with strong evidence and no worse predictions, the best first."""
+    strong = (one for one in others if one.gained(base) > GAINED)
+    sound = (one for one in strong if not (_worse_sensors(one, base) or one.failed > base.failed))
+    return sorted(sound, key=lambda one: one.gained(base), reverse=True)
+
+
+def _worse_sensors(one: VariantRun, base: VariantRun) -> list[str]:
+    """Return both errors of the validation sensors that a run predicts worse, or not at all."""
+    return [
+        f"{name} {own:.3g} instead of {error:.3g}"
+        for name, error in base.validation.items()
+        if math.isfinite(error)
+        and not (own := one.validation.get(name, math.nan)) <= error * (1.0 + WORSE)
+    ]
+
+
+def conclusions(base: VariantRun, others: Sequence[VariantRun]) -> list[str]:
+    """Return sentences on the recommendation, and on what other variants disagree about."""
+    best = recommended(base, others)
+    remarks = _remarks(base, best, [one for one in others if not one.error])
+    text = _recommendation(base, best)
+    if math.isnan(base.log_evidence):
+        text = (
+            "Variants are not ranked: this case has no log evidence (its law has no covariance). "
+            "The case is kept unchanged."
+        )
+        remarks = iter(())
+    failed = _names_of(one for one in others if one.error)
+    why = [f"Not compared, because they failed: {failed}."] if failed else []
+    equals = (*_equals(best, others), *_better(best, base, others))
+    return [text, *equals, *why, *remarks, *_disagreements(best, [base, *others])]
+
+
+def _recommendation(base: VariantRun, best: VariantRun) -> str:
+    if best.variant == base.variant:
+        which = " that predicts the validation sensors as well" if base.validation else ""
+        usable = "usable " if best.better else ""
+        return (
+            f"Recommended: the case, unchanged. No {usable}variant{which} gains more than "
+            f"{GAINED:g} of log evidence."
+        )
+    text = (
+        f"Recommended: '{best.variant.name}'. Its log evidence is {best.gained(base):.4g} larger "
+        f"than that of the case, and its verdict '{best.level}'."
+    )
+    if math.isfinite(base.validation_error):
+        errors = f"{best.validation_error:.3g} instead of {base.validation_error:.3g}"
+        text += f" Its error at the validation sensors is {errors}."
+    else:
+        text += " No validation sensor confirms it."
+    if best.level not in USABLE:
+        text += " Do not use its estimates: no variant explains the data."
+    return text
+
+
+def _equals(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
+    """Iterate over sentences on the rivals of the recommended variant."""
+    if not best.rivals:
+        return
+    names = ", ".join(f"'{name}'" for name in best.rivals)
+    own = next(one for one in others if one.variant == best.variant)
+    rivals = [one for one in others if one.variant.name in best.rivals]
+    differ = ", ".join(dict.fromkeys(name for one in rivals for name in own.apart(one)))
+    yield (
+        f"These data cannot distinguish it from {names}, with other values of {differ}. The "
+        "intervals of the recommended variant contain theirs. A run of it alone has narrower "
+        "intervals: find out which variant is right before you use them."
+    )
+
+
+def _better(best: VariantRun, base: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
+    """Iterate over the sentence on variants that explain the data better, but cannot be used."""
+    if not best.better:
+        return
+    names = ", ".join(f"'{name}'" for name in best.better)
+    first = next(one for one in others if one.variant.name == best.better[0])
+    more = first.gained(base) - best.gained(base)
+    yield (
+        f"The data fit {names} better, by up to {more:.4g} of log evidence, but those estimates "
+        f"cannot be used (verdict '{first.level}'). The recommended variant is thus not the whole "
+        "explanation: look for another cause before you use its estimates."
+    )
+
+
+def _remarks(base: VariantRun, best: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
+    """Iterate over variants with better evidence and worse predictions, and refuted ones."""
+    for one in others:
+        if one.gained(base) > GAINED and (worse := _worse_sensors(one, base)):
+            errors = ", ".join(worse)
+            yield (
+                f"'{one.variant.name}' fits the assimilated sensors better and predicts validation "
+                f"ones worse ({errors}): it is not recommended."
+            )
+    if refuted := _names_of(one for one in others if one.gained(base) < -GAINED):
+        yield f"The data contradict {refuted}: lower evidence than the case."
+    apart = [one for one in others if math.isnan(one.gained(base))]
+    if apart:
+        names = _names_of(apart)
+        yield f"The evidence of {names} is missing or counts other readings: it is not compared."
+    if best.level not in USABLE:
+        for one in (one for one in apart if one.level in USABLE):
+            yield f"'{one.variant.name}' has the verdict '{one.level}' with its readings."
+
+
+def _names_of(runs: Iterable[VariantRun]) -> str:
+    """Return the names of variants in quotes; empty without any."""
+    return ", ".join(f"'{one.variant.name}'" for one in runs)
+
+
+def _disagreements(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
+    """Iterate over unknowns that differ by more than the intervals between variants."""
+    found: dict[str, list[str]] = {}
+    shared = False
+    for one in others:
+        shared |= one is not best and not best.estimates.keys().isdisjoint(one.estimates)
+        for name in one.apart(best):
+            found.setdefault(name, []).append(one.variant.name)
+    for name, names in found.items():
+        listed = ", ".join(f"'{one}'" for one in names)
+        yield f"{name} depends on the variant: its interval in {listed} does not overlap."
+    if shared and not found and best.level in USABLE:
+        yield "All variants agree: their intervals overlap with that of the recommended one."
