@@ -19,7 +19,6 @@ from livepde.cases.new_case import write_template
 from livepde.cases.preview import Preview, preview
 from livepde.cases.proposals import proposed
 from livepde.cases.read import parse
-from livepde.cases.remedies import with_intervals
 from livepde.cases.schema import SensitivitySpec
 from livepde.cases.variants import Variant, VariantRun
 from livepde.fem import Inputs, Moment
@@ -338,14 +337,14 @@ def test_gradient_law_on_points_gets_a_note(rod):
 def test_gradient_law_has_no_intervals_and_says_which_settings_have(rod):
     path = rod(GRADIENT)
     prepared = cases.load(path).prepare()
-    settings = with_intervals(prepared.case)
+    settings = prepared.case.with_intervals
     assert settings == ("law.kind=sensitivity", "law.gain=")
     assert "with `--set law.kind=sensitivity --set law.gain=`." in prepared.case.notes[-1]
     base = VariantRun(Variant("as stated"))
     assert proposed(prepared, base) == [Variant("Kalman filter", settings)]
     other = cases.load(path, settings=parse(settings))
     assert isinstance(other.law, lp.SensitivityLaw)
-    assert not with_intervals(other)
+    assert not other.with_intervals
     noiseless = cases.load(rod((', noise = "0.05 K"', ""))).prepare()  # of one: all or none
     assert "state the `noise` of each sensor" in noiseless.case.notes[-1]
     assert not proposed(noiseless, base)

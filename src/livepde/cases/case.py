@@ -27,7 +27,6 @@ from livepde.cases.process import (
     wall_attributes,
 )
 from livepde.cases.read import apply, did_you_mean, key_path, read_spec, read_text, read_toml
-from livepde.cases.remedies import with_intervals
 from livepde.cases.schema import SENSORS, GradientSpec, SensitivitySpec
 from livepde.diagnostics.check_report import Bound, Sense
 from livepde.errors import DataError, LawError
@@ -393,7 +392,7 @@ class Case(CaseContent):
                 "The gradient law is made for observed subdomains and averages; a few noisy point "
                 "sensors mislead it. Use law.kind = 'sensitivity' for points."
             )
-        if settings := with_intervals(self):
+        if settings := self.with_intervals:
             options = " ".join(f"--set {setting}" for setting in settings)
             noise = "" if case_channels.noise_of(self) else ", and state the `noise` of each sensor"
             found.append(

@@ -45,6 +45,15 @@ class CaseContent:
         return path.stem if path.stem != "case" else path.parent.name or "case"
 
     @property
+    def with_intervals(self) -> tuple[str, ...]:
+        """Settings of a law that has intervals; empty if the law of the case has them."""
+        law = self.spec.law
+        if law.kind == "sensitivity":
+            return ()
+        own = sorted(law.model_fields_set - {"kind"})
+        return ("law.kind=sensitivity", *(f"law.{key}=" for key in own))
+
+    @property
     def constants(self) -> dict[str, float]:
         """The inputs of the equation that are constants, in its units."""
         known, given = self.equation.inputs, self.spec.inputs

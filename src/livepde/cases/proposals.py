@@ -19,7 +19,6 @@ from livepde.cases.remedies import (
     later_start,
     switching,
     usual_shift,
-    with_intervals,
 )
 from livepde.cases.variants import Variant, VariantRun
 from livepde.errors import ModelError
@@ -79,7 +78,7 @@ def _candidates(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
         yield Variant(name, settings_in(cause.setting))
     if case.spec.law.kind != "sensitivity":
         if noise_of(case):
-            yield Variant("Kalman filter", with_intervals(case))
+            yield Variant("Kalman filter", case.with_intervals)
         return
     yield from _process(prepared, base)
     yield from _layers(case)

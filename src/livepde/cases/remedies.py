@@ -168,15 +168,6 @@ def switching(case: Case, table: DataTable) -> list[str]:
     ]
 
 
-def with_intervals(case: Case) -> tuple[str, ...]:
-    """Return the settings of a law that has intervals; empty if the law of the case has them."""
-    law = case.spec.law
-    if law.kind == "sensitivity":
-        return ()
-    own = sorted(law.model_fields_set - {"kind"})
-    return ("law.kind=sensitivity", *(f"law.{key}=" for key in own))
-
-
 def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     """Return the settings that make a cause an unknown of the case; empty if none does."""
     case = prepared.case

@@ -6,16 +6,18 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import compress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from livepde.dates import origin_at, since_1970
 from livepde.errors import DataError
 from livepde.linalg import Array, Mask
 from livepde.stepping import Between
 from livepde.streams.table import DataTable
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 EARLY = "early"  # kind of the remark on readings before another file begins
 PAUSE = 5.0  # usual intervals, beyond which readings are far apart
@@ -182,6 +184,8 @@ def _outer_join(
 
     Times that fall into one interval of this width are one row, with the first table's time.
     """
+    import pandas as pd  # slow to load, and a single table needs none
+
     keys = [np.rint(t / width) for t in times]
     moments = pd.concat([pd.Series(t, index=key) for t, key in zip(times, keys, strict=True)])
     frames = [
