@@ -562,12 +562,7 @@ def unknowns_of(case: CaseContent) -> dict[str, fem.Unknown]:
     # Differences of a temperature are in K.
     unit = "K" if state == "degC" else state
     if offsets := _stated(case, "offset", "sensor"):
-        first, *others = map(case.unit, offsets)
-        for name, other in zip(list(offsets)[1:], others, strict=True):
-            if other != first:
-                text = f"is in {other}, and other offsets are in {first}; all share one prior."
-                raise case.error(f"channels.{name}.offset", text)
-        prior = fem.Normal(0.0, _common(case, offsets, "offset"))
+        prior, first = fem.Normal(0.0, _common(case, offsets, "offset")), _one_unit(case, offsets)
         own = unit if first == state else first
         found["offset"] = fem.Scalars(tuple(offsets), prior, unit=own)
     # A gain is a factor without a unit, 1 for an exact sensor.
@@ -578,15 +573,7 @@ def unknowns_of(case: CaseContent) -> dict[str, fem.Unknown]:
         names = [shift for name in stds for shift in shift_names(name, dimension)]
         prior = fem.Normal(0.0, _common(case, stds, "at_std"))
         found[POSITION] = fem.Scalars(names, prior, unit=case.equation.length_unit)
-    errors = {
-        name: (
-            case.positive(fading.std, state, f"channels.{name}.correlated.std"),
-            case.positive(fading.time, case.equation.time_unit, f"channels.{name}.correlated.time"),
-        )
-        for name, item in case.roles("sensor").items()
-        if (fading := item.correlated) is not None
-    }
-    if errors:
+    if errors := _correlated(case):
         std, time = _common(case, errors, "correlated")
         # An Ornstein-Uhlenbeck process: stationary standard deviation and correlation time.
         prior, fades = fem.Normal(0.0, std), fem.MeanReverting(time)
@@ -600,6 +587,27 @@ def unknowns_of(case: CaseContent) -> dict[str, fem.Unknown]:
         prior = _common(case, constants, "time_constant")
         unit = case.equation.time_unit
         found["time_constant"] = fem.Scalars(tuple(constants), prior, unit=unit)
+    return found
+
+
+def _one_unit(case: CaseContent, offsets: Iterable[str]) -> str:
+    """Return the unit of sensors with offsets, which share one prior."""
+    first, *others = offsets
+    for name in others:
+        if case.unit(name) != case.unit(first):
+            text = f"is in {case.unit(name)}, and other offsets are in {case.unit(first)}"
+            raise case.error(f"channels.{name}.offset", f"{text}; all share one prior.")
+    return case.unit(first)
+
+
+def _correlated(case: CaseContent) -> dict[str, tuple[float, float]]:
+    """Return standard deviation and correlation time of the errors of sensors that fade."""
+    found = {}
+    for name, item in case.roles("sensor").items():
+        if (fading := item.correlated) is not None:
+            key = f"channels.{name}.correlated"
+            std = case.positive(fading.std, case.equation.state.unit, f"{key}.std")
+            found[name] = std, case.positive(fading.time, case.equation.time_unit, f"{key}.time")
     return found
 
 

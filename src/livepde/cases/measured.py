@@ -200,28 +200,34 @@ def _readings(
     moments = list(zip(*(cells[name] for name in clock.names), strict=True))
     if not sensor and len(set(moments)) == len(moments):
         return None
-    for name in asked:
-        names = [cell.strip() for cell in cells[name]]
-        known = tuple(filter(None, dict.fromkeys(names)))
-        apart = len({*zip(names, moments, strict=True)})
-        # An hour that clocks show twice repeats some moments of a sensor.
-        if not sensor and (len(known) < 2 or apart < MOSTLY * len(moments)):
-            continue
-        values = [value] if value else [one for one in numbers if VALUED.search(one)]
-        values = values or [one for one in numbers if one != sensor]
-        if len(values) != 1:
-            raise SampleError(
-                f"{table}: each row is a reading of '{name}': set data.value to the column of "
-                f"values{', perhaps ' if values else ''}{' or '.join(values)}."
-            )
-        pairs = (
-            {*zip(names, (cell.strip() for cell in cells[other]), strict=True)}
-            for other in texts
-            if UNITS.search(other)
-        )
-        units = next((dict(pair) for pair in pairs if len(pair) == len(known)), {})
-        return _Readings(name, values[0], known, units)
-    return None
+    texts_in = {name: [cell.strip() for cell in cells[name]] for name in (*asked, *texts)}
+    name = sensor or next((one for one in asked if _names_sensors(texts_in[one], moments)), "")
+    if not name:
+        return None
+    names = texts_in[name]
+    known = tuple(filter(None, dict.fromkeys(names)))
+    pairs = ({*zip(names, texts_in[one], strict=True)} for one in texts if UNITS.search(one))
+    units = next((dict(pair) for pair in pairs if len(pair) == len(known)), {})
+    return _Readings(name, value or _valued(table, name, numbers), known, units)
+
+
+def _names_sensors(names: Sequence[str], moments: Sequence[Any]) -> bool:
+    """Return whether texts in rows of some times name the sensors of the rows."""
+    # An hour that clocks show twice repeats some moments of a sensor.
+    apart = len({*zip(names, moments, strict=True)})
+    return len(set(filter(None, names))) > 1 and apart >= MOSTLY * len(moments)
+
+
+def _valued(table: Path, sensor: str, numbers: Sequence[str]) -> str:
+    """Return the column of values of a table with a row for each reading."""
+    values = [one for one in numbers if VALUED.search(one)]
+    values = values or [one for one in numbers if one != sensor]
+    if len(values) == 1:
+        return values[0]
+    raise SampleError(
+        f"{table}: each row is a reading of '{sensor}': set data.value to the column of "
+        f"values{', perhaps ' if values else ''}{' or '.join(values)}."
+    )
 
 
 def _clock(

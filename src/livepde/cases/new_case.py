@@ -112,6 +112,28 @@ def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
     given = {item.name for item in found if item.columns and not item.is_sensor}
     # Noise is a standard deviation, a difference of temperatures: in K.
     noise = _open(equation.state.unit.replace("degC", "K"))
+    # Without a flux among the sensors, one noise is that of all.
+    mixed = any(item.given.get("quantity") == FLUX for item in found)
+    found = [_with_noise(equation, item, noise) for item in found] if mixed else found
+    lines = [
+        *_top(table, equation, given),
+        *_inline("mesh", _mesh(equation)),
+        *_data_lines(table, folder, equation),
+        *_contents(table),
+        *_unknowns(equation, given),
+        *_constants(found),
+        *_inline("law", {} if mixed else {"noise": noise}, NOISE),
+        *_steps(table, equation),
+        "",
+        "[channels]",
+        *_channels(equation, found),
+    ]
+    text = "\n".join(lines)
+    return f"{HEAD.format(case=folder / 'case.toml')}{OPEN}{text}\n"
+
+
+def _data_lines(table: Measured, folder: Path, equation: Equation) -> Iterator[str]:
+    """Yield the line of [data], with a comment on what to check."""
     data, told = _data(table, folder), list[str]()
     if len(data.get("missing", ())) > len(table.missing):
         told.append("missing: far outside the other values; check them")
@@ -122,26 +144,7 @@ def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
     if equation.spacing == "geometric" and table.samples.origin is None and first > 0.0:
         data["t0"] = _open(table.time_unit)
         told.append("t0: when the process began, at rest")
-    # Without a flux among the sensors, one noise is that of all.
-    mixed = any(item.given.get("quantity") == FLUX for item in found)
-    found = [_with_noise(equation, item, noise) for item in found] if mixed else found
-    lines = [
-        *_top(table, equation, given),
-        *_inline("mesh", _mesh(equation)),
-        *_inline("data", data, "; ".join(told)),
-        *_contents(table),
-        *_unknowns(equation, given),
-        *_constants(found),
-        *_inline("law", {} if mixed else {"noise": noise}, NOISE),
-        *_steps(table, equation),
-        "",
-        "[channels]",
-        *_channels(
-            equation, [_with_noise(equation, one, noise) if mixed else one for one in found]
-        ),
-    ]
-    text = "\n".join(lines)
-    return f"{HEAD.format(case=folder / 'case.toml')}{OPEN}{text}\n"
+    yield from _inline("data", data, "; ".join(told))
 
 
 def _with_noise(equation: Equation, item: FoundChannel, noise: str) -> FoundChannel:
@@ -396,18 +399,9 @@ def _stated(name: str, unit: str) -> str:
 
 def _sensor(equation: Equation, key: str, column: str, name: str, values: Array) -> FoundChannel:
     """Return a sensor with the place and the unit that the name of its column states."""
-    told, given = [_range(values)], {"role": "sensor", "column": column}
-    place, fraction = PLACE.search(name), FRACTION.search(name)
-    at: Any = _open(equation.length_unit)
-    if equation.dimension > 1:
-        # A name states one coordinate at most, so that the place stays open.
-        at = [at] * equation.dimension
-    elif place is not None and equation.length_unit:
-        at = f"{place[1].replace(',', '.')} {place[2]}"
-        told.append("position from the name")
-    elif fraction is not None:
-        told.append(f'at = "{fraction[0]} {equation.length_unit}"?')
-    given["at"] = at
+    at, remark = _place(equation, name)
+    told = [_range(values), *filter(None, [remark])]
+    given: dict[str, Any] = {"role": "sensor", "column": column, "at": at}
     if equation.components:
         given["of"] = equation.components[0]
         told.append(f"of {' or '.join(equation.components)}")
@@ -423,6 +417,18 @@ def _sensor(equation: Equation, key: str, column: str, name: str, values: Array)
     same = converts(unit, model) and conversion(unit, model, name) == Affine()  # °C
     given |= {"unit": unit} if unit and not same else {}
     return FoundChannel(key, given, (column,), ", ".join(told))
+
+
+def _place(equation: Equation, name: str) -> tuple[Any, str]:
+    """Return the place of a sensor as the name of its column states it, or open; and a remark."""
+    place, fraction = PLACE.search(name), FRACTION.search(name)
+    at = _open(equation.length_unit)
+    if equation.dimension > 1:
+        # A name states one coordinate at most, so that the place stays open.
+        return [at] * equation.dimension, ""
+    if place is not None and equation.length_unit:
+        return f"{place[1].replace(',', '.')} {place[2]}", "position from the name"
+    return at, "" if fraction is None else f'at = "{fraction[0]} {equation.length_unit}"?'
 
 
 def _unit_of_sensor(name: str, unit: str) -> str:
