@@ -16,6 +16,7 @@ import livepde as lp
 from livepde.laws.error_columns import SMALL, ErrorColumns
 from livepde.laws.model_errors import linear_model, model_errors
 from livepde.laws.stored_samples import StoredSamples
+from livepde.streams import AbsoluteNoise, Twin
 from livepde.verdict import (
     Allowed,
     Cause,
@@ -26,6 +27,33 @@ from livepde.verdict import (
     discretised,
 )
 from livepde.verdict.evidence import NU, TEMPER, Causes, Family, LinearModel, Mixture, averaged
+
+
+def test_harmonics_of_an_unknown_are_not_those_behind_it():
+    """An unknown with harmonics has more coefficients than numbers, in whatever place."""
+    mesh, times = lp.interval(0.0, 1.0, 20), np.arange(0.0, 12.01, 0.1)
+    unknowns = {
+        "s": lp.Scalar(lp.Normal(0.0, 1.0), evolution=lp.fem.Periodic(5.0)),
+        "k": lp.LogNormal(0.1, 0.05),
+    }
+    found = []
+    for names in (("s", "k"), ("k", "s")):
+        model = lp.Model(
+            lp.Field(mesh, lp.linear(mesh), dirichlet={"left": lp.Channel("T"), "right": 0.0}),
+            {name: unknowns[name] for name in names},
+            A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) - q.s * v,
+        )
+        sensors = lp.Points({"a": 0.3, "b": 0.6}, noise=0.01)
+        truth = {"q_true": {"s": 0.5, "k": 0.08}, "u0": 0.0, "inputs": lambda t: {"T": np.sin(t)}}
+        twin = Twin(
+            model=model, observation=sensors, times=times, noise=AbsoluteNoise(0.01), **truth
+        )
+        errors = lp.Identifier(model, sensors, u0=0.0).run(twin).verdict.errors
+        found.append({one.label: (one.value, one.low, one.high) for one in errors.unknowns})
+    for name, numbers in found[0].items():
+        assert numbers == pytest.approx(found[1][name], rel=1e-6)
+    assert found[0]["k"][1] < 0.08 < found[0]["k"][2]
+
 
 # --- the average --------------------------------------------------------------------------------
 

@@ -307,6 +307,7 @@ def sensors_of_any_kind(draw):
             inputs=("x",),
         ),
         lp.observation.FluxPlates({"e": "left", "i": a}, "gain"),
+        lp.observation.Slow(lp.Points([a]), 0.1 * power),
         lp.observation.Moving({"m": "x", "n": "missing"}),
         lp.observation.Transformed(
             lp.Points({"t": a}, {"t": lambda q, x: 0.1 * q.gain}), lambda y: np.exp(c * y / 2)
@@ -315,7 +316,7 @@ def sensors_of_any_kind(draw):
         lp.Subdomain(lambda x: x[0] > 0.8 * a),
         lp.observation.Matrix(np.random.default_rng(power).standard_normal((3, 13)) + c),
     ]
-    both = lp.Combined([base[k] for k in (1, 2, 3, 4, 5, 6, 7)])
+    both = lp.Combined([base[k] for k in (1, 2, 3, 4, 5, 6, 7, 8)])
     base += [
         both,
         lp.observation.Calibrated(

@@ -297,3 +297,32 @@ def test_the_evidence_of_readings_that_a_late_variant_lacks_is_no_loss():
     sound = replace(case, log_evidence=1690.0)
     close = replace(late, same_readings=1680.0)
     assert close.gained(sound) == pytest.approx(20.0)
+
+
+OTHERS = [
+    lp.Full(noise=0.1),
+    lp.Subdomain(lambda x: x[0] > 0.5, noise=0.1),
+    lp.observation.Matrix(np.eye(1, 13, 6), noise=0.1),
+    lp.observation.FluxPlates({"e": "left"}, "alpha", noise=0.1),
+    lp.observation.Moving({"m": "x"}, noise=0.1),
+    lp.observation.Functionals({"f": lambda q, u, x: q.alpha * u**2}, noise=0.1),
+    lp.Averages({"A": lambda x: x[0] > 0.4}, noise=0.1),
+]
+
+
+@pytest.mark.parametrize("other", OTHERS, ids=lambda one: type(one).__name__)
+def test_sensors_beside_a_slow_one_see_the_same(other):
+    ends = {"left": lp.Channel("T"), "right": 0.0}
+    model = heat(lp.interval(0.0, 1.0, 12), lp.LogNormal(0.1, 0.05), ends)
+    predicted = []
+    for sensors in (other, lp.Combined([other, Slow(lp.Points({"s": 0.3}), 0.1, noise=1e6)])):
+        identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(refit=None), u0=0.0)
+        count = other.bind(model.state_space, model.X, model.parameter_space).size
+        for k in range(6):
+            inputs = {"T": 0.1 * k, "x": 0.4}
+            inputs = {name: inputs[name] for name in identifier.inputs}
+            readings = np.full(identifier.observed.size, 0.01 * k)
+            estimate = identifier.step(0.1 * k, readings, inputs)
+        value, _ = estimate.parameters["alpha"]
+        predicted.append(np.append(estimate.innovation[:count], value))
+    np.testing.assert_allclose(*predicted, rtol=1e-6, atol=1e-9)

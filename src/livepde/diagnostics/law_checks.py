@@ -23,6 +23,7 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed, Split
 from livepde.samples import Sample, sample_of
+from livepde.start import with_sensors
 from livepde.stepping import Interval, Scheme, Stage, StepFailed
 
 ROUNDING = 1e-12
@@ -80,6 +81,7 @@ def check_observation(
             raise ObservationError(
                 "check_observation: an observation alone has no matrix; give its model too."
             )
+        model = with_sensors(model, observed)
         observed = observed.bind(model.state_space, model.X, model.parameter_space)
     rng = np.random.default_rng(seed)
     lines = _projections(observed, rng) if observed.linear else []

@@ -293,10 +293,15 @@ class FunctionSpace:
             raise ModelError(f"sensor and component are both called '{taken[0]}': rename one.")
         return replace(self, sensors={name: one.row(self) for name, one in sensors.items()})
 
+    @property
+    def seen(self) -> int:
+        """Number of coefficients of fields, which sensors see; those of slow sensors follow."""
+        return self.dim - len(self.sensors)
+
     @cached_property
     def of_fields(self) -> Array:
         """Ones for coefficients of fields, zeros for the states of sensors, shape (dim,)."""
-        return np.repeat([1.0, 0.0], [self.dim - len(self.sensors), len(self.sensors)])
+        return np.repeat([1.0, 0.0], [self.seen, len(self.sensors)])
 
     def completed(self, u: Array) -> Array:
         """Return states, (dim,) or (dim, k), in which each slow sensor shows what it sees."""

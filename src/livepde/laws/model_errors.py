@@ -352,11 +352,12 @@ def _allowed(
     widths = 2.0 * QUANTILE * narrow
     wider = (both[2] - both[1]) / np.where(widths > 0.0, widths, np.inf)
     for name, item in latent.parts.items():
-        part = slice(item.part.start, item.part.start + item.size)
+        part = problem.model.parameter_space.part(name)
         labels = item.block.labels(name)
         prior, unit = item.unknown.prior, item.unknown.unit
         usual = USUAL * float(prior.latent_std) if prior.symmetric else 0.0
-        every = np.array([value, *ends, plain_low, plain_high, wider])[:, part]
+        shown = [one[part] for one in (value, *ends, plain_low, plain_high)]
+        every = np.array([*shown, wider[item.part][: item.size]])  # of harmonics, the constant
         if len(labels) != item.size:  # a field
             labels, every = [name], _root_mean_squares(every)[:, None]
         for label, numbers in zip(labels, every.T.tolist(), strict=True):

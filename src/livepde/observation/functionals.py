@@ -99,20 +99,24 @@ class FunctionalsObserved(Observed):
         return max(field.order for field in fields) + max(degrees, default=0)
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
-        uq = np.concatenate([u, q])
+        uq = np.concatenate([u[: self.state.seen], q])
         return np.array([form.vector("w", moment, uq=uq)[0] for form in self.forms])
 
     def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
-        uq = np.concatenate([u, q])
+        seen = self.state.seen
+        uq = np.concatenate([u[:seen], q])
         rows = sp.csr_array(
             sp.vstack([form.matrix("w", "uq", moment, uq=uq) for form in self.forms])
         )
-        return sp.csr_array(rows[:, : len(u)]), rows[:, len(u) :].toarray()
+        more = sp.csr_array((rows.shape[0], len(u) - seen))
+        H = sp.csr_array(sp.hstack([rows[:, :seen], more], format="csr"))
+        return H, rows[:, seen:].toarray()
 
 
 def _jets(uq: Any, prefix: str, space: FunctionSpace) -> Any:
     """Return state or parameter in the form of weak-form arguments."""
-    jets = {name: getattr(uq, prefix + name) for name in space.names}
+    names = (name for name in space.names if name not in space.sensors)
+    jets = {name: getattr(uq, prefix + name) for name in names}
     return next(iter(jets.values())) if space.single else Named(**jets)
 
 

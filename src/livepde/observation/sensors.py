@@ -608,8 +608,10 @@ class Matrix(Observation):
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
         given: Any = self.G if sp.issparse(self.G) else np.atleast_2d(self.G)
         matrix = sp.csr_array(given)
-        if matrix.shape[1] != state.dim:
+        if matrix.shape[1] != state.seen:
             raise ObservationError(
-                f"Matrix: G has {matrix.shape[1]} columns; the state has {state.dim} coefficients."
+                f"Matrix: G has {matrix.shape[1]} columns; the state has {state.seen} coefficients."
             )
-        return matrix
+        return sp.csr_array(
+            (matrix.data, matrix.indices, matrix.indptr), (matrix.shape[0], state.dim)
+        )
