@@ -562,9 +562,9 @@ def unknowns_of(case: CaseContent) -> dict[str, fem.Unknown]:
     # Differences of a temperature are in K.
     unit = "K" if state == "degC" else state
     if offsets := _stated(case, "offset", "sensor"):
-        prior, first = fem.Normal(0.0, _common(case, offsets, "offset")), _one_unit(case, offsets)
-        own = unit if first == state else first
-        found["offset"] = fem.Scalars(tuple(offsets), prior, unit=own)
+        own = _one_unit(case, offsets)
+        prior = fem.Normal(0.0, _common(case, offsets, "offset"))
+        found["offset"] = fem.Scalars(tuple(offsets), prior, unit=unit if own == state else own)
     # A gain is a factor without a unit, 1 for an exact sensor.
     if gains := _stated(case, "gain", "sensor"):
         found["gain"] = fem.Scalars(tuple(gains), fem.Normal(1.0, _common(case, gains, "gain")))
