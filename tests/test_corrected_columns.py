@@ -157,6 +157,16 @@ def test_a_sensor_between_the_rows_of_the_others_changes_no_input(tmp_path):
     assert not found.loc[later, "T_10"].notna().any()
 
 
+@pytest.mark.parametrize("role", ["validation", "ignored"])
+def test_no_reading_is_made_up_beside_the_initial_profile(tmp_path, role: str):
+    path = short_rod(tmp_path, ROWS)
+    plain = read(path)
+    step = float(np.median(np.diff(plain.index)))
+    late = {"channels.T_20.late": f"{step / 2} s", "channels.T_20.role": role}
+    found = read(path, **late)
+    assert not found.loc[found.index.intersection(plain.index), "T_20"].notna().any()
+
+
 @pytest.mark.slow
 def test_a_late_sensor_is_fitted_as_if_it_were_not(tmp_path):
     """Half an interval late, with refits and gaps: the estimate of the table without a fault."""

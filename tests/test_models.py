@@ -269,6 +269,8 @@ def test_in_a_case_a_measured_flow_needs_no_unknown_flux(tmp_path):
     assert prepared.identifier.model.channels == ("flow", "T_0")
     first = next(iter(prepared.stream))
     assert first.z["flow"] == pytest.approx(1e-3 / 3600.0)
+    case.write_text(f'{text}\n[inputs]\nflow = "2 mm/h"\n')
+    assert load(case).prepare().identifier.model.channels == ("T_0",)
     case.write_text(text)
     with pytest.raises(ModelError, match="the input flow"):
         load(case).prepare()

@@ -107,7 +107,7 @@ def test_a_slow_sensor_that_counts_as_fast_is_doubted():
 
 
 def test_gaps_and_irregular_intervals():
-    """A sensor that is not read goes on to respond."""
+    """A sensor responds in gaps of its readings, too."""
     rng, who = np.random.default_rng(4), lp.Identifier(rod(), sensors(PRIOR), u0=0.0)
     kept = np.flatnonzero(rng.random(len(TIMES)) < 0.6)
     for k in kept:

@@ -175,6 +175,7 @@ class Identifier(StreamRuns):
         self._q0 = model.initial_parameter(q0)
         self._u0 = model.initial_values(0.0 if u0 is None else u0)
         self._stated = model.boundary_readings(u0)  # at t0
+        self._assumed = u0 is None and model.form_initial is None  # a state of zero
         self._fingerprint = self._lazy_fingerprint()
         sizes = self.observed.size, len(hidden), len(self.inputs)
         self._so_far = TakenSamples.start(t0, *sizes)
@@ -214,6 +215,7 @@ class Identifier(StreamRuns):
         other = copy.copy(self)
         other._q0, other._u0 = q0, u0
         other.problem = replace(self.problem, initial_errors=errors)
+        other._assumed = False  # whether somebody stated the start of this member is not known
         other._fingerprint = other._lazy_fingerprint()
         return other
 
@@ -446,7 +448,7 @@ class Identifier(StreamRuns):
         known, ignored = self.validation, self.ignored
         names, units = ((), ()) if known is None else (known.names, known.units)
         inputs = self._channels.inputs
-        assumed = self.problem.initial is None and self.model.form_initial is None
+        assumed = self._assumed
         if not names and not steps.irregular and gaps.silent and not assumed:
             return judge
 

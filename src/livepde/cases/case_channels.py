@@ -366,6 +366,12 @@ def interpolates(case: CaseContent) -> bool:
     return isinstance(initial, schema.InitialSpec) and initial.start in INTERPOLATED
 
 
+def profile_sensors(case: CaseContent) -> list[str]:
+    """Return the sensors that an initial state is interpolated from."""
+    known = case.roles("sensor") if interpolates(case) else {}
+    return [name for name, one in known.items() if one.at is not None and not one.is_flux]
+
+
 def _made_of_readings(case: CaseContent) -> bool:
     """Return whether the initial state is made of readings that are uncertain."""
     initial = case.spec.initial
@@ -426,12 +432,12 @@ def _level(readings: Sequence[_Reading]) -> tuple[list[float], list[float]]:
 def _initial_readings(case: CaseContent, first: Sample) -> list[_Reading]:
     """Return the readings that the initial state is interpolated from."""
     ends = {"left": float(case.mesh.p.min()), "right": float(case.mesh.p.max())}
-    values = by_name(first.z, ())
+    values, sensors = by_name(first.z, ()), profile_sensors(case)
     found = []
     for name, channel in case.roles("sensor", "boundary").items():
         if channel.role == "boundary" and channel.at in ends:
             found.append(_Reading(ends[str(channel.at)], values[name], name))
-        elif channel.role == "sensor" and channel.at is not None and not channel.is_flux:
+        elif name in sensors:
             found.append(_Reading(_position(case, name, channel), values[name], name))
     present = [one for one in found if np.isfinite(one.value)]
     if not present:

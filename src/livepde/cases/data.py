@@ -16,7 +16,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from livepde.cases.case_channels import columns_of, interpolates
+from livepde.cases.case_channels import columns_of, interpolates, profile_sensors
 from livepde.cases.case_content import CaseContent, check_options, load_code, own_code
 from livepde.cases.data_schema import BrokerSpec, DataSpec, FileSpec, NodesSpec
 from livepde.cases.schema import SENSORS, CaseSpec
@@ -165,7 +165,7 @@ def read_data(case: CaseContent, source: str | Iterable[str] | None) -> DataTabl
         where,
         between,
         together=together,
-        profile=sensors if interpolates(case) else (),
+        profile=profile_sensors(case),
     )
     return _until_stop(case, clock, joined)
 

@@ -38,7 +38,7 @@ LATEST = 2.7  # times the least number: the year 2051, or 2169 of Excel
 DATED = re.compile(r"^t\b|time|date|datum|zeit|temps", re.I)
 VALUED = re.compile(r"val|wert|reading|result|state", re.I)  # column of values of all sensors
 UNITS = re.compile(r"unit|einheit|unité|eenheid", re.I)  # column of their units
-MOSTLY = 0.9  # of the rows of a sensor that have moments of their own
+MOSTLY = 0.9  # share of rows whose time and sensor no other row has
 VALUES = {"number", "date", "hour"}  # kinds of cells that a header does not have
 
 

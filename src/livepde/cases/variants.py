@@ -128,12 +128,12 @@ class VariantRun:
     def gained(self, base: VariantRun) -> float:
         """Return log evidence minus that of the case itself; NaN if other readings count."""
         if self.same_readings is not None:
-            return self.log_evidence - self.same_readings + self._gained_by_others(base)
+            return self.log_evidence - self.same_readings + self._evidence_of_lacking(base)
         if self.error or dict(self.readings) != dict(base.readings):
             return math.nan
         return self.log_evidence - base.log_evidence
 
-    def _gained_by_others(self, base: VariantRun) -> float:
+    def _evidence_of_lacking(self, base: VariantRun) -> float:
         """Return the log evidence that readings add which the variant lacks.
 
         Where the case misses those, its evidence moves by thousands with a few of them, and other

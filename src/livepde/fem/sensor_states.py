@@ -39,7 +39,7 @@ class SensorState:
         return self.time_constant is None
 
 
-class Shown(NamedTuple):
+class SensorPair(NamedTuple):
     """What a slow sensor sees and shows, in a form."""
 
     seen: Any
@@ -70,8 +70,8 @@ class SensorBlock(Block):
 
         return Local(self._dofs, [("value", (2,))], evaluate)
 
-    def jet(self, parts: Local, values: Array) -> Shown:
-        return Shown(*values)
+    def jet(self, parts: Local, values: Array) -> SensorPair:
+        return SensorPair(*values)
 
     def prior(self) -> Array:
         return np.zeros(1)  # completed by what it sees

@@ -1,4 +1,4 @@
-"""Sensors that respond slowly, with a state of their own."""
+"""Sensors that respond slowly: each adds a coefficient to the state."""
 
 from __future__ import annotations
 

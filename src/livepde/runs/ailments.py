@@ -75,7 +75,7 @@ class Ailments:
     def look(self) -> tuple[str, str] | None:
         """Return kind and sentence of an event if the run's health has changed, else None.
 
-        The sentence is empty after a silence, whose end has an event of its own.
+        The sentence is empty after a silence: its end is a separate event.
         """
         (kind, why), before = self._ailing(), self._told[0]
         if kind == before:
