@@ -31,7 +31,8 @@ class Fit:
     a
         Coordinates of the final estimate, shape (k,); NaN if there is none.
     cost, claimed
-        Its cost by the lean forward model, and the cost that livepde reports.
+        Its cost by the lean forward model, and the cost that livepde reports: NaN where a reading
+        is refused, which counts for the lean model alone.
     passes
         Passes over all samples that livepde reports, NaN if it reports none.
     converged, level
@@ -76,7 +77,8 @@ def _judged(objective: Objective, result: Result, seconds: float) -> Fit:
     fit = last.fit
     if fit is None:
         return Fit(a, cost, np.nan, np.nan, True, last.verdict.level, seconds)
-    return Fit(a, cost, fit.cost, fit.passes, fit.converged, last.verdict.level, seconds)
+    claimed = np.nan if fit.refused else fit.cost  # it leaves out the readings that are refused
+    return Fit(a, cost, claimed, fit.passes, fit.converged, last.verdict.level, seconds)
 
 
 @lru_cache(maxsize=64)

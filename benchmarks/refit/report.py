@@ -61,9 +61,8 @@ def _checks(name: str, trials: Sequence[Trial]) -> Iterator[Check]:
     most = float(np.quantile(passes, LEVEL))
     yield Check(f"{name}: passes, nine of ten", most, problem.most_passes, "<=")
     if np.isfinite(claims := _claims(trials)).any():
-        # A gate may leave out the reading of thousands that is wild by chance.
-        usual = float(np.nanquantile(claims, LEVEL))
-        yield Check(f"{name}: reported cost, relative difference", usual, CLAIM, "<=")
+        worst = float(np.nanmax(claims))
+        yield Check(f"{name}: reported cost, relative difference", worst, CLAIM, "<=")
     ratios = [item.ratio for item in trials if np.isfinite(item.ratio)]
     if ratios:
         text = f"{name}: processor time / SciPy, median"
