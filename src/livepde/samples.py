@@ -260,7 +260,11 @@ def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
         values, stds = np.array(z, dtype=object).T.tolist()
         noise = own_noise(list(map(check_noise, observed.names, stds)))
         return readings(values, observed)[0], noise
-    array = _array(z)
+    return _values(_array(z), observed), None
+
+
+def _values(array: Array, observed: Observed) -> Array:
+    """Return measurements of all sensors as a new array, if they have its shape and no infinity."""
     if array.ndim == 0 and observed.size == 1:
         array = array.reshape(1)
     if array.shape != (observed.size,):
@@ -272,7 +276,7 @@ def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
     if np.isinf(array).any():
         where = observed.names[int(np.flatnonzero(np.isinf(array))[0])]
         raise SampleError(f"channel '{where}' is infinite; send NaN for a missing sample.")
-    return array.copy(), None
+    return array.copy()
 
 
 @dataclass(frozen=True, eq=False)

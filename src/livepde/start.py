@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from livepde.errors import ConfigurationError
+from livepde.fem import SensorState
 from livepde.laws import InitialReading, Law, Problem
 from livepde.linalg import Array
 from livepde.model import Model
@@ -75,14 +76,21 @@ def with_sensors(
     known = model.parameter_space.unknowns
     own = {name: item for name, item in observation.unknowns.items() if name not in known}
     model = model.with_unknowns(own) if own else model
-    if validation and (free := [n for n, s in validation.states.items() if s.unknown]):
-        raise ConfigurationError(
-            f"validation: the time constant of '{free[0]}' is an unknown, which only assimilated "
-            "sensors have: give a number."
-        )
-    states = {**(validation.states if validation else {}), **observation.states}
+    states = {**_shown_states(validation), **observation.states}
     new = {name: one for name, one in states.items() if name not in model.sensors}
     return model.with_sensors(new) if new else model
+
+
+def _shown_states(validation: Observation | None) -> Mapping[str, SensorState]:
+    """Return the states of slow sensors that are only predicted, whose constants are known."""
+    shown = {} if validation is None else validation.states
+    for name, state in shown.items():
+        if state.unknown:
+            raise ConfigurationError(
+                f"validation: the time constant of '{name}' is an unknown, which only assimilated "
+                "sensors have: give a number."
+            )
+    return shown
 
 
 def stated_problem(

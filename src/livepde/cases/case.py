@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
-from itertools import chain
+from itertools import chain, filterfalse
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -386,19 +386,25 @@ class Case(CaseContent):
     def notes(self) -> list[str]:
         """Notes on allowed settings that may be mistakes."""
         found = [*process_notes(self, self.model), *case_channels.flux_notes(self)]
-        found += case_channels.cell_notes(self)
+        return [*found, *case_channels.cell_notes(self), *self._law_notes, *self._expect_notes]
+
+    @property
+    def _law_notes(self) -> Iterator[str]:
         if isinstance(self.law, laws.GradientLaw) and isinstance(self.observation, Points):
-            found.append(
+            yield (
                 "The gradient law is made for observed subdomains and averages; a few noisy point "
                 "sensors mislead it. Use law.kind = 'sensitivity' for points."
             )
         if settings := self.with_intervals:
             options = " ".join(f"--set {setting}" for setting in settings)
             noise = "" if case_channels.noise_of(self) else ", and state the `noise` of each sensor"
-            found.append(
+            yield (
                 "The gradient law has no covariance: its estimates have no intervals, and none "
                 f"with model errors. For intervals, run this case with `{options}`{noise}."
             )
+
+    @property
+    def _expect_notes(self) -> Iterator[str]:
         # Numbers of a run, see `runs.measures`.
         labels = self.model.parameter_space.labels
         known = [
@@ -408,11 +414,9 @@ class Case(CaseContent):
             *TOTALS,
             *(f"rmse.{name}" for name in (*ROLES, *self.roles(*SENSORS))),
         ]
-        return found + [
-            f"expect.{name}: a run of this case has no such number; {did_you_mean(name, known)}"
-            for name in self.expected
-            if name not in known
-        ]
+        for name in filterfalse(known.__contains__, self.expected):
+            text = f"a run of this case has no such number; {did_you_mean(name, known)}"
+            yield f"expect.{name}: {text}"
 
     def prepare(self, source: str | Iterable[str] | None = None) -> Prepared:
         """Return an identifier and its stream.

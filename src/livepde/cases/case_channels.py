@@ -584,12 +584,7 @@ def unknowns_of(case: CaseContent) -> dict[str, fem.Unknown]:
         # An Ornstein-Uhlenbeck process: stationary standard deviation and correlation time.
         prior, fades = fem.Normal(0.0, std), fem.MeanReverting(time)
         found["correlated"] = fem.Scalars(tuple(errors), prior, unit=unit, evolution=fades)
-    constants = {
-        name: _constant(case, {name: item})
-        for name, item in case.roles("sensor").items()
-        if isinstance(item.time_constant, schema.TimeConstantSpec)
-    }
-    if constants:
+    if constants := _unknown_constants(case):
         prior = _common(case, constants, "time_constant")
         unit = case.equation.time_unit
         found["time_constant"] = fem.Scalars(tuple(constants), prior, unit=unit)
@@ -615,6 +610,15 @@ def _correlated(case: CaseContent) -> dict[str, tuple[float, float]]:
             std = case.positive(fading.std, case.equation.state.unit, f"{key}.std")
             found[name] = std, case.positive(fading.time, case.equation.time_unit, f"{key}.time")
     return found
+
+
+def _unknown_constants(case: CaseContent) -> dict[str, float | fem.Prior]:
+    """Return the prior of each time constant that is unknown."""
+    return {
+        name: _constant(case, {name: item})
+        for name, item in case.roles("sensor").items()
+        if isinstance(item.time_constant, schema.TimeConstantSpec)
+    }
 
 
 def _stated(case: CaseContent, key: str, *roles: str) -> dict[str, float]:

@@ -196,26 +196,28 @@ def _readings(
     if not asked:
         return None
     how = (written.separator, written.encoding, clock, written.skip)
-    _, cells = texts_of(table, [*clock.names, *asked, *texts], *how)
-    moments = list(zip(*(cells[name] for name in clock.names), strict=True))
-    if not sensor and len(set(moments)) == len(moments):
+    _, found = texts_of(table, [*clock.names, *asked, *texts], *how)
+    cells = {name: list(map(str.strip, column)) for name, column in found.items()}
+    if not (name := sensor or _naming_sensors(asked, cells, clock)):
         return None
-    texts_in = {name: [cell.strip() for cell in cells[name]] for name in (*asked, *texts)}
-    name = sensor or next((one for one in asked if _names_sensors(texts_in[one], moments)), "")
-    if not name:
-        return None
-    names = texts_in[name]
-    known = tuple(filter(None, dict.fromkeys(names)))
-    pairs = ({*zip(names, texts_in[one], strict=True)} for one in texts if UNITS.search(one))
+    known = tuple(filter(None, dict.fromkeys(cells[name])))
+    pairs = ({*zip(cells[name], cells[one], strict=True)} for one in texts if UNITS.search(one))
     units = next((dict(pair) for pair in pairs if len(pair) == len(known)), {})
     return _Readings(name, value or _valued(table, name, numbers), known, units)
 
 
-def _names_sensors(names: Sequence[str], moments: Sequence[Any]) -> bool:
-    """Return whether texts in rows of some times name the sensors of the rows."""
-    # An hour that clocks show twice repeats some moments of a sensor.
-    apart = len({*zip(names, moments, strict=True)})
-    return len(set(filter(None, names))) > 1 and apart >= MOSTLY * len(moments)
+def _naming_sensors(asked: Sequence[str], cells: Mapping[str, list[str]], clock: Clock) -> str:
+    """Return the column that names the sensor of each row, if times repeat; else empty."""
+    moments = list(zip(*(cells[name] for name in clock.names), strict=True))
+    if len(set(moments)) == len(moments):
+        return ""
+
+    def names_sensors(names: list[str]) -> bool:
+        # An hour that clocks show twice repeats some moments of a sensor.
+        apart = len({*zip(names, moments, strict=True)})
+        return len(set(filter(None, names))) > 1 and apart >= MOSTLY * len(moments)
+
+    return next((name for name in asked if names_sensors(cells[name])), "")
 
 
 def _valued(table: Path, sensor: str, numbers: Sequence[str]) -> str:
@@ -334,15 +336,12 @@ def _most_like_times(numbers: Sequence[str], hours: Sequence[str], written: Writ
     day, numbers are times only if their name says so.
     """
     timed = [n for n in numbers if counted_since(n) or unit_in(n, "s", *OF_TIMES)]
-    values = {name: _values(name, written) for name in numbers}
-    rising = [name for name, found in values.items() if (found[:-1] < found[1:]).all()]
-    both = [name for name in timed if name in rising]
-    named = [*both, *filter(CALLED_TIME.match, rising)]
+    rising = [name for name in numbers if _rises(name, written)]
+    named = [*filter(rising.__contains__, timed), *filter(CALLED_TIME.match, rising)]
     if hours:
         return [*named, *(name for name in hours if elapsed_formats(_cells(name, written)))]
     # Row numbers increase, too: they are times only if nothing else is.
-    others = [name for name in rising if not _counts_rows(name, written)]
-    return [*named, *others, *rising, *timed]
+    return [*named, *sorted(rising, key=lambda name: _counts_rows(name, written)), *timed]
 
 
 def _format(table: Path, written: Written, time: tuple[str, ...], given: str) -> str:
@@ -385,6 +384,11 @@ def _values(name: str, written: Written) -> Array:
     k = written.header.index(name)
     cells = (number_of(row[k], written.decimal) for row in written.rows if k < len(row))
     return np.array(list(cells), dtype=float)
+
+
+def _rises(name: str, written: Written) -> bool:
+    values = _values(name, written)
+    return bool((values[:-1] < values[1:]).all())
 
 
 def _counts_rows(name: str, written: Written) -> bool:

@@ -283,16 +283,19 @@ def _unknowns(equation: Equation, inputs: set[str]) -> Iterator[str]:
     chosen = _alternative(equation, inputs)
     for name, variable in equation.unknowns.items():
         if name == chosen or not variable.optional:
-            others = [one for one in equation.alternatives if one in equation.unknowns]
-            others = [one for one in others if one != name]
-            more = f"; or {', '.join(others)}, or both" if name == chosen else ""
-            prior = _open(variable.unit)
-            given: dict[str, Any] = {"prior": prior, "std": prior}
-            if variable.transform == "logit":
-                given["bounds"] = [0, 1]
-            if variable.transform:
-                given["transform"] = variable.transform
-            yield from _inline(f"unknowns.{name}", given, variable.text + more)
+            known = [one for one in equation.alternatives if one in equation.unknowns]
+            others = ", ".join(one for one in known if one != name)
+            more = f"; or {others}, or both" if name == chosen else ""
+            yield from _inline(f"unknowns.{name}", _open_prior(variable), variable.text + more)
+
+
+def _open_prior(variable: Variable) -> dict[str, Any]:
+    """Return the keys of an unknown whose prior is open."""
+    prior = _open(variable.unit)
+    given: dict[str, Any] = {"prior": prior, "std": prior}
+    if variable.transform == "logit":
+        given["bounds"] = [0, 1]
+    return {**given, "transform": variable.transform} if variable.transform else given
 
 
 def _constants(found: list[FoundChannel]) -> Iterator[str]:
@@ -405,15 +408,12 @@ def _sensor(equation: Equation, key: str, column: str, name: str, values: Array)
     if equation.components:
         given["of"] = equation.components[0]
         told.append(f"of {' or '.join(equation.components)}")
-    unit = _unit_of_sensor(name, equation.state.unit)
+    unit, model = _unit_of_sensor(name, equation.state.unit), equation.state.unit
     stated = unit.removeprefix(BLANK).strip()
     flux = equation.fluxes.flux if equation.fluxes and equation.conductivity else ""
     if unit.startswith(BLANK) and flux and converts(stated, flux):
-        given["quantity"] = FLUX
+        given["quantity"], unit, model = FLUX, stated, flux
         told.append('flux along x, at an end: at = "left" or "right"')
-        given |= {"unit": stated} if conversion(stated, flux, name) != Affine() else {}
-        return FoundChannel(key, given, (column,), ", ".join(told))
-    model = equation.state.unit
     same = converts(unit, model) and conversion(unit, model, name) == Affine()  # °C
     given |= {"unit": unit} if unit and not same else {}
     return FoundChannel(key, given, (column,), ", ".join(told))
@@ -433,14 +433,20 @@ def _place(equation: Equation, name: str) -> tuple[Any, str]:
 
 def _unit_of_sensor(name: str, unit: str) -> str:
     """Return the unit that the name of a sensor's column states; empty if it states none."""
-    stated = IN_BRACKETS.search(name)
-    if stated and not PLACE.fullmatch(stated[1].strip()):
-        return unit_in(name, unit, IN_BRACKETS) or (f"{BLANK} {stated[1]}" if unit else "")
-    if slash := AFTER_SLASH.search(name):
-        known = in_si(slash[1]) is not None
-        return unit_in(name, unit, AFTER_SLASH) or (f"{BLANK} {slash[1]}" if unit and known else "")
-    if stated:
+    bracket, slash = IN_BRACKETS.search(name), AFTER_SLASH.search(name)
+    placed = bracket and PLACE.fullmatch(bracket[1].strip())
+    if bracket and not placed:
+        return unit_in(name, unit, IN_BRACKETS) or (f"{BLANK} {bracket[1]}" if unit else "")
+    if slash:
+        asked = unit and in_si(slash[1]) is not None
+        return unit_in(name, unit, AFTER_SLASH) or (f"{BLANK} {slash[1]}" if asked else "")
+    if placed:
         return ""
+    return _unit_at_end(name, unit)
+
+
+def _unit_at_end(name: str, unit: str) -> str:
+    """Return the unit in which the name of a column ends, as T_degC; empty if in none."""
     suffixes = ((pattern, pattern.search(name)) for pattern in (SUFFIX, LAST))
     named = (one for one, suffix in suffixes if suffix and suffix["unit"] not in NO_UNITS)
     return next(filter(None, (unit_in(name, unit, pattern) for pattern in named)), "")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from itertools import pairwise, product
+from itertools import chain, pairwise, product
 
 import numpy as np
 
@@ -115,15 +115,15 @@ def _process(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     if source and law.kind == "sensitivity" and not law.jumps:
         yield Variant("source that jumps", (*source, 'law.jumps=["source"]'))
     yield Variant("loss", freed(prepared, Cause("loss", "", "", size=0.1 / time)))
-    offsets = [
-        setting
-        for name in prepared.case.roles("boundary")
-        for setting in freed(prepared, Cause("boundary", name, "", size=error))
-    ]
-    if offsets:
-        yield Variant("offsets of the boundary values", tuple(offsets))
-    terms = (("flux", error / time), ("transfer", 0.1 / time))
-    for name, (kind, size) in product(map(str, prepared.case.mesh.boundaries or {}), terms):
+    causes = (Cause("boundary", name, "", size=error) for name in prepared.case.roles("boundary"))
+    if offsets := tuple(chain.from_iterable(freed(prepared, cause) for cause in causes)):
+        yield Variant("offsets of the boundary values", offsets)
+    yield from _at_boundaries(prepared, {"flux": error / time, "transfer": 0.1 / time})
+
+
+def _at_boundaries(prepared: Prepared, terms: Mapping[str, float]) -> Iterator[Variant]:
+    """Iterate over terms of some sizes that each boundary may lack."""
+    for name, (kind, size) in product(map(str, prepared.case.mesh.boundaries or {}), terms.items()):
         settings = freed(prepared, Cause(kind, name, "", size=size))
         yield Variant(NAMES[kind].format(name), settings)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 
 from livepde.cases.variants import GAINED, VariantRun
 
@@ -25,16 +26,18 @@ def recommended(base: VariantRun, others: Sequence[VariantRun]) -> VariantRun:
     ahead = _ahead(base, others)
     if not ahead:
         return base
-    usable = [one for one in ahead if one.level in USABLE]
-    if not usable:
-        usable = [base] if base.level in USABLE else ahead
-    best = usable[0].gained(base)
-    near = [one for one in usable if one.gained(base) > best - GAINED]
+    candidates = _usable(ahead) or _usable([base]) or ahead
+    best = candidates[0].gained(base)
+    near = [one for one in candidates if one.gained(base) > best - GAINED]
     chosen = min(near, key=lambda one: (one.unknowns, -one.gained(base)))
-    rivals = [one for one in near if one.apart(chosen)]
+    if rivals := [one for one in near if one.apart(chosen)]:
+        chosen = chosen.beside(rivals)
     better = tuple(one.variant.name for one in ahead if one.gained(base) > best + GAINED)
-    found = chosen.beside(rivals) if rivals else chosen
-    return replace(found, better=better) if better else found
+    return replace(chosen, better=better) if better else chosen
+
+
+def _usable(runs: Iterable[VariantRun]) -> list[VariantRun]:
+    return [one for one in runs if one.level in USABLE]
 
 
 def _ahead(base: VariantRun, others: Sequence[VariantRun]) -> list[VariantRun]:
@@ -57,14 +60,15 @@ def _worse_sensors(one: VariantRun, base: VariantRun) -> list[str]:
 def conclusions(base: VariantRun, others: Sequence[VariantRun]) -> list[str]:
     """Return sentences on the recommendation, and on what other variants disagree about."""
     best = recommended(base, others)
-    remarks = _remarks(base, best, [one for one in others if not one.error])
+    known = [one for one in others if not one.error]
+    remarks = chain(_mispredicting(base, known), _remarks(base, best, known))
     text = _recommendation(base, best)
     if math.isnan(base.log_evidence):
         text = (
             "Variants are not ranked: this case has no log evidence (its law has no covariance). "
             "The case is kept unchanged."
         )
-        remarks = iter(())
+        remarks = chain()
     failed = _names_of(one for one in others if one.error)
     why = [f"Not compared, because they failed: {failed}."] if failed else []
     equals = (*_equals(best, others), *_better(best, base, others))
@@ -123,23 +127,24 @@ def _better(best: VariantRun, base: VariantRun, others: Sequence[VariantRun]) ->
 
 
 def _remarks(base: VariantRun, best: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
-    """Iterate over variants with better evidence and worse predictions, and refuted ones."""
-    for one in others:
-        if one.gained(base) > GAINED and (worse := _worse_sensors(one, base)):
-            errors = ", ".join(worse)
-            yield (
-                f"'{one.variant.name}' fits the assimilated sensors better and predicts validation "
-                f"ones worse ({errors}): it is not recommended."
-            )
+    """Iterate over sentences on variants that are worse, or cannot be compared."""
     if refuted := _names_of(one for one in others if one.gained(base) < -GAINED):
         yield f"The data contradict {refuted}: lower evidence than the case."
     apart = [one for one in others if math.isnan(one.gained(base))]
-    if apart:
-        names = _names_of(apart)
+    if names := _names_of(apart):
         yield f"The evidence of {names} is missing or counts other readings: it is not compared."
-    if best.level not in USABLE:
-        for one in (one for one in apart if one.level in USABLE):
-            yield f"'{one.variant.name}' has the verdict '{one.level}' with its readings."
+    for one in () if _usable([best]) else _usable(apart):
+        yield f"'{one.variant.name}' has the verdict '{one.level}' with its readings."
+
+
+def _mispredicting(base: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
+    """Iterate over sentences on variants with better evidence and worse predictions."""
+    for one in others:
+        if one.gained(base) > GAINED and (worse := _worse_sensors(one, base)):
+            yield (
+                f"'{one.variant.name}' fits the assimilated sensors better and predicts validation "
+                f"ones worse ({', '.join(worse)}): it is not recommended."
+            )
 
 
 def _names_of(runs: Iterable[VariantRun]) -> str:
@@ -150,9 +155,9 @@ def _names_of(runs: Iterable[VariantRun]) -> str:
 def _disagreements(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
     """Iterate over unknowns that differ by more than the intervals between variants."""
     found: dict[str, list[str]] = {}
-    shared = False
+    others = [one for one in others if one.variant != best.variant]
+    shared = any(best.estimates.keys() & one.estimates.keys() for one in others)
     for one in others:
-        shared |= one is not best and not best.estimates.keys().isdisjoint(one.estimates)
         for name in one.apart(best):
             found.setdefault(name, []).append(one.variant.name)
     for name, names in found.items():

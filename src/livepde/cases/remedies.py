@@ -12,7 +12,7 @@ import numpy as np
 
 from livepde.cases.process import prior_of
 from livepde.cases.read import settings_in, toml_key, toml_value
-from livepde.cases.schema import TimeConstantSpec
+from livepde.cases.schema import ChannelSpec, TimeConstantSpec
 from livepde.errors import CaseError
 from livepde.laws import SensitivityLaw
 from livepde.linalg import Array
@@ -32,7 +32,7 @@ KEYS = {kind: key for kind, (_, key) in ESTIMATED.items()}
 """Kind of error of a sensor -> its key in a case; all sensors share one prior of each."""
 # Errors with a size that a fit could find.
 SIZED = ("averaging", "boundary", "channel", "drift", "flux", "lag", "loss", "source", "transfer")
-STATED = ("factor", "late")  # keys of a channel whose stated value a cause does not replace
+STATED = {"factor", "late"}  # keys of a channel whose stated value a cause does not replace
 MISSED = 5.0  # times the noise that the first readings may miss a stated start
 DOUBTED = ("caution", "do not trust")  # levels of a verdict
 JUMPED = "Jumps are allowed already: check the model and the data for another cause."
@@ -197,22 +197,27 @@ def _adding(name: str, std: float, **keys: float | str) -> str:
 def _of_sensor(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     """Return the setting of an error of a sensor, with the prior that other sensors state."""
     case = prepared.case
-    key, channels = KEYS[cause.kind], case.roles("sensor")
-    channel = channels.get(cause.subject)
-    if channel is None:
+    key, channels, name = KEYS[cause.kind], case.roles("sensor"), cause.subject
+    if name not in channels:
         return _stated(case, cause)
-    placed = channel.is_point and not channel.is_flux
-    if getattr(channel, key) is not None or (key == "at_std" and not placed):
+    if _is_settled(channels[name], key):
         return ()
-    others = {name: value for name, item in channels.items() if (value := getattr(item, key))}
-    if key == "offset" and any(case.unit(name) != case.unit(cause.subject) for name in others):
+    others = {label: value for label, item in channels.items() if (value := getattr(item, key))}
+    if key == "offset" and {case.unit(label) for label in others} - {case.unit(name)}:
         return ()  # all offsets share one prior
-    given = next(iter(others.values()), None)
-    if given is None:
-        given = _usual_std(prepared, cause)
-    if given is None:
-        return settings_in(cause.setting)
-    return (channel_setting(cause.subject, key, toml_value(given)),)
+    std = next(iter(others.values())) if others else _usual_std(prepared, cause)
+    return settings_in(cause.setting) if std is None else (_keyed(name, key, std),)
+
+
+def _is_settled(channel: ChannelSpec, key: str) -> bool:
+    """Return whether a sensor cannot have an error of its own: it has one, or no position."""
+    placed = channel.is_point and not channel.is_flux
+    return getattr(channel, key) is not None or (key == "at_std" and not placed)
+
+
+def _keyed(name: str, key: str, value: object) -> str:
+    """Return the setting of a key of a channel."""
+    return channel_setting(name, key, toml_value(value))
 
 
 def _slow(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
@@ -228,7 +233,7 @@ def _slow(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     given = next((one for one in others if isinstance(one, TimeConstantSpec)), None)
     size = amount_of(cause.size, prepared.case.equation.time_unit)
     known = given.model_dump() if given else {"value": size, "std": size}
-    return (channel_setting(cause.subject, "time_constant", toml_value(known)),)
+    return (_keyed(cause.subject, "time_constant", known),)
 
 
 def _usual_std(prepared: Prepared, cause: Cause) -> float | str | None:
@@ -259,15 +264,16 @@ def _stated(case: Case, cause: Cause) -> tuple[str, ...]:
     None either with a unit of another quantity: the law does not know the unit of each input.
     """
     channel, settings = case.spec.channels.get(cause.subject), settings_in(cause.setting)
-    keys = [setting.partition("=")[0].rpartition(".")[2] for setting in settings]
-    if channel is not None and keys == ["unit"] and not _convertible(case, cause.subject, settings):
-        return ()
-    if "along" in keys and not (channel is not None and channel.is_fixed):
-        return ()
-    taken = [key for key in keys if key in STATED and getattr(channel, key, None) is not None]
+    keys = {setting.partition("=")[0].rpartition(".")[2] for setting in settings}
+    refused = any(getattr(channel, key, None) is not None for key in keys & STATED)
+    if "unit" in keys and channel is not None:
+        refused |= not _convertible(case, cause.subject, settings)
+    if "along" in keys:
+        refused |= channel is None or not channel.is_fixed
     # A case needs a sensor: the only one cannot be left out.
-    only = "role" in keys and list(case.roles("sensor")) == [cause.subject]
-    return () if taken or only else settings
+    if "role" in keys:
+        refused |= list(case.roles("sensor")) == [cause.subject]
+    return () if refused else settings
 
 
 def _convertible(case: Case, name: str, settings: Sequence[str]) -> bool:
@@ -289,7 +295,7 @@ def _exchanged(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     if None in columns:  # a sensor of a channel that has several, or a mean of columns
         return ()
     pairs = zip(names, columns, strict=True)
-    return tuple(channel_setting(name, "column", toml_value(column)) for name, column in pairs)
+    return tuple(_keyed(name, "column", column) for name, column in pairs)
 
 
 def _initial(prepared: Prepared) -> tuple[str, ...]:
@@ -385,7 +391,7 @@ def _boundary(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     if case.equation.fluxes is None or channel is None or channel.offset is not None:
         return ()
     size = float(f"{WIDE * abs(cause.size):.2g}")
-    return (channel_setting(cause.subject, "offset", toml_value(size)),) if size else ()
+    return (_keyed(cause.subject, "offset", size),) if size else ()
 
 
 def _end(case: Case, name: str, what: str) -> str:

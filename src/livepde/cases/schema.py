@@ -298,15 +298,19 @@ class ChannelSpec(Spec):
 
     @model_validator(mode="after")
     def _options_of_sensors(self) -> ChannelSpec:
-        sensor = self.role in SENSORS
         own = {"offset", "gain", "correlated", "at_std"} & self.model_fields_set
         # A sensor that is ignored for a while keeps its keys.
         if self.role == "boundary":
             own -= {"offset"}
         if own and self.role not in ("sensor", "ignored"):
             raise ValueError(f"{own.pop()} requires role = 'sensor'")
-        unfit = not sensor or self.follows or self.quantity or self.at_std is not None
-        if self.time_constant is not None and unfit:
+        return self
+
+    @model_validator(mode="after")
+    def _options_of_all_sensors(self) -> ChannelSpec:
+        sensor = self.role in SENSORS
+        placed = (self.follows, self.quantity, self.at_std) == (None, None, None)
+        if self.time_constant is not None and not (sensor and placed):
             raise ValueError("time_constant requires a sensor at a fixed place, without at_std")
         if self.of is not None and not sensor:
             raise ValueError(f"of requires a sensor, but the role is {self.role}")

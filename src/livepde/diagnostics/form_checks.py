@@ -467,22 +467,9 @@ def _volume_element(model: Model) -> list[Check]:
     x = measure.points[0]
     if measure.name is not None or not measure.kept or (x <= 0.0).any():
         return []
-    parts = model.form_M.owners("u")
-    values, slopes = (
-        [k for k, (_, what) in enumerate(parts) if what == part] for part in ("value", "grad")
-    )
-    q = model.parameter_space.prior
-    factors = [model.form_M.factor(k, k, 0.0) for k in values]
-    factors += [
-        model.physical_A.factor(k, k, 1.0, q=q) + model.form_B.factor(k, k, 1.0) for k in slopes
-    ]
-
-    def grows(factor: Array, power: int) -> bool:
-        each = np.broadcast_to(factor, x.size).reshape(x.shape) / x**power
-        same = np.ptp(each, axis=1) <= LINEARITY * np.abs(each).max(axis=1)
-        return bool(same.all() and each.any())
-
-    power = next((p for p in (1, 2) if all(grows(factor, p) for factor in factors)), 0)
+    factors = [np.broadcast_to(one, x.size).reshape(x.shape) for one in _own_factors(model)]
+    powers = (p for p in (1, 2) if all(_is_constant(one / x**p) for one in factors))
+    power = next(powers, 0)
     return [
         Check.at_most(
             "power of x[0] in mass and diffusion, but not in `weight`",
@@ -493,6 +480,24 @@ def _volume_element(model: Model) -> list[Check]:
             "volumes.",
         )
     ]
+
+
+def _own_factors(model: Model) -> list[Array]:
+    """Return the factors of each component in its mass, and of its gradient in its diffusion."""
+    q = model.parameter_space.prior
+    return [
+        model.form_M.factor(k, k, 0.0)
+        if part == "value"
+        else model.physical_A.factor(k, k, 1.0, q=q) + model.form_B.factor(k, k, 1.0)
+        for k, (_, part) in enumerate(model.form_M.owners("u"))
+        if part in ("value", "grad")
+    ]
+
+
+def _is_constant(factor: Array) -> bool:
+    """Whether a factor is constant in each cell, and not zero in all; shape (cells, points)."""
+    same = np.ptp(factor, axis=1) <= LINEARITY * np.abs(factor).max(axis=1)
+    return bool(same.all() and factor.any())
 
 
 def _algebraic(model: Model, at: _TestPoint) -> list[Check]:

@@ -348,16 +348,12 @@ class _Trials:
         columns, values = self.columns, self.columns.column(name)
         if len(values) < FEWEST_ROWS // 2:
             return
-        span, size = float(np.ptp(values)), float(np.abs(values).max())
-        constant = span <= PLAIN * size
-        each = [("offset", STEP * (span if span > 0.0 else max(size, 1.0)))]
-        if not constant:
-            each += [("gain", STEP), ("lag", columns.interval)]
+        driving, steps = name in columns.inputs, self._steps(values)
+        if "lag" in steps and driving and columns.whole(name):
+            del steps["lag"]
+            yield self._switched_late(base, name)
         slopes: dict[str, Array] = {}
-        for kind, step in each:
-            if kind == "lag" and name in self.columns.inputs and self.columns.whole(name):
-                yield self._switched_late(base, name)
-                continue
+        for kind, step in steps.items():
             g = self._change(base, Error(kind, (name,), step))
             if g is None:
                 continue
@@ -365,11 +361,17 @@ class _Trials:
             gained, theta = base.freed(slopes[kind])
             # Correcting by theta changes the residuals by theta g: so the column is off by theta.
             yield gained, Error(kind, (name,), self._bounded(kind, name, theta))
-        if "offset" in slopes and ("gain" in slopes or constant):
-            if name in columns.inputs:
-                yield from self._units(base, name, slopes)
-            else:
-                yield from self._sensor_units(base, name)
+        if steps.keys() - slopes.keys() <= {"lag"}:
+            units = self._units(base, name, slopes) if driving else self._sensor_units(base, name)
+            yield from units
+
+    def _steps(self, values: Array) -> dict[str, float]:
+        """Return kind -> size of the errors whose slopes are taken; of a constant, the offset."""
+        span, size = float(np.ptp(values)), float(np.abs(values).max())
+        steps = {"offset": STEP * (span if span > 0.0 else max(size, 1.0))}
+        if span > PLAIN * size:
+            steps |= {"gain": STEP, "lag": self.columns.interval}
+        return steps
 
     def _switched_late(self, base: _Fit, name: str) -> tuple[float, Error]:
         """Return how late an input is that is held, and by how much that lowers the cost.

@@ -417,8 +417,7 @@ def _trial(
             before, start = before[:, : work.tried], state.start
             if before.shape[1] == work.tried:
                 return {"trial": before, "trial_start": start}
-    full = before.shape[1] >= work.tried
-    if full or (before.shape[1] and not before[0, -1, 0] < span.t1):  # or it is taken again
+    if before.shape[1] >= work.tried or _reaches(before, span.t1):  # or it is taken again
         return {}
     trial = added(before, span, np.ones(1, dtype=bool), now.parts)
     if not now.driven.pause[0]:
@@ -426,6 +425,11 @@ def _trial(
     if work.fits:
         return {"trial": trimmed(trial, trial.shape[1]), "trial_start": zeros(now)}
     return {"trial": trimmed(trial, trial.shape[1] - 1), "trial_start": now}
+
+
+def _reaches(log: Array, t: float) -> bool:
+    """Whether a log of one member has a row at a time, or later."""
+    return bool(log.shape[1]) and not log[0, -1, 0] < t
 
 
 def _windows_from(

@@ -107,15 +107,11 @@ def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
         parts = [f"{counts[kind]} {text}" for kind, text in INPUT_KINDS.items() if counts[kind]]
         if not parts:
             continue
-        held = (counts.get("missing", 0) + counts.get("ended", 0)) / max(len(journal), 1)
-        sentence = FINDINGS["input, counts"]
-        if counts.get("bridged"):
-            sentence = FINDINGS["input, bridged"]
-        elif counts.get("ended"):
-            sentence = FINDINGS["input, ended"]
+        held = (counts["missing"] + counts["ended"]) / max(len(journal), 1)
+        which = next(filter(counts.get, ("bridged", "ended")), "counts")
         skip = channel_setting(name, "missing", '"skip"')
-        what = "Input" if name in driving else "Sensor"
-        text, remedy = sentence.filled(kind=what, name=name, counts=", ".join(parts), skip=skip)
+        told = {"kind": "Input" if name in driving else "Sensor", "name": name, "skip": skip}
+        text, remedy = FINDINGS[f"input, {which}"].filled(**told, counts=", ".join(parts))
         found.append(Finding("input", "note", text, name, held, remedy=remedy))
     return found
 

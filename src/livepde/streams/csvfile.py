@@ -9,7 +9,7 @@ import stat
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain, islice
+from itertools import chain, filterfalse, islice
 from operator import itemgetter
 from pathlib import Path
 from statistics import multimode
@@ -341,12 +341,15 @@ def _time_formats(
     header: Sequence[str], rows: Sequence[Sequence[str]], decimal: str
 ) -> tuple[str, ...]:
     """Return the formats of the first named column that may hold dates; none without one."""
-    for k, name in enumerate(header):
-        texts = [row[k].strip() for row in rows if k < len(row)]
-        texts = [text for text in texts if not is_missing(text)]
-        if not name or not texts or number_of(texts[0], decimal) is not None:
-            continue
-        if any(elapsed(texts[0], form) is not None for form in ELAPSED):
+
+    def is_dated(text: str) -> bool:
+        timed = any(elapsed(text, form) is not None for form in ELAPSED)
+        return not timed and number_of(text, decimal) is None
+
+    for k in (k for k, name in enumerate(header) if name):
+        cells = (row[k].strip() for row in rows if k < len(row))
+        texts = list(filterfalse(is_missing, cells))
+        if not texts or not is_dated(texts[0]):
             continue
         if formats := tuple(filter(None, date_formats(texts))):  # not of ISO dates
             return formats
