@@ -78,7 +78,7 @@ class FleetEstimate:
     statuses: tuple[Status, ...]
     steps: Array
     diagnose: Callable[[], Diagnostics[Array]]
-    held: Mapping[str, Array]
+    held: Mapping[str, Mask]
     space: FunctionSpace
     belief: Callable[[int], Belief]
     state_space: FunctionSpace | None = None

@@ -19,14 +19,14 @@ from livepde.fem import Inputs, Moment
 from livepde.fleet.assessment import assessed
 from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEngine, beginnings
 from livepde.fleet.estimate import FleetEstimate, FleetResult, number_of
+from livepde.fleet.taken import TakenByMembers
 from livepde.frames import layout_of
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status
-from livepde.laws.verdict import COUNTS
-from livepde.linalg import Array, IntArray, nonfinite_allowed
+from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
+from livepde.linalg.member_arrays import put, take
 from livepde.model import Model
 from livepde.observation import Observation, Observed
-from livepde.records import STATUS_CODES
 from livepde.samples import (
     check_noise,
     in_order_of,
@@ -140,21 +140,12 @@ class Fleet:
         self.note = law.stepped_alone(self._work)
         self._errors = [initial_errors(model, one) for one in off]
         self._engine = self._stepper(made_of, u0s)
-        count = len(self)
+        sizes = self.observed.size, len(self.inputs), len(self)
         self._state: Any = None
-        self._t = np.full(count, float(t0))
-        self._z = np.full((count, self.observed.size), np.nan)
-        self._inputs = np.full((count, len(self.inputs)), np.nan)
-        self._known = self._inputs.copy()  # the same, or what holds since a step has failed
-        self._held = np.zeros((count, len(self.inputs)))  # duration of the gaps of inputs by now
-        # What verdicts count, member by member, as `InputLedger` and `StepLedger` do.
-        self._held_counts = np.zeros((count, 1 + len(self.inputs)), dtype=np.int64)
-        self._unstated = np.zeros((count, len(self.inputs)))
-        self._steps = np.zeros((count, COUNTS), dtype=np.int64)
+        self._so_far = TakenByMembers.start(t0, *sizes)
         self._samples = 0
         self._starts: dict[int, Identifier] = {}
-        if not self.inputs:
-            self._begin(self._inputs)
+        self._begin_without_inputs()
 
     def _stated_at_start(self, u0s: Sequence[Any]) -> Array:
         """Return the inputs at t0 that u0 states, shape (members, channels), NaN elsewhere."""
@@ -222,7 +213,7 @@ class Fleet:
     @property
     def t(self) -> Array:
         """Time of the last accepted sample of each member, shape (members,)."""
-        return self._t.copy()
+        return self._so_far.t.copy()
 
     def _moments(self, t: Array, inputs: Array) -> list[Moment]:
         return [
@@ -230,8 +221,14 @@ class Fleet:
             for at, row in zip(t, inputs, strict=True)
         ]
 
-    def _begin(self, inputs: Array) -> None:
-        moments, u0 = self._moments(self._t, inputs), self._u0
+    def _begin_without_inputs(self) -> None:
+        """Begin at once if no input has to come with the first sample."""
+        if self._state is None and not self.inputs:
+            none = np.zeros((len(self), 0))
+            self._begin(none, none > 0.0)
+
+    def _begin(self, inputs: Array, unstated: Mask) -> None:
+        moments, u0 = self._moments(self._so_far.t, inputs), self._u0
         with nonfinite_allowed():  # refused below
             if self.model.form_initial is None:
                 starts = [self.model.impose(u, at) for u, at in zip(u0, moments, strict=True)]
@@ -245,7 +242,7 @@ class Fleet:
                     f"member '{name}' gets no finite initial state: check the values of its "
                     f"inputs {list(self.inputs)}; the run begins with the next sample."
                 )
-        self._state, self._inputs, self._known = state, inputs, inputs.copy()
+        self._state, self._so_far = state, self._so_far.begun(inputs, unstated)
 
     def step(
         self, t: float, z: Values, inputs: Mapping[str, ArrayLike] | None = None
@@ -283,31 +280,35 @@ class Fleet:
         measured, noise, validation, named = self._parsed(z, inputs)
         self._one._check_weighs(noise)
         # The times of members differ after a failed step: a sample has to be later than all.
-        last = float(self._t.max())
+        last = float(self._so_far.t.max())
         self._refuse_earlier(t, last)
         values, held = self._filled(named)
         none = np.zeros(len(self))
         missing = np.array([held.get(name, none) for name in self.inputs], dtype=float)
         missing = missing.reshape(len(self.inputs), len(self)).T
         if self._state is None:
-            if t > last:
-                held = {**held, **self._held_at_start(held)}
-            self._begin(self._opening(values) if t > last else values)
+            unstated = self._unstated & (t > last)
+            for k in np.flatnonzero(unstated.any(axis=0)):
+                held[self.inputs[k]] = unstated[:, k] | (missing[:, k] > 0.0)
+            self._begin(self._opening(values) if t > last else values, unstated)
         used = measured if t >= self._one.assimilate_from else np.full_like(measured, np.nan)
+        before = self._so_far
         ending = partial(
-            Span, t0=self._t, t1=t, channels=self.inputs, inputs1=values, z1=used, noise=noise
+            Span, t0=before.t, t1=t, channels=self.inputs, inputs1=values, z1=used, noise=noise
         )
         if t == last:
             span = ending(inputs0=values, z0=used)
             report = self._expected(span)
             self._state = self._engine.begin(self._state, span)
         else:
-            gaps = np.stack([self._held, missing], axis=1)
-            span = ending(inputs0=self._inputs, z0=self._z, gaps=gaps if gaps.any() else None)
+            gaps = np.stack([before.held, missing], axis=1)
+            span = ending(inputs0=before.inputs, z0=before.z, gaps=gaps if gaps.any() else None)
             span = span.driven(self.problem.control.held)
             self._state, report = self._engine.step(self._state, span)
-        self._samples += 1
-        self._keep(t, used, values, missing, report.statuses)
+        control = self.problem.control
+        holding = np.array([name in control.held.last for name in self.inputs], dtype=bool)
+        parts = t, used, values, missing, report.statuses, control, holding
+        self._so_far, self._samples = before.after(*parts), self._samples + 1
         return self._estimate(span, measured, validation, report, held)
 
     def _refuse_earlier(self, t: float, last: float) -> None:
@@ -317,44 +318,19 @@ class Fleet:
                 "sort the stream, and drop repeated samples."
             )
 
-    def _keep(
-        self, t: float, used: Array, values: Array, missing: Array, statuses: Sequence[Status]
-    ) -> None:
-        """Count the steps; keep time and values of a sample where the step was taken."""
-        codes = [STATUS_CODES.index(status.code) for status in statuses]
-        self._steps = self._steps + np.eye(COUNTS, dtype=np.int64)[codes]
-        self._steps[:, -1] += [*map(self.problem.control.stretches, (t - self._t).tolist())]
-        # A member whose step failed keeps its time and values: its next step covers both intervals.
-        good = np.array([status.taken for status in statuses])
-        lasting = (self._held + (t - self._t)[:, None]) * missing
-        self._held = np.where(good[:, None], lasting, self._held)
-        if self.inputs:
-            each = np.column_stack([np.ones(len(self)), missing > 0.0]).astype(np.int64)
-            self._held_counts = self._held_counts + each * good[:, None]
-        self._t = np.where(good, t, self._t)
-        self._z = np.where(good[:, None], used, self._z)
-        self._inputs = np.where(good[:, None], values, self._inputs)
-        # A value that holds until the next reading may not be read again.
-        stays = np.array([name in self.problem.control.held.last for name in self.inputs], bool)
-        self._known = np.where(good[:, None] | stays, values, self._known)
-
     def _opening(self, inputs: Array) -> Array:
         """Return the inputs at the initial time, from those of a later first sample."""
         unknown = np.isnan(self._stated)
         # The same object at both ends says that inputs are held.
         return inputs if unknown.all() else np.where(unknown, inputs, self._stated)
 
-    def _held_at_start(self, held: Mapping[str, Array]) -> dict[str, Array]:
-        """Return channels of the model -> members without a value now or at the initial time."""
-        found = {}
-        for k, name in enumerate(self.inputs):
-            unknown = np.isnan(self._stated[:, k])
-            if name in self.problem.control.held.next:  # the mean comes with the end
-                continue
-            if name in self.model.channels and unknown.any():
-                self._unstated[:, k] = unknown
-                found[name] = unknown | held.get(name, np.zeros(len(self), dtype=bool))
-        return found
+    @property
+    def _unstated(self) -> Mask:
+        """True for channels of the model without a value at the initial time, by member."""
+        # The mean over the first interval comes with its end.
+        read = {*self.model.channels} - {*self.problem.control.held.next}
+        asked: Mask = np.array([name in read for name in self.inputs], dtype=bool)
+        return np.isnan(self._stated) & asked
 
     def _expected(self, span: Span) -> MemberReports:
         beliefs, count = self._engine.beliefs(self._state), len(self)
@@ -370,7 +346,7 @@ class Fleet:
         measured: Array,
         validation: Array,
         report: MemberReports,
-        held: dict[str, Array],
+        held: dict[str, Mask],
     ) -> FleetEstimate:
         state, engine, error = self._state, self._engine, validation
         read = cache(lambda: engine.beliefs(state))
@@ -437,7 +413,7 @@ class Fleet:
 
     def template(self) -> Any:
         """Return the state of the first member at its start without inputs: for its structure."""
-        moments = self._moments(self._t[:1], np.zeros_like(self._inputs[:1]))
+        moments = self._moments(self._so_far.t[:1], np.zeros((1, len(self.inputs))))
         engine = self._engine.subset(np.array([0]))
         return engine.start(self._q0[:1], self._u0[:1], moments)
 
@@ -457,24 +433,20 @@ class Fleet:
         starts = self._q0, self._u0, self._errors
         other._q0, other._u0, other._errors = ([each[k] for k in which] for each in starts)
         other._stated = self._stated[which]
-        for name, values in self.ends.items():
-            setattr(other, f"_{name}", values[which])
+        other._so_far = take(self._so_far, which)
         other._state, other._samples = state, samples
-        if state is None and not self.inputs:
-            other._begin(other._inputs)
+        other._begin_without_inputs()
         return other
 
     def adopt(self, which: IntArray, part: Fleet) -> Any:
         """Take over times and values of a subset, and return its state; for `Shard`."""
-        for name, values in part.ends.items():
-            self.ends[name][which] = values
+        self._so_far = put(self._so_far, which, part._so_far)
         return part._state
 
     @property
     def ends(self) -> dict[str, Array]:
         """Times, measurements, inputs, their gaps and what verdicts count, by member."""
-        names = ("t", "z", "inputs", "known", "held", "held_counts", "unstated", "steps")
-        return {name: getattr(self, f"_{name}") for name in names}
+        return dict(vars(self._so_far))
 
     def run(self, stream: Iterable[Sequence[Any]]) -> FleetResult:
         """Take every sample of a stream, (t, z) or (t, z, inputs), and collect the estimates."""
@@ -579,14 +551,14 @@ class Fleet:
                 f"channel '{name}' of member '{member}' is infinite; send NaN for a missing sample."
             )
 
-    def _filled(self, named: Mapping[str, Array]) -> tuple[Array, dict[str, Array]]:
+    def _filled(self, named: Mapping[str, Array]) -> tuple[Array, dict[str, Mask]]:
         """Return all inputs, (members, channels), and which members hold their last value."""
         values, held = np.full((len(self), len(self.inputs)), np.nan), {}
         for k, name in enumerate(self.inputs):
             column = named.get(name, values[:, k])
             missing = np.isnan(column)
             if name not in self._one._channels.optional and missing.any():
-                column = np.where(missing, self._known[:, k], column)
+                column = np.where(missing, self._so_far.known[:, k], column)
                 if np.isnan(column).any():
                     member = self.members[int(np.argmax(np.isnan(column)))]
                     raise errors.MissingInputError(
@@ -652,21 +624,18 @@ class Fleet:
         state = None
         try:
             if header["begun"]:
-                moments = self._moments(self._t, np.zeros_like(self._inputs))
+                moments = self._moments(self._so_far.t, np.zeros((len(self), len(self.inputs))))
                 template = self._engine.start(self._q0, self._u0, moments)
                 inner = {path.removeprefix("state/"): leaf for path, leaf in leaves.items()}
                 state = self._engine.restored(template, inner)
-            ends, samples = {name: leaves[name] for name in self.ends}, int(leaves["samples"])
+            so_far, samples = self._so_far.restored(leaves), int(leaves["samples"])
         except (KeyError, ValueError) as error:
             raise errors.RunError(
                 f"{where} does not fit this fleet ({error}): build it with the law's options as "
                 "they were when it was saved."
             ) from error
-        for name, values in ends.items():
-            setattr(self, f"_{name}", values)
-        self._state, self._samples = state, samples
-        if state is None and not self.inputs:
-            self._begin(self._inputs)
+        self._state, self._so_far, self._samples = state, so_far, samples
+        self._begin_without_inputs()
 
 
 def _named(members: int | Sequence[str]) -> tuple[str, ...]:

@@ -373,19 +373,15 @@ class Shard:
         self._fleet.check(header, leaves, "the dump")
         try:
             offset, taken = int(leaves["offset"]), leaves["taken"].astype(np.int64)
-            ends = {name: leaves[name] for name in self._fleet.ends}
+            so_far = self._fleet._so_far.restored(leaves)
             inner = {path.removeprefix("state/"): leaf for path, leaf in leaves.items()}
             states = self._states.restored(inner)
-            for name, values in self._fleet.ends.items():
-                if ends[name].shape != values.shape:
-                    raise ValueError(f"{name} has shape {ends[name].shape}, needs {values.shape}")
         except (KeyError, ValueError) as error:
             raise RunError(
                 f"the dump does not fit this shard ({error}): build it with the law's options as "
                 "they were."
             ) from error
-        for name, values in self._fleet.ends.items():
-            values[:] = ends[name]
+        self._fleet._so_far = so_far
         self.offset, self._taken, self._states, self._torn = offset, taken, states, False
 
 
