@@ -232,7 +232,7 @@ class Fingerprint:
     """Texts and numbers of each part of a problem.
 
     `texts` has the options of a part, with a sign instead of each number; `numbers` the numbers,
-    and sizes of what they are sums of, shape (numbers, 2).
+    and the sizes of their terms, shape (numbers, 2).
     """
 
     texts: Mapping[str, str]
@@ -320,7 +320,7 @@ def fingerprint(
 
 
 def _start(q0: Array, u0: Array, errors: Array) -> list[Array]:
-    """Return sums of what a run begins with; none of errors of u0 where there are none."""
+    """Return sums of the start of a run; none of errors of u0 where there are none."""
     return [_sums(q0), _sums(u0), *([_sums(errors.ravel())] if errors.size else [])]
 
 
@@ -365,7 +365,7 @@ OF_SENSORS: tuple[Callable[..., Any], ...] = (
 def _evaluated(
     functions: Iterable[Callable[..., Any]], of: Model | Observed, places: Iterable[Place]
 ) -> list[Array]:
-    """Return sums of what the process is made of, or of what sensors show, at each place."""
+    """Return sums of the terms of the process, or of readings, at each place."""
     return [_tried(function, of, *place) for place in places for function in functions]
 
 
@@ -380,7 +380,7 @@ def _of_priors(model: Model) -> Iterator[Array]:
 
 
 def _tried(function: Callable[..., Any], *arguments: Any) -> Array:
-    """Return the sums of what a function returns; NaN if it has no value there."""
+    """Return the sums of the values of a function; NaN if it has none there."""
     try:
         return _sums(function(*arguments))
     except Exception:  # noqa: BLE001  a form may refuse a state in any way; so it does next time

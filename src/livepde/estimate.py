@@ -1,4 +1,4 @@
-"""The estimate after one sample: unknowns, state, and what is known about them."""
+"""The estimate after one sample: unknowns, state, diagnostics and verdict."""
 
 from __future__ import annotations
 

@@ -157,7 +157,8 @@ def draws(
 ) -> tuple[Array, Array]:
     """Return draws of the coefficients of parameter and state, shapes (n, m) and (n, state).
 
-    Jointly normal in latent values, with what the law leaves out; the state to first order.
+    Jointly normal in latent values, with the variance that the law omits; the state to first
+    order.
     """
     factor, rng = _factor(belief), np.random.default_rng(seed)
     xi = rng.standard_normal((n, factor.shape[1]))

@@ -246,7 +246,7 @@ class Model(Shown):
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return how pickle builds it again: from what it was made of."""
+        """Return how pickle builds it again: from its own arguments."""
         parts = self.state, self.parameter, self._parts
         try:
             pickle.dumps(parts)

@@ -18,7 +18,7 @@ from livepde.observation import Observation
 from livepde.stepping import Newton
 
 STRICT = Newton(tolerance=1e-12, share=0.0)
-"""Every step is solved to rounding, not only to what the time step leaves out."""
+"""Every step is solved to rounding, not only to the error of the time step."""
 
 
 def space(mesh: Any, **options: Any) -> Field:

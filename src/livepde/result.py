@@ -386,7 +386,7 @@ class Result(Shown):
         return records, last if missing else fields
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what was found, without the model, whose functions may not be pickled."""
+        """Return the records, without the model, whose functions may not be pickled."""
         records, fields = self._finished()
         own: dict[str, Any] = {
             "records": records,
@@ -447,6 +447,6 @@ class Result(Shown):
 
 
 def _check_count(name: str, value: Any) -> None:
-    """Refuse what is not a whole number, at least 1."""
+    """Refuse anything but a whole number of at least 1."""
     if not isinstance(value, Integral) or int(value) < 1:
         raise ConfigurationError(f"{name} must be a whole number, at least 1; got {value!r}.")

@@ -73,7 +73,7 @@ def options_of(value: Any) -> str:
 
 
 def expression(function: Callable[..., Any]) -> str:
-    """Return what a function returns, as its source has it; else the name of the function.
+    """Return the expression that a function returns, from its source; else its name.
 
     >>> expression(len)
     'len(...)'
@@ -92,7 +92,7 @@ def expression(function: Callable[..., Any]) -> str:
 
 
 def _returned(source: str, arguments: list[str]) -> Iterator[str]:
-    """Iterate over what the functions with these arguments in a piece of source return."""
+    """Iterate over the expressions that functions with these arguments return in some source."""
     for node in ast.walk(_parsed(source)):
         if not isinstance(node, ast.Lambda | ast.FunctionDef):
             continue

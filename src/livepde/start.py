@@ -20,7 +20,7 @@ from livepde.stepping import Advance, Scheme
 
 
 def check_parts(*parts: object) -> None:
-    """Refuse what is not a model, an observation and a law, in this order."""
+    """Refuse anything but a model, an observation and a law, in this order."""
     for part, kind in zip(parts, (Model, Observation, Law), strict=True):
         if not isinstance(part, kind):
             remedy = ": call it" if isinstance(part, type) and issubclass(part, kind) else ""

@@ -1,4 +1,4 @@
-"""What an identifier keeps of the samples it has taken, beside the state of its law."""
+"""Samples that an identifier has taken: the last one, and counts for the verdict."""
 
 from __future__ import annotations
 

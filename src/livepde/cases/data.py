@@ -392,7 +392,7 @@ def _from_first_inputs(case: CaseContent, table: DataTable) -> DataTable:
 
 
 def _from_row(case: CaseContent, table: DataTable, begin: int) -> DataTable:
-    """Return a record from a row on, with what the rows before it state of inputs that hold."""
+    """Return a record from a row on, with the values of held inputs in the rows before it."""
     values, channels = table.values[begin:].copy(), case.spec.channels
     for k, name in enumerate(table.names if begin else ()):
         stated = table.values[: begin + 1, k]

@@ -107,7 +107,7 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
 
 
 def predicted(prepared: Prepared, samples: Iterable[Sample]) -> tuple[Array, Array]:
-    """Return the first readings, and what the prior predicts of them, shapes (samples, sensors)."""
+    """Return the first readings, and their predictions by the prior, shapes (samples, sensors)."""
     law = SensitivityLaw(
         modes=1, noise=1.0, refit=None, guards=None, shadows=None, gate=np.inf, verdict=False
     )

@@ -63,7 +63,7 @@ def proposed(prepared: Prepared, base: VariantRun, most: int = MOST) -> list[Var
 
 
 def _candidates(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
-    """Iterate over likely causes, then over what is often missing or too much in a case."""
+    """Iterate over likely causes, then over common errors of a case."""
     case = prepared.case
     # A start that the first readings miss looks like many other errors.
     if first_miss(prepared) > _usual_error(base):

@@ -75,13 +75,13 @@ def _also(prepared: Prepared, causes: Sequence[Cause]) -> Iterator[Cause]:
 
 
 def _omitted(prepared: Prepared) -> str:
-    """Return what the equation leaves out at the beginning, and what to do; empty if nothing."""
+    """Return the term that the equation omits at first, and the remedy; empty without one."""
     text, later = prepared.case.equation.omits, later_start(prepared)
     return f"{text} Or begin later: `{later}`." if text and later else text
 
 
 def later_start(prepared: Prepared) -> str:
-    """Return the setting of a start after which what the equation leaves out has faded.
+    """Return the setting of a start after which the omitted term has faded.
 
     Empty if nothing is left out, or if that takes more than half of the record.
     """
@@ -259,7 +259,7 @@ def usual_shift(prepared: Prepared, name: str) -> float:
 
 
 def _stated(case: Case, cause: Cause) -> tuple[str, ...]:
-    """Return the settings of a cause; none that would replace what the case states.
+    """Return the settings of a cause; none that would replace a value of the case.
 
     None either with a unit of another quantity: the law does not know the unit of each input.
     """

@@ -1,4 +1,4 @@
-"""What may be wrong with a sensor that is set aside, from its readings and their predictions."""
+"""Likely errors of a sensor that is set aside, from its readings and their predictions."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def _begin(
     time_format: str,
     skip: int | None,
 ) -> None:
-    """Write a case for tables, with some keys set, and print what was read and is left open."""
+    """Write a case for tables, with some keys set, and print a summary with its open keys."""
     zone = zone_named(str(changes.get("data.zone") or "UTC"), "--set data.zone")
     missing = missing_in(changes.pop("data.missing", None), "--set data.missing")
     how: dict[str, Any] = {"time_format": time_format, "skip": skip, "zone": zone}

@@ -305,7 +305,7 @@ def concluded(
 
 
 def _judged(prepared: Prepared, driven: Driven, dataset: xr.Dataset) -> Verdict:
-    """Return the verdict on a run, with settings of the case that would remedy what was found."""
+    """Return the verdict on a run, with settings of the case that would remedy its findings."""
     raw, journal = prepared.raw, driven.journal
 
     def readings() -> tuple[Array, Array]:

@@ -52,7 +52,7 @@ except ImportError as error:
 
 
 class {name}(IdentifierSlave, Fmi{fmi}Slave):
-    """What the unit does is in livepde.exchange.slave."""
+    """Its behaviour is in livepde.exchange.slave."""
 
     fmi = {fmi}
 '''

@@ -532,7 +532,7 @@ Declaration: TypeAlias = Field | Scalar | Piecewise | Scalars
 """An unknown with its options."""
 
 Unknown: TypeAlias = Declaration | Prior
-"""What a model takes as an unknown; a prior alone is that of one number."""
+"""Types that a model accepts as an unknown; a prior alone is that of one number."""
 
 
 def declared(unknown: Unknown) -> Declaration:

@@ -1,4 +1,4 @@
-"""Where weak forms are evaluated: coordinates, time, inputs, and quadrature of cells and facets."""
+"""Points where weak forms are evaluated, with time, inputs and quadrature of cells and facets."""
 
 from __future__ import annotations
 

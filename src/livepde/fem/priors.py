@@ -289,7 +289,7 @@ class Logit(Transform):
 
 
 class Prior(ABC):
-    """What is known of a number before the first sample: common base of the distributions.
+    """Belief about a number before the first sample: common base of the distributions.
 
     `std` is the standard deviation in the unit of the unknown; an estimate never leaves `bounds`.
     """

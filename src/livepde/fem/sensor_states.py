@@ -26,7 +26,7 @@ class SensorState:
     Attributes
     ----------
     row
-        Function of the state space that returns G, what the sensor sees of it, shape (1, n).
+        Function of the state space that returns G, the row by which the sensor reads it, (1, n).
     time_constant
         In the unit of time of the model; None: the unknown `time_constant[NAME]`.
     """
@@ -40,7 +40,7 @@ class SensorState:
 
 
 class SensorPair(NamedTuple):
-    """What a slow sensor sees and shows, in a form."""
+    """Input and output of a slow sensor, in a form."""
 
     seen: Any
     shown: Any
@@ -49,7 +49,7 @@ class SensorPair(NamedTuple):
 class SensorBlock(Block):
     """The one coefficient of a slow sensor.
 
-    `number` is its place among all coefficients, `row` what it sees of the others, (1, number).
+    `number` is its place among all coefficients, `row` reads the others, (1, number).
     """
 
     size = 1

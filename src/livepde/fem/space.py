@@ -304,7 +304,7 @@ class FunctionSpace:
         return np.repeat([1.0, 0.0], [self.seen, len(self.sensors)])
 
     def completed(self, u: Array) -> Array:
-        """Return states, (dim,) or (dim, k), in which each slow sensor shows what it sees."""
+        """Return states, (dim,) or (dim, k), in which each slow sensor shows its input."""
         if not self.sensors:
             return u
         found = u.copy()
@@ -409,7 +409,7 @@ class FunctionSpace:
 
     @cached_property
     def described(self) -> NamedUnknowns:
-        """What a reader of estimates needs of the space, without functions and meshes."""
+        """The space without functions and meshes, for readers of estimates."""
         return NamedUnknowns(
             labels=self.labels,
             parts=self.parts,

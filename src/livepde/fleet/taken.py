@@ -1,4 +1,4 @@
-"""What a fleet keeps of the samples that its members have taken."""
+"""Samples that the members of a fleet have taken: the last ones, and counts for verdicts."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ class MemberReports:
 
 
 class GateDecision(NamedTuple):
-    """What a gate has decided on a sample."""
+    """Decision of a gate on a sample."""
 
     refused: Mask  # readings that do not correct the unknowns, shape (members, sensors)
     anchored: Mask  # those of them that correct the state alone
@@ -220,7 +220,7 @@ def _density(
 
 
 class _Admitted(NamedTuple):
-    """Which readings are used, which are refused, and what the gate remembers."""
+    """Which readings are used, which are refused, and the memory of the gate."""
 
     used: Mask
     refused: Mask

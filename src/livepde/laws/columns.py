@@ -307,7 +307,7 @@ def likely_columns(columns: Columns, least: float) -> list[Cause]:
 
 
 class _Trials:
-    """The errors of some columns, and what they explain."""
+    """The errors of some columns, and the misfit that each explains."""
 
     def __init__(self, columns: Columns) -> None:
         self.columns = columns

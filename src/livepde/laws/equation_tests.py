@@ -270,7 +270,7 @@ class ObservedEquation:
 
 
 class EquationTests:
-    """Test functions within omega, and the judgement of what they see.
+    """Test functions within omega, and the judgement of their products.
 
     `forms`: forms of a stage of all sensors. `prior`: columns V, shape (m, k), with the covariance
     V V^T of q that a prior states; none where the law does not go by the prior.

@@ -69,7 +69,7 @@ class Course(NamedTuple):
     constant: Array | None = None  # the amplitudes with which they are constant; None: ones
 
     def varying(self, columns: Array) -> Array:
-        """Return the columns, (..., columns), with no effect of what is constant in time."""
+        """Return the columns, (..., columns), without the effect of constants."""
         one = np.ones(self.size) if self.constant is None else self.constant
         found: Array = columns - (columns @ one)[..., None] * one / (one @ one)
         return found
@@ -297,7 +297,7 @@ class ErrorColumns:
         return p
 
     def _without_unknowns(self, found: Array, nows: Sequence[Now]) -> Array:
-        """Return answers without what an unknown does, which is no error of the model."""
+        """Return answers without the effect of an unknown, which is no error of the model."""
         some = np.linspace(0, len(nows) - 1, min(COMPARED, len(nows))).astype(int)
         for number in self._of_unknowns([nows[k] for k in some]):
             first, (_, course) = self.first[number], self.answers[number]

@@ -122,7 +122,7 @@ class Filter:
     def input_gaps(self, span: Span) -> Mask | None:
         """Return for which members an input was not read in a span, (members,); None: for none.
 
-        What the innovations tell then may be what that input has done.
+        Innovations may then be due to that input.
         """
         if span.gaps is None:
             return None
@@ -253,7 +253,7 @@ class Filter:
     def _with_inputs(
         self, x: FilterState, end: FilterState, span: Span
     ) -> tuple[FilterState, StepFailed | None]:
-        """Return the state with the errors of inputs, and of what they have done in a pause."""
+        """Return the state with the errors of inputs, also in a pause."""
         noise, failure = self.problem.input_noise, None
         if noise:
             end, failure = with_input_errors(self.carried, x, end, span, noise)

@@ -29,7 +29,7 @@ NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not j
 
 @dataclass(frozen=True, eq=False)
 class InputHistory:
-    """What the inputs have done so far, and at which pace."""
+    """Ranges and rates of the inputs so far, and the pace of their samples."""
 
     # Range of each input, and its largest rate of change, shapes (members, channels).
     low: Array
@@ -211,7 +211,7 @@ class FilterState:
     innovations: Innovations  # statistics of the innovations
     # In how many parts the substeps since the sample before were divided, shape (members,).
     parts: IntArray
-    screened: Screened  # what the gate remembers of each sensor
+    screened: Screened  # memory of the gate, by sensor
     # Square of the noise as a multiple of the stated one, 1 unless the filter finds it, and how
     # many samples that stands for, shapes (members,).
     level: Array
@@ -226,7 +226,7 @@ class FilterState:
     causes: Array = field(metadata={"grows": 1, "begins_anew": True})
     ledger: Ledger = field(metadata={"begins_anew": True})
     shadows: ShadowState  # estimated discretisation error
-    driven: InputHistory  # what the inputs have done so far
+    driven: InputHistory  # ranges and rates of the inputs so far
 
     def __len__(self) -> int:
         return len(self.member)

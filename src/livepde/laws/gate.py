@@ -32,7 +32,7 @@ NORMAL = 1.4826  # standard deviation of normal values over the median of their 
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """What the gate remembers of each sensor; arrays have the shape (members, sensors)."""
+    """Memory of the gate, by sensor; arrays have the shape (members, sensors)."""
 
     # Refusals in a row, and how many of these readings differed from the one before.
     refused: IntArray
@@ -106,12 +106,12 @@ class Gated(NamedTuple):
     kept: Mask  # readings that are used
     anchored: Mask  # readings that correct the state alone
     counted: Mask  # readings that count in the test for jumps
-    state: Screened  # what the gate remembers
+    state: Screened  # memory of the gate
 
 
 @dataclass(frozen=True)
 class Gate:
-    """Refuses readings that do not fit, and decides what a lasting misfit means.
+    """Refuses readings that do not fit, and interprets a lasting misfit.
 
     A reading fits if its innovation is at most `beyond` expected standard deviations. After
     `patience` refusals in a row the sensor is believed if its readings are plausible and most of
@@ -142,7 +142,7 @@ class Gate:
         t: float,
         pause: Mask,
     ) -> Gated:
-        """Return what is used of a sample at time t.
+        """Return the used part of a sample at time t.
 
         `z`, `d`, `noise`: readings, innovations and their noise, shapes (members, sensors). `far`,
         `used`: readings that do not fit, and those that are present. `pause`: members for which the

@@ -354,7 +354,7 @@ class _Samples:
         return _Pass(np.array(followed), smoothed, x, misfit)
 
     def _moved(self, followed: Sequence[Array], x: FilterState, h: float) -> float:
-        """Return what the last increment of the unknowns adds to the misfit."""
+        """Return the misfit that the last increment of the unknowns adds."""
         filter_, reduction = self.work.filter, self.work.filter.reduction
         if not filter_.moves:
             return 0.0

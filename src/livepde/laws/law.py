@@ -443,7 +443,7 @@ class Law(ABC, Generic[Work, State]):
         return None
 
     def diagnosed(self, work: Work, state: State) -> Diagnostics[float]:
-        """Return what is known of the estimate besides itself between two samples."""
+        """Return the diagnostics of the estimate between two samples."""
         return Diagnostics()
 
     def weighs_readings(self) -> bool:

@@ -1,4 +1,4 @@
-"""When a filter goes back to earlier samples: to fit them again, to recover, or after a jump."""
+"""Policies by which a filter goes back to earlier samples: refit, safeguards and jumps."""
 
 from __future__ import annotations
 

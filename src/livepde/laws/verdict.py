@@ -1,4 +1,4 @@
-"""Which causes the verdict on a filter looks for, what has moved it, and how steps ended."""
+"""Causes that the verdict on a filter tests, its largest innovations, and how steps ended."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def with_noise(verdict: Verdict, work: SensitivityWork, level: float) -> Verdict
 def after_fit(verdict: Verdict, fit: Fit | None) -> Verdict:
     """Return a verdict at the end of a run, where a fit of all its samples has converged.
 
-    The fit decides on all readings again: what the gate refused before it counts no longer.
+    The fit decides on all readings again: earlier refusals by the gate do not count.
     """
     if fit is None or not fit.converged:
         return verdict

@@ -1,6 +1,6 @@
 """States of several members: dataclasses of arrays whose leading axis is the members.
 
-Arrays without members hold what no member has, and stay so.
+Arrays without members stay empty.
 """
 
 from __future__ import annotations

@@ -319,7 +319,7 @@ class Observed:
     """An observation bound to a state space: predicted readings and their derivatives.
 
     Sensors other than z = G u + D q override `predict`, `jacobian` and `linear`, `available` if
-    readings may be missing, and `_prepare` to compute what they need.
+    readings may be missing, and `_prepare` to compute their common part.
     """
 
     def __init__(

@@ -108,5 +108,5 @@ class Slow(Observation):
 
 
 def _row(base: Any, number: int, state: FunctionSpace) -> sp.csr_array:
-    """Return what a sensor of an observation sees of a state, (1, n)."""
+    """Return the row by which a sensor of an observation reads a state, (1, n)."""
     return sp.csr_array(base.matrix(state))[[number]]

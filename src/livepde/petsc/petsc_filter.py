@@ -61,7 +61,7 @@ class PetscFilterState:
 
 @dataclass(frozen=True, eq=False)
 class FilterReport:
-    """Status of a sample, and of shape (sensors,) z - G u, its expected size, and what was used."""
+    """Status of a sample; of shape (sensors,) z - G u, its expected size, and the used readings."""
 
     status: Status
     innovation: Array

@@ -299,7 +299,7 @@ class ImplicitStep:
 def check_petsc_model(
     model: PetscModel, u: Any, q: Any, t: float = 0.0, w: Any = None, *, seed: int = 1
 ) -> CheckReport:
-    """Check what the laws rely on, at a point u, q, t, in random directions.
+    """Check the assumptions of the laws at a point u, q, t, in random directions.
 
     With data w on omega it is what `PetscObserver` relies on, without what `PetscFilter` does.
     """

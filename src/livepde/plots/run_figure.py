@@ -93,7 +93,7 @@ def overview(
 
 
 def curves(data: xr.Dataset, t: Array, measured: Array, *, title: str = "") -> Figure:
-    """Draw the readings of each sensor, and what the model expected of them.
+    """Draw the readings of each sensor, and the predictions of the model.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def measured_and_predicted(
     sensors: Sequence[str] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw readings of sensors with one unit, and what the model predicted of them.
+    """Draw readings and predictions of sensors with one unit.
 
     Lines of validation sensors are dashed: they are predicted after the sample, and never used.
 
@@ -287,7 +287,7 @@ def corner(draws: xr.Dataset, names: Sequence[str] | None = None, *, axes: Any =
 
 
 def _chosen(names: Sequence[str] | None, known: list[str], what: str) -> list[str]:
-    """Return names of what is to be drawn, default all; `what` begins the message for others."""
+    """Return the names to draw, default all; `what` begins the message for unknown ones."""
     shown = known if names is None else list(names)
     for name in shown:
         if name not in known:
@@ -322,7 +322,7 @@ class RunPlots:
     def measured_and_predicted(
         self, *, sensors: Sequence[str] | None = None, ax: Axes | None = None
     ) -> Axes:
-        """Draw the readings of sensors with one unit, and what the model predicted of them."""
+        """Draw readings and predictions of sensors with one unit."""
         data, measured = self._data(), self._result.measured
         t = data["time"].values
         return measured_and_predicted(data, t, measured.to_numpy(), sensors=sensors, ax=ax)

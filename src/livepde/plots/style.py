@@ -1,4 +1,4 @@
-"""What figures show of the dataset of a run, and their common style: colours, axes, legends."""
+"""Parts of the dataset of a run for figures, and their common style: colours, axes, legends."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ def build(std: float = 1.0, nodes: int = N, *, clamped: bool = False) -> tuple[M
 
 
 def twin_of(std: float = 1.0, *, clamped: bool = False, **options: Any) -> Twin:
-    """Return the twin of `build`; `options` of `Twin` replace what it states."""
+    """Return the twin of `build`; `options` of `Twin` replace its own."""
     model, omega = build(std, clamped=clamped)
     truth = {"q_true": q_true, "u_true": u_true, "times": TIMES}
     given = {"model": model, "observation": omega, "scheme": ImplicitEuler(), **truth, **options}

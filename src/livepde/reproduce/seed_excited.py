@@ -70,7 +70,7 @@ def build(std: float = 1.0) -> tuple[Model, Full]:
 
 
 def twin_of(std: float = 1.0, **options: Any) -> Twin:
-    """Return the twin of `build`; `options` of `Twin` replace what it states."""
+    """Return the twin of `build`; `options` of `Twin` replace its own."""
     model, full = build(std)
     truth = {"q_true": q_true, "u_true": u_true, "times": TIMES}
     given = {"model": model, "observation": full, "scheme": ImplicitEuler(), **truth, **options}

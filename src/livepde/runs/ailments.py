@@ -18,7 +18,7 @@ UNUSED = frozenset(  # rows and values of no use
 
 
 class Ailments:
-    """What is wrong with a live run, from what it meets.
+    """Faults of a live run, from its events.
 
     A verdict is no ailment: the process is well while its model is not.
 
@@ -95,7 +95,7 @@ class Ailments:
         self._heard = self._taken = self._clock()
 
     def listen(self, heard: bool) -> str:
-        """Note whether a row has come; return what there is to report of a silence that ends."""
+        """Note whether a row has come; return the report on a silence that ends."""
         now, ended = self._clock(), ""
         if heard:
             if self.silent:

@@ -1,4 +1,4 @@
-"""What a live run does with samples that come too fast, and with old ones; where estimates go."""
+"""Queue of a live run: samples that come too fast, old samples, and sinks of estimates."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ class Live:
     Attributes
     ----------
     ailments
-        What is wrong with the run.
+        Faults of the run.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What a live run shows others: /health, /metrics for Prometheus, its log, lines of JSON."""
+"""Outputs of a live run for others: /health, /metrics for Prometheus, its log, JSON lines."""
 
 from __future__ import annotations
 

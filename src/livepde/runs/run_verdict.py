@@ -134,7 +134,7 @@ def clock_findings(journal: Journal) -> list[Finding]:
 def sampling_findings(
     data: xr.Dataset, readings: Callable[[], tuple[Array, Array]] | None = None
 ) -> list[Finding]:
-    """Return what the times of a run show: units that changed, clocks that leapt, and pauses.
+    """Return findings on the times of a run: changed units, clocks that leapt, and pauses.
 
     `readings`: returns times and values of the channels, shapes (samples,) and (samples, channels).
     It is called if there is a pause. Without it a leap of the clock is called a pause.

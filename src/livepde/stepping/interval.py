@@ -78,7 +78,7 @@ NO_INPUTS = np.zeros((1, 0))
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class End:
-    """What is known at one end of a sample interval, as in `Interval`."""
+    """Values at one end of a sample interval, as in `Interval`."""
 
     t: float
     inputs: Mapping[str, float]

@@ -372,7 +372,7 @@ class BandedStage(MemberStage):
             known[together:] -= _sums_along(along[:, chosen:], driven)
 
     def _begin(self, stage: StageOfMembers) -> BandedStep:
-        """Return what all stages of a length share, and keep it for the next one."""
+        """Return the common part of all stages of a length, and keep it for the next one."""
         latent, h = self.model.latent, stage.h
         unknowns = stage.q if latent.plain else latent.value(stage.q.T).T
         slopes, coefficients = None, self.model.coefficients
@@ -442,7 +442,7 @@ def _sums_along(directions: Array, driven: Array) -> Array:
 
 
 def _along(form: Form, unit: Array, of: Callable[[Array], Array]) -> Array:
-    """Return the change of what is affine in q with one of the unknowns, `unit` a row of ones.
+    """Return the change of an affine function of q with one of the unknowns, `unit` a row of ones.
 
     Where A has a part without unknowns it is a difference, at values so large that it loses none
     of its digits.

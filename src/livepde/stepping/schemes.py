@@ -34,7 +34,7 @@ def safe_point() -> None:
 
 @contextmanager
 def interruptible(check: Callable[[], None]) -> Iterator[None]:
-    """Let a function be called before each substep; what it raises ends the computation."""
+    """Let a function be called before each substep; an exception in it ends the computation."""
     token = CHECK.set(check)
     try:
         yield

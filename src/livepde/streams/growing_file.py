@@ -39,7 +39,7 @@ UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 
 class Line(NamedTuple):
-    """A line, or what has happened to a file."""
+    """A line of a file, or an event of it."""
 
     number: int  # of the file
     start: int  # first byte of the line in it
@@ -49,7 +49,7 @@ class Line(NamedTuple):
 
 
 class FilePosition(NamedTuple):
-    """A place in a file: where it is, and by what the file is known."""
+    """A place in a file, and the mark of the file."""
 
     start: int = 0  # byte before which all was read
     crc: int = 0  # checksum of the first bytes before it
@@ -84,7 +84,7 @@ class _Content:
 
     @classmethod
     def open(cls, path: Path) -> _Content | None:
-        """Open a file, None if there is none; raises `DataError` for what is not a file."""
+        """Open a file, None if there is none; raises `DataError` if it is not a file."""
         try:
             # To open a pipe without a writer would hold the program up.
             if not stat.S_ISREG(path.stat().st_mode):
@@ -128,7 +128,7 @@ class _Content:
         )
 
     def is_unchanged(self) -> bool:
-        """Return whether what was read is still there."""
+        """Return whether the lines that were read are still there."""
         return self.known(self.head, self.tail, self.offset)
 
     def fits(self, place: FilePosition) -> bool:
@@ -188,7 +188,7 @@ class _Content:
         return found
 
     def _missed(self, chunk: bytes) -> list[Line]:
-        """Return a report if rows may be missing between a file and what it was before.
+        """Return a report if rows may be missing between a file and its earlier content.
 
         Where the last line is still there, as in a window of rows that moves on, none is missing.
         """
@@ -360,7 +360,7 @@ class GrowingFile:
         return True
 
     def _changed(self, now: _Content) -> list[Line]:
-        """Go over to what has become of a file whose content was changed."""
+        """Continue with a file whose content was changed."""
         copy = self._copy_of(now)
         if copy is not None:
             self._begin(copy)

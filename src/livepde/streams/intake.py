@@ -563,7 +563,7 @@ class Intake:
                 self._accepted.popleft()
 
     def _held(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Return what a sample that is left out states of inputs."""
+        """Return the held inputs that an omitted sample states."""
         habits = {channel: self.policy.habit(channel) for channel in values}
         return {
             channel: value

@@ -131,7 +131,7 @@ class _Client:
         raise NotImplementedError
 
     def _connected(self) -> None:
-        """Note that the server accepts what is asked of it."""
+        """Note that the server accepts requests."""
         if self._started.done():
             log.info("reconnected to the server at %s", self._server.url)
         else:
@@ -328,7 +328,7 @@ class OpcuaSink(_Client):
 
 
 async def _writable(client: Any, name: str, column: str) -> tuple[Any, Any, str]:
-    """Return a node, its type and what is written to it."""
+    """Return a node, its type and the value to write."""
     from asyncua.ua import AccessLevel, VariantType
     from asyncua.ua.uaerrors import UaError
 

@@ -117,7 +117,7 @@ class Follow(RowSource):
     skipped. A line is read once its end has been written. If a header appears again, its order of
     the columns holds from there on.
 
-    What becomes of the file is described in `livepde.streams.growing_file`: one that is renamed is
+    Changes of the file are described in `livepde.streams.growing_file`: one that is renamed is
     read to its end before the new one, and one that is cut or written again is read from its start,
     where known rows are repeated. If rows may be missing, a row without values reports it.
 
@@ -239,7 +239,7 @@ class Follow(RowSource):
             del self._headers[place]
 
     def _read_header(self, line: Line, at: int) -> None:
-        """Read the header at a place, and labels under it, from what is before a line."""
+        """Read the header at a place, and labels under it, from the text before a line."""
         self._above = 0 if at else self._skip
         for content in self._file.before(at):
             if at >= line.start or (self._header is not None and not self._labels):

@@ -51,7 +51,7 @@ class Column:
         Channel whose readings have this standard deviation; "": none. A value that is not
         positive makes the reading missing; a missing one is replaced by that of the sensor.
     between
-        How the channel behaves between two readings; rows that are left out keep what they state
+        How the channel behaves between two readings; omitted rows keep their values
         of a channel that is no "line".
     """
 
@@ -340,7 +340,7 @@ def _known_before(
 def _with_held(
     t: Array, values: Array, rows: Thinned, chosen: Mask, kept: Mask
 ) -> tuple[Array, Mask]:
-    """Return the rows of a table, and which stay, with what all rows state of held inputs.
+    """Return the rows of a table, and which stay, with the held inputs of all rows.
 
     `chosen` are the rows that `every` leaves, `kept` those of them that lack no needed channel.
     """

@@ -48,7 +48,7 @@ class Thinned:
                 self._last[k] = row[k]
 
     def take(self, t: float, row: Array, *, chosen: bool, whole: bool) -> Array | None:
-        """Return what is left of a row, NaN where a column is missing; None if nothing.
+        """Return the rest of a row, NaN where a column is missing; None if nothing is left.
 
         `chosen`: whether `every` leaves the row.
         `whole`: whether the row has all channels that a sample needs.

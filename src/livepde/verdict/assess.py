@@ -75,7 +75,7 @@ FACTOR = 2.0  # by which the scale of a sensor or an input may be wrong
 LONGEST = 0.25  # of the run: how late a sensor may be
 SEEN = 4.0  # standard errors of an amplitude from which it shows
 BEYOND = 2.0  # standard deviations of a shift beyond an interval
-UNSEEN = 3  # sentences on what is not seen
+UNSEEN = 3  # sentences on errors that no sensor shows
 
 
 @dataclass(frozen=True, eq=False)

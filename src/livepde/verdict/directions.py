@@ -48,7 +48,7 @@ MOST_SUMS = 12_000  # numbers in one kind of sum
 
 
 class Now(NamedTuple):
-    """Point of a response: state, latent parameter, time and inputs, and what a load asks for."""
+    """Point of a response: state, latent parameter, time, inputs, and the arguments of a load."""
 
     u: Array
     q: Array

@@ -76,7 +76,7 @@ class LinearModel:
     J: Array
     Z: Array
     z: Array
-    T: Array  # what is asked for, as rows on xi, (numbers, p)
+    T: Array  # wanted numbers, as rows on xi, (numbers, p)
 
     @cached_property
     def _known(self) -> tuple[Array, Array]:

@@ -29,7 +29,7 @@ PROMISES: dict[Level, str] = {
     NOT_JUDGED: "the model was not tested",
     LEVELS[-1]: "do not use the estimates as they are",
 }
-"""Level -> what it means for the estimates."""
+"""Level -> its meaning for the estimates."""
 DOUBTS = ("misfit", "constancy", "disagreement")  # findings that speak against the model
 # Those whose severity follows from fit and effect: the interval holds shifts by the discretisation.
 RANKED = (*DOUBTS, "following", "stuck", "discretisation")

@@ -1,4 +1,4 @@
-"""How far a model is from the data, and by how much its errors may have moved the unknowns."""
+"""Misfit of a model, and how far its errors may have moved the unknowns."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class ModelErrors:
     Attributes
     ----------
     misfit
-        Root mean square of what the best fit leaves of the readings, over the noise that
+        Root mean square of the residuals of the best fit, over the noise that
         successive readings show.
     of_signal
         The same over the standard deviation of the readings in time.

@@ -69,7 +69,7 @@ def _measured_panels(data: xr.Dataset, at: float | None) -> Iterator[Panel]:
         return
     units = style.sensors_by_unit(data)
     for unit, names in units.items():
-        about = "Points: readings. Lines: what the model expected of them one step ahead."
+        about = "Points: readings. Lines: predictions of the model one step ahead."
         if "validation" in data and set(names) & set(map(str, data["validation"].values)):
             about += " Dashed: validation sensors, which it never uses."
         if len(names) > style.MOST_LINES:
@@ -80,7 +80,7 @@ def _measured_panels(data: xr.Dataset, at: float | None) -> Iterator[Panel]:
 
 
 def measured(data: xr.Dataset, sensors: Sequence[str], unit: str, at: float | None) -> go.Figure:
-    """Draw the readings of sensors of one unit, and what the model expected of them."""
+    """Draw readings and predictions of sensors of one unit."""
     data = _bounded(data)
     figure, axis = canvas.over_time(data, style.shown_unit(unit), at)
     t = axis.values(data["time"].values)
