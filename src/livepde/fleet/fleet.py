@@ -227,6 +227,16 @@ class Fleet:
             none = np.zeros((len(self), 0))
             self._begin(none, none > 0.0)
 
+    def _begun_by(self, values: Array, missing: Mask, *, later: bool) -> dict[str, Mask]:
+        """Begin with the inputs of a first sample, at the initial time or later.
+
+        Return the channels of the model that have no value at the initial time.
+        """
+        unstated = self._unstated & later
+        self._begin(self._opening(values) if later else values, unstated)
+        some = np.flatnonzero(unstated.any(axis=0)).tolist()
+        return {self.inputs[k]: unstated[:, k] | missing[:, k] for k in some}
+
     def _begin(self, inputs: Array, unstated: Mask) -> None:
         moments, u0 = self._moments(self._so_far.t, inputs), self._u0
         with nonfinite_allowed():  # refused below
@@ -287,10 +297,7 @@ class Fleet:
         missing = np.array([held.get(name, none) for name in self.inputs], dtype=float)
         missing = missing.reshape(len(self.inputs), len(self)).T
         if self._state is None:
-            unstated = self._unstated & (t > last)
-            for k in np.flatnonzero(unstated.any(axis=0)):
-                held[self.inputs[k]] = unstated[:, k] | (missing[:, k] > 0.0)
-            self._begin(self._opening(values) if t > last else values, unstated)
+            held |= self._begun_by(values, missing > 0.0, later=t > last)
         used = measured if t >= self._one.assimilate_from else np.full_like(measured, np.nan)
         before = self._so_far
         ending = partial(

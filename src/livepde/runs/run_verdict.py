@@ -58,6 +58,8 @@ ZONE = (
     "'Europe/Berlin'. "
 )
 OF_SENSORS = "start", "early"  # kinds of remarks that matter for sensors, too
+# Kind of a gap -> its sentence, the first that applies; else that of "".
+SENTENCES = {"bridged": "input, bridged", "ended": "input, ended", "": "input, counts"}
 INPUT_KINDS = {
     "start": "first values were outliers and count as missing",
     "spike": "spikes were rejected",
@@ -108,10 +110,10 @@ def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
         if not parts:
             continue
         held = (counts["missing"] + counts["ended"]) / max(len(journal), 1)
-        which = next(filter(counts.get, ("bridged", "ended")), "counts")
+        sentence = SENTENCES[next(filter(counts.get, SENTENCES), "")]
         skip = channel_setting(name, "missing", '"skip"')
         told = {"kind": "Input" if name in driving else "Sensor", "name": name, "skip": skip}
-        text, remedy = FINDINGS[f"input, {which}"].filled(**told, counts=", ".join(parts))
+        text, remedy = FINDINGS[sentence].filled(**told, counts=", ".join(parts))
         found.append(Finding("input", "note", text, name, held, remedy=remedy))
     return found
 
