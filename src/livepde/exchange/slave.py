@@ -15,7 +15,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 from livepde import __version__
 from livepde.exchange.fmu_export import FOLDER, opened
-from livepde.exchange.unit_process import PERIOD, STATUS, Component, UnitProcess, Variable
+from livepde.exchange.unit_process import PERIOD, STATUS, Component, ScalarVariable, UnitProcess
 from livepde.units import in_si
 
 if not sys.orig_argv:
@@ -60,7 +60,7 @@ class IdentifierSlave:
         def put(k: int, value: float) -> None:
             unit.inputs[k] = value
 
-        def add(kind: str, item: Variable, cause: Any, get: Any, **more: Any) -> None:
+        def add(kind: str, item: ScalarVariable, cause: Any, get: Any, **more: Any) -> None:
             about = {"description": item.text, "causality": cause, "getter": get, **more}
             about.setdefault("variability", variability.discrete)
             self.register_variable(self._kit(kind)(item.name, **about), nested=False)
@@ -68,15 +68,15 @@ class IdentifierSlave:
 
         # FMI 3.0 wants the independent variable as a variable; FMI 2.0 leaves it out.
         if self.fmi == 3:
-            time = Variable("time", "s", "Time.")
+            time = ScalarVariable("time", "s", "Time.")
             add(real, time, causality.independent, float, variability=variability.continuous)
         for k, port in enumerate(process.inputs):
             add(real, port, causality.input, lambda k=k: unit.inputs[k], setter=partial(put, k))
         for k, item in enumerate(process.outputs()):
             add(real, item, causality.output, lambda k=k: unit.outputs[k])
-        item = Variable("status", "", STATUS)
+        item = ScalarVariable("status", "", STATUS)
         add(whole, item, causality.output, lambda: unit.status)
-        item = Variable(PERIOD, "s", "Time between samples; 0: every step takes one.")
+        item = ScalarVariable(PERIOD, "s", "Time between samples; 0: every step takes one.")
         about = {"setter": partial(setattr, unit, "period"), "variability": variability.fixed}
         add(real, item, causality.parameter, lambda: unit.period, **about)
 

@@ -43,7 +43,7 @@ SAME = 1e-9
 
 
 @dataclass(frozen=True)
-class Variable:
+class ScalarVariable:
     """Description of a variable of a unit."""
 
     name: str
@@ -52,7 +52,7 @@ class Variable:
 
 
 @dataclass(frozen=True)
-class Port(Variable):
+class Port(ScalarVariable):
     """Input or output channel of a unit, in the unit of its data."""
 
     column: Column  # conversion of values to the unit of the model
@@ -111,12 +111,12 @@ class UnitProcess:
             if name not in self.fields
         ]
 
-    def outputs(self) -> list[Variable]:
+    def outputs(self) -> list[ScalarVariable]:
         """Return descriptions of the outputs except the status, in the order of `shown`.
 
         Raises `ConfigurationError`: two outputs have the same name.
         """
-        found = [Variable("estimate_time", "s", "Time of the last sample that was used.")]
+        found = [ScalarVariable("estimate_time", "s", "Time of the last sample that was used.")]
         space = self.model.parameter_space
         for label in space.labels:
             found += self._estimated(label, label)
@@ -125,7 +125,7 @@ class UnitProcess:
                 found += self._estimated(name, f"{name}[{k + 1}]")
         for port in self.sensors:
             text = f"The model's value of {port.name}."
-            found.append(Variable(f"{port.name}_model", port.unit, text))
+            found.append(ScalarVariable(f"{port.name}_model", port.unit, text))
         names = [port.name for port in self.inputs] + [item.name for item in found]
         names += ["status", "time", PERIOD]
         for name in names:
@@ -136,12 +136,12 @@ class UnitProcess:
                 )
         return found
 
-    def _estimated(self, label: str, name: str) -> Iterator[Variable]:
+    def _estimated(self, label: str, name: str) -> Iterator[ScalarVariable]:
         unit = self.model.parameter_space.unknown_of(label).unit
-        yield Variable(name, unit, f"Estimate of {name}.")
+        yield ScalarVariable(name, unit, f"Estimate of {name}.")
         if self.covariance:
             text = f"Standard deviation of {name}."
-            yield Variable(f"{name}_std", STEPS.get(unit, unit), text)
+            yield ScalarVariable(f"{name}_std", STEPS.get(unit, unit), text)
 
     def unknown(self) -> list[float]:
         """Return the outputs before the first sample: the prior, and NaN for model values."""

@@ -19,7 +19,7 @@ from livepde.fem import Inputs, Moment
 from livepde.fleet.assessment import assessed
 from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEngine, beginnings
 from livepde.fleet.estimate import FleetEstimate, FleetResult, number_of
-from livepde.fleet.taken import TakenByMembers
+from livepde.fleet.taken_by_members import TakenByMembers
 from livepde.frames import layout_of
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status
