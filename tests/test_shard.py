@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from patience import PATIENCE
 from test_fleet import LAWS, MODELS, SENSORS, law, rod, samples
@@ -150,15 +151,15 @@ def test_a_sample_that_cannot_be_used_is_refused_alone():
         "not later",
         "time t is nan",
         "time t",
-        "z has shape (1, 2)",
-        "not a number",
+        "z has shape (2,)",
+        "not an array of numbers",
         "unknown input 'T_9'",
         "unknown channel 'T_9'",
         "1 parts",
         "0 parts",
         "no member ['d']",
         "inputs are 1.0",
-        "z has shape (1,)",
+        "z has shape ()",
     ]
     one, other = shard(model), shard(model)
     one.step(0, items[:15])
@@ -170,6 +171,33 @@ def test_a_sample_that_cannot_be_used_is_refused_alone():
         assert part in message
     np.testing.assert_allclose(found.q[len(poor) :], wanted.q, rtol=1e-9)
     assert np.isnan(found.q[: len(poor)]).all()
+
+
+ROW = pd.Series({"T_c": 0.3, "T_b": 0.2, "T_a": 0.1})
+FORMS = [
+    ROW,
+    {"T_a": (0.1, 0.02), "T_b": 0.2},
+    [(0.1, 0.02), (0.2, 0.01), (0.3, 0.01)],
+    np.ma.masked_array([0.1, 0.2, 0.3], [True, False, False]),
+]
+
+
+@pytest.mark.parametrize("z", FORMS, ids=["row", "pair", "pairs", "masked"])
+def test_a_reading_has_each_form_that_an_identifier_takes(z):
+    """A row of a table counts by its names, as one for a list of such rows in a fleet."""
+    places = {"T_a": 0.2, "T_b": 0.5, "T_c": 0.8}
+    parts = rod(), lp.Points(places, noise=0.01), lp.SensitivityLaw(refit=None)
+    inputs = dict.fromkeys(lp.Identifier(*parts, u0=0.0).inputs, 1.0)
+    wanted = lp.Identifier(*parts, u0=0.0).step(0.1, z, inputs)
+    one = lp.fleet.Shard(*parts, ["a", "b"], u0=0.0)
+    got = one.step(0, [("a", 0.1, z, inputs), ("b", 0.1, z, inputs)])
+    assert got.status == ["ok", "ok"]
+    fleet = lp.Fleet(*parts, ["a", "b"], u0=0.0)
+    together = [] if isinstance(z, list | np.ma.MaskedArray) else [fleet.step(0.1, [z, z], inputs)]
+    for found in (got, *together):
+        for name in ("q", "q_std", "innovation"):
+            theirs = [getattr(wanted, name)] * 2
+            np.testing.assert_allclose(getattr(found, name), theirs, rtol=1e-9)
 
 
 @pytest.mark.slow

@@ -347,9 +347,7 @@ class Channels:
         """
         if not isinstance(inputs, dict):
             inputs = mapped(inputs, "inputs")
-        if not isinstance(z, (np.ndarray, dict)):
-            row = labelled(z)
-            z = row if row is z else self._columns(row)
+        z = self.labelled(z)
         if not isinstance(z, np.ndarray) and isinstance(z, Mapping):
             measured, noise, validation, named = self._by_name(z, inputs)
         else:
@@ -360,6 +358,13 @@ class Channels:
             self._check_once(named, given)
             named |= {n: v for n, v in given.items() if n not in named or not math.isnan(v)}
         return measured, noise, validation, named
+
+    def labelled(self, z: Any) -> Any:
+        """Return a row of a table as a mapping of its channels, and other readings as they are."""
+        if isinstance(z, (np.ndarray, dict)):
+            return z
+        row = labelled(z)
+        return row if row is z else self._columns(row)
 
     def _check_once(self, named: Mapping[str, float], given: Mapping[str, float]) -> None:
         """Refuse an input with one value among the readings and another one among the inputs."""

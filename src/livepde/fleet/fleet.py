@@ -28,6 +28,7 @@ from livepde.linalg.member_arrays import put, take
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.samples import (
+    by_name,
     check_noise,
     in_order_of,
     is_frame,
@@ -45,6 +46,13 @@ from livepde.verdict import Verdict
 FORMAT = 12  # of the checkpoint
 
 Values = ArrayLike | Mapping[str, ArrayLike]
+
+
+def columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Return numbers by name, NaN where a row has none; the noise of a pair has its own name."""
+    rows = [by_name(row, ()) for row in rows]
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {name: [row.get(name, np.nan) for row in rows] for name in names}
 
 
 class Fleet:
@@ -270,7 +278,8 @@ class Fleet:
             Measurements, shape (members, sensors), NaN where missing, or (members, sensors, 2) with
             the noise of each; or channel name -> a number for all members, or one for each, noise
             as "noise of T_1", such as a pandas table with a row for each member. Values with
-            labels, as of a series or a mapping, are those of the members of these names.
+            labels, as of a series or a mapping, are those of the members of these names. A list of
+            such rows, one for each member, is in the order of the members.
         inputs
             Input channels, each a number for all members, or one for each; NaN holds the last one.
 
@@ -469,11 +478,18 @@ class Fleet:
             result._settle(self._settled(result.last))
         return result
 
+    def labelled(self, z: Any) -> Any:
+        """Return the readings of one member, those with labels as a mapping of channels."""
+        return self._one._channels.labelled(z)
+
     def _parsed(
         self, z: Values, inputs: Mapping[str, ArrayLike] | None
     ) -> tuple[Array, Array | None, Array, dict[str, Array]]:
         """Return assimilated values and their noise, validation values and inputs, all checked."""
         z = mapped(z, "z") if is_frame(z) else z
+        if isinstance(z, list | tuple) and z:
+            rows = list(map(self.labelled, z))
+            z = columns(rows) if all(isinstance(row, Mapping) for row in rows) else z
         parse = self._by_name if isinstance(z, Mapping) else self._by_place
         measured, noise, validation, named = parse(z)
         for name, values in mapped(inputs, "inputs").items():

@@ -15,13 +15,13 @@ from livepde.errors import DataError, OffsetError, RunError, SampleError, option
 from livepde.fem import FunctionSpace
 from livepde.fleet.engines import State
 from livepde.fleet.estimate import FleetEstimate
-from livepde.fleet.fleet import Fleet
+from livepde.fleet.fleet import Fleet, columns
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw
 from livepde.linalg import Array, IntArray
 from livepde.model import Model
-from livepde.observation import Observation
-from livepde.samples import number
+from livepde.observation import Observation, Observed
+from livepde.samples import number, readings
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -240,7 +240,7 @@ class Shard:
             An earlier step was broken off by an exception: the state is between two batches.
         """
         self._refuse_torn()
-        items = [item if isinstance(item, tuple | list) else () for item in batch]
+        items: list[Item] = [item if isinstance(item, tuple | list) else () for item in batch]
         self._refuse_elsewhere(offset, len(items))
         space, sensors = self._fleet.model.parameter_space, self._fleet.observed.names
         estimates = ShardEstimates.blank(offset, items, space, sensors)
@@ -278,13 +278,16 @@ class Shard:
             f"were not: read the log again from {here} on."
         )
 
-    def _waves(self, items: Sequence[Item], estimates: ShardEstimates) -> Iterable[list[int]]:
-        """Return rows in waves, in each of which a member has one sample at most."""
+    def _waves(self, items: list[Item], estimates: ShardEstimates) -> Iterable[list[int]]:
+        """Return rows in waves, in each of which a member has one sample at most.
+
+        Readings with labels become mappings.
+        """
         waves: dict[int, list[int]] = {}
         counts: Counter[str] = Counter()
         for row, item in enumerate(items):
             try:
-                name = self._checked(item)
+                items[row] = name, *_ = self._checked(item)
             except DataError as error:
                 estimates.refuse(row, str(error))
                 continue
@@ -292,8 +295,8 @@ class Shard:
             counts[name] += 1
         return waves.values()
 
-    def _checked(self, item: Item) -> str:
-        """Return the name of the member of a sample that has the right parts."""
+    def _checked(self, item: Item) -> Item:
+        """Return a sample that has the right parts; its readings with labels are a mapping."""
         if not 3 <= len(item) <= 4:
             raise SampleError(f"a sample has {len(item)} parts; give (member, t, z, inputs).")
         if not isinstance(item[0], str) or item[0] not in self._places:
@@ -301,7 +304,8 @@ class Shard:
         number(item[1], "time t")
         if len(item) == 4 and not isinstance(item[3], Mapping | None):
             raise SampleError(f"inputs are {item[3]!r:.80}; give channel -> number.")
-        return str(item[0])
+        name, t, z, *inputs = item
+        return name, t, self._fleet.labelled(z), *inputs
 
     def _blocks(self, items: Sequence[Item], wave: Sequence[int]) -> Iterator[list[int]]:
         """Yield rows whose members have their last two sample times in common."""
@@ -321,7 +325,7 @@ class Shard:
         which = np.array([self._places[items[row][0]] for row in rows])
         block = self._subset(which)
         try:
-            estimate = block.step(*_joined([items[row] for row in rows]))
+            estimate = block.step(*_joined([items[row] for row in rows], block.observed))
         except DataError as error:
             if len(rows) == 1:
                 estimates.refuse(rows[0], str(error))
@@ -385,26 +389,19 @@ class Shard:
         self.offset, self._taken, self._states, self._torn = offset, taken, states, False
 
 
-def _joined(items: Sequence[Item]) -> tuple[float, Any, dict[str, Any]]:
+def _joined(items: Sequence[Item], observed: Observed) -> tuple[float, Any, dict[str, Any]]:
     """Return time, measurements and inputs of several samples as `Fleet.step` takes them."""
     t, z = float(items[0][1]), [item[2] for item in items]
     inputs = [(item[3] or {}) if len(item) == 4 else {} for item in items]
-    measured = _columns(z) if isinstance(z[0], Mapping) else _rows(z)
-    return t, measured, _columns(inputs)
+    measured = columns(z) if isinstance(z[0], Mapping) else _rows(z, observed)
+    return t, measured, columns(inputs)
 
 
-def _columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Return numbers by name, NaN where a row has none."""
-    names = dict.fromkeys(name for row in rows for name in row)
-    return {name: [row.get(name, np.nan) for row in rows] for name in names}
-
-
-def _rows(rows: Sequence[Any]) -> Any:
-    """Return measurements, shape (members, sensors), or with noise (members, sensors, 2)."""
-    try:
-        return np.array([np.asarray(row) for row in rows])
-    except ValueError:
-        raise SampleError("the samples have different numbers of values.") from None
+def _rows(rows: Sequence[Any], observed: Observed) -> Array:
+    """Return measurements and the noise of each, NaN without, shape (members, sensors, 2)."""
+    nothing = np.full(observed.size, np.nan)
+    pairs = (readings(row, observed) for row in rows)
+    return np.stack([(z, nothing if noise is None else noise) for z, noise in pairs]).swapaxes(1, 2)
 
 
 class OwnStates:
