@@ -615,6 +615,23 @@ def test_an_identifier_goes_on_from_where_a_member_is(law):
         np.testing.assert_array_equal(one.q, again.step(t, z[1], given).q)
 
 
+def test_an_identifier_of_a_member_without_samples_begins_as_the_member_does():
+    """With its own errors of the initial state, and its own state on the mesh of the shadow."""
+    starts = [0.0, lambda x: np.sin(3.0 * np.pi * x[0])]
+    errors = [(0.1,), (lambda x: 0.3 * x[0], lambda x: 0.2 * (1.0 - x[0]))]
+    model, law = rod(), lp.SensitivityLaw()
+    fleet = lp.Fleet(model, SENSORS, law, 2, u0=starts, u0_errors=errors)
+    for k, (start, off) in enumerate(zip(starts, errors, strict=True)):
+        one = lp.Identifier(model, SENSORS, law, u0=start, u0_errors=off)
+        for who in (one, member := fleet.identifier(k)):
+            for t, z, inputs in samples(fleet, steps=8):
+                at = {name: np.broadcast_to(value, 2)[k] for name, value in inputs.items()}
+                who.step(t, z[k], at)
+        for name in ("q", "q_std", "u_std"):
+            found, wanted = (getattr(who.estimate(), name) for who in (member, one))
+            np.testing.assert_allclose(found, wanted, rtol=1e-9)
+
+
 def test_a_member_that_is_taken_out_late_has_an_estimate():
     rod = lp.models.heat(lp.interval(0.0, 1.0, 10), lp.LogNormal(0.1, std=0.05))
     fleet = Fleet(rod, lp.Points({"a": 0.5}, noise=0.1), lp.SensitivityLaw(), 2, u0=0.0)

@@ -22,7 +22,16 @@ from livepde.errors import ConfigurationError, MissingInputError, RunError, Samp
 from livepde.estimate import Estimate
 from livepde.fem import Inputs, Moment
 from livepde.forecast import Forecast, ahead, future_times, seen_rows
-from livepde.laws import AnyLaw, Belief, Report, SensitivityLaw, Status, numerical, stepped
+from livepde.laws import (
+    AnyLaw,
+    Belief,
+    Problem,
+    Report,
+    SensitivityLaw,
+    Status,
+    numerical,
+    stepped,
+)
 from livepde.laws.later import then
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.laws.verdict import with_assumed_start
@@ -207,15 +216,17 @@ class Identifier(StreamRuns):
         parts = self.law, self.problem, self.validation
         return cache(partial(fingerprint, *parts, self._q0, self._u0))  # copies share it
 
-    def _started(self, q0: Array, u0: Array, errors: Array) -> Identifier:
+    def _started(
+        self, q0: Array, u0: Array, problem: Problem, work: Any, *, assumed: bool
+    ) -> Identifier:
         """Return an identifier of the same parts with another start; for `Fleet.identifier`.
 
-        Latent parameter, state and its own errors have the shapes (m,), (n,) and (errors, n).
+        Latent parameter and state have the shapes (m,) and (n,). `problem` and the law's parts
+        `work` say how that state was given; `assumed`: nobody did.
         """
         other = copy.copy(self)
         other._q0, other._u0 = q0, u0
-        other.problem = replace(self.problem, initial_errors=errors)
-        other._assumed = False  # whether somebody stated the start of this member is not known
+        other.problem, other._work, other._assumed = problem, work, assumed
         other._fingerprint = other._lazy_fingerprint()
         return other
 

@@ -66,7 +66,9 @@ class StreamRuns(Shown):
     def _start(self, inputs: Inputs) -> Any: ...
 
     @abstractmethod
-    def _started(self, q0: Array, u0: Array, errors: Array) -> Self: ...
+    def _started(
+        self, q0: Array, u0: Array, problem: Problem, work: Any, *, assumed: bool
+    ) -> Self: ...
 
     @abstractmethod
     def _forget(self) -> None: ...
@@ -277,7 +279,7 @@ class StreamRuns(Shown):
         latent = self.model.latent
         centre = latent.inverse(q)
         found = LinearReadings(np.array([latent.inverse(draw) for draw in draws]) - centre)
-        who = self._started(centre, self._u0, self.problem.initial_errors)
+        who = self._started(centre, self._u0, self.problem, self._work, assumed=False)
         who._forget()
         nothing = np.full(self.observed.size, np.nan)
         for sample in samples:

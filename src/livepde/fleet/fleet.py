@@ -23,6 +23,7 @@ from livepde.fleet.taken_by_members import TakenByMembers
 from livepde.frames import layout_of
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status
+from livepde.laws.sensitivity_state import SensitivityWork
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
 from livepde.linalg.member_arrays import put, take
 from livepde.model import Model
@@ -145,6 +146,7 @@ class Fleet:
         self._q0 = list(map(model.initial_parameter, q0s))
         self._u0 = [model.initial_values(0.0 if u is None else u) for u in u0s]
         self._stated = self._stated_at_start(u0s)
+        self._assumed = [u is None and model.form_initial is None for u in u0s]
         self.note = law.stepped_alone(self._work)
         self._errors = [initial_errors(model, one) for one in off]
         self._engine = self._stepper(made_of, u0s)
@@ -408,9 +410,15 @@ class Fleet:
         state = None if self._state is None else self._engine.member(self._state, k)
         ends = {name: values[k].copy() for name, values in self.ends.items()}
         # Kept, since its fingerprint is computed once for all checkpoints of this member.
-        start = self._starts.get(k) or self._one._started(self._q0[k], self._u0[k], self._errors[k])
-        self._starts[k] = start
+        start = self._starts[k] = self._starts.get(k) or self._begun(k)
         return start._placed(state, ends, self._samples)
+
+    def _begun(self, k: int) -> Identifier:
+        """Return the identifier of a member before its first sample."""
+        begun = self._engine.begun(k)
+        problem = begun.filter.problem if isinstance(begun, SensitivityWork) else self.problem
+        parts = self._q0[k], self._u0[k], problem, begun
+        return self._one._started(*parts, assumed=self._assumed[k])
 
     def verdict(self, member: str | int) -> Verdict:
         """Return the verdict that a separate run of a member would have, by name or number.
@@ -423,8 +431,7 @@ class Fleet:
         if self._state is None or not isinstance(law, SensitivityLaw) or not law.verdict:
             return Verdict.unjudged()
         ends = {name: values[k].copy() for name, values in self.ends.items()}
-        one = self._one._started(self._q0[k], self._u0[k], self._errors[k])
-        state = self._engine.member(self._state, k)
+        one, state = self._begun(k), self._engine.member(self._state, k)
         return assessed(one, law, begun, state, ends, self._samples)
 
     def template(self) -> Any:
@@ -448,6 +455,7 @@ class Fleet:
         other._engine = self._engine.subset(which)
         starts = self._q0, self._u0, self._errors
         other._q0, other._u0, other._errors = ([each[k] for k in which] for each in starts)
+        other._assumed = [self._assumed[k] for k in which]
         other._stated = self._stated[which]
         other._so_far = take(self._so_far, which)
         other._state, other._samples = state, samples
