@@ -98,6 +98,22 @@ def test_a_sensor_may_lie_near_or_on_the_end_of_the_mesh(at, shift):
 
 
 @pytest.mark.slow
+def test_a_constant_added_to_all_temperatures_changes_no_interval():
+    """In a uniform initial state, a shift of a sensor has an effect of rounding errors alone."""
+    found = []
+    for level in (0.0, 20.0, 293.15):
+        model = heat(
+            lp.interval(0.0, 1.0, 10), lp.LogNormal(0.1, std=0.05), {"left": lp.Channel("g")}
+        )
+        sensors = lp.Points({"a": 0.2, "b": 0.6}, noise=0.01, position_std=0.03)
+        who, rng = lp.Identifier(model, sensors, u0=level), np.random.default_rng(1)
+        for t in 0.1 * np.arange(8):
+            z = np.array([0.8, 0.3]) * (1.0 - np.exp(-t)) + 0.03 * rng.standard_normal(2)
+            estimate = who.step(t, level + z, {"g": level + 1.0 - np.exp(-2.0 * t)})
+        found.append([*estimate.parameters["alpha"], estimate.diagnostics.innovation_ratio])
+    np.testing.assert_allclose(found[1:], found[:1] * 2, rtol=1e-6)
+
+
 def test_in_two_dimensions_each_coordinate_has_a_shift():
     mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (6, 6))
     model = lp.Model(

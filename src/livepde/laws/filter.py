@@ -129,6 +129,13 @@ class Filter:
         found: Mask = np.asarray((span.gaps[:, :, self._driving] > 0.0).any(axis=(1, 2)))
         return found if np.count_nonzero(found) else None
 
+    def learns(self, Y: Array) -> bool:
+        """Return whether readings with the rows Y, (members, r, sensors), change an estimate.
+
+        Sensors at uncertain positions in a uniform state have rows of rounding errors.
+        """
+        return bool((np.square(Y / self.noise) > np.finfo(float).eps).any())
+
     def noise_of(self, x: FilterState, z: Span | Interval) -> Array:
         """Return the standard deviation of each reading at the end, shape (members, sensors).
 

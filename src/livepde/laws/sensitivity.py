@@ -339,7 +339,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         span = filter_.span(interval)
         state = changed(state, log=added(state.log, span, np.ones(1, dtype=bool), x.parts))
         # A state that is known, seen by sensors that see no unknown, has nothing to learn.
-        if not filter_.sensors.observe(x, span.end)[1].any():
+        if not filter_.learns(filter_.sensors.observe(x, span.end)[1]):
             # The readings count all the same: another case may assimilate them.
             seen, _ = absorb(filter_, x, span, work.options)
             return state.counted(seen.evidence)

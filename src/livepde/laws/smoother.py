@@ -286,7 +286,7 @@ class _FixedInterval:
         predicted, Y = filter_.sensors.observe(x, span.end)
         none = np.zeros(predicted.shape, dtype=bool)
         decision = GateDecision(none, none)
-        if Y.any():  # as the law begins
+        if filter_.learns(Y):  # as the law begins
             misfit += missed(filter_, x, opening)
             x, decision = self._absorbed(x, span, 0)
         return x, misfit, decision
