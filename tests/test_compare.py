@@ -25,6 +25,7 @@ from livepde.cases.recommendation import conclusions, recommended
 from livepde.cases.remedies import NO_SETTING, freed, with_settings
 from livepde.cases.variants import LastEstimate, Variant, VariantRun, run_variant, variant_of
 from livepde.errors import CaseError
+from livepde.progress import timed
 from livepde.verdict import Cause, Finding, ModelErrors, Verdict
 from livepde.verdict.sentences import estimating
 
@@ -769,3 +770,19 @@ def test_a_variant_that_other_readings_make_usable_is_named():
     assert "'later start' has the verdict 'caution' with its readings." in conclusions(
         base, [later]
     )
+
+
+def test_each_variant_has_a_line_in_a_terminal(monkeypatch, capsys):
+    def two(quiet=False):
+        with timed(["as stated", "offset of [T_10]"], quiet) as running:
+            for index in range(2):
+                with running(index):
+                    pass
+        return capsys.readouterr()
+
+    assert two() == ("", "")  # no terminal
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    output, shown = two()
+    assert output == ""
+    assert all(text in shown for text in ("✓", "as stated", "offset of [T_10]", "0:00:00"))
+    assert two(quiet=True) == ("", "")

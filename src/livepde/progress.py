@@ -1,8 +1,9 @@
-"""A progress bar with rate and time left; silent where standard error is not a terminal."""
+"""Progress on standard error; silent where it is not a terminal."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 from rich.console import Console
@@ -33,3 +34,36 @@ def watched(
     )
     with progress.Progress(*columns, console=console, transient=True) as bar:
         yield from bar.track(stream, total=total, description=what)
+
+
+@contextmanager
+def timed(
+    names: Sequence[str], quiet: bool = False
+) -> Iterator[Callable[[int], AbstractContextManager[None]]]:
+    """Show a line for each name, unless `quiet`; yield what runs the clock of a line by its index.
+
+    Several lines may run at once, each in its own thread.
+    """
+    console = Console(stderr=True)
+    if quiet or not console.is_terminal:
+        yield lambda _: nullcontext()
+        return
+    from rich import progress  # not before somebody looks
+
+    columns = (
+        progress.SpinnerColumn(finished_text="✓"),
+        progress.TextColumn("{task.description}", markup=False),
+        progress.TimeElapsedColumn(),
+    )
+    with progress.Progress(*columns, console=console, transient=True) as shown:
+        tasks = [shown.add_task(name, start=False, total=1) for name in names]
+
+        @contextmanager
+        def running(index: int) -> Iterator[None]:
+            shown.start_task(tasks[index])
+            try:
+                yield
+            finally:
+                shown.advance(tasks[index])
+
+        yield running

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
@@ -37,7 +37,7 @@ from livepde.cli.options import (
 from livepde.cli.printing import present
 from livepde.errors import ConfigurationError, RunError
 from livepde.plots.style import figure_class
-from livepde.progress import watched
+from livepde.progress import timed
 from livepde.runs import Table
 from livepde.runs.summary import digits, interval, shown
 
@@ -169,12 +169,18 @@ def _all(
             except BrokenProcessPool:
                 return VariantRun(variant, error="its process was killed or ran out of memory")
 
-    if jobs == 1 or len(variants) < 2:
-        ended: Iterator[VariantRun] = map(run, variants)
-        return list(ended if quiet else watched(ended, len(variants)))
-    with ThreadPoolExecutor(jobs) as threads:
-        ended = threads.map(apart, variants)
-        return list(ended if quiet else watched(ended, len(variants)))
+    jobs = min(jobs, len(variants))
+    one = run if jobs < 2 else apart
+    with timed([variant.name for variant in variants], quiet) as running:
+
+        def watched(index: int, variant: Variant) -> VariantRun:
+            with running(index):
+                return one(variant)
+
+        if jobs < 2:
+            return list(map(watched, range(len(variants)), variants))
+        with ThreadPoolExecutor(jobs) as threads:
+            return list(threads.map(watched, range(len(variants)), variants))
 
 
 def _run(
