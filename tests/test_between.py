@@ -643,3 +643,19 @@ def test_a_table_of_two_rows_reads_as_it_is_written(tmp_path: Path) -> None:
     filled = fill_table(table, ["Q"], ["Q"])
     assert filled.remarks == table.remarks  # nothing is refused
     np.testing.assert_array_equal(filled.values, table.values)
+
+
+def test_an_input_that_is_off_is_not_missing(tmp_path: Path) -> None:
+    # The power of a thermal response test scatters while it is on, and is zero in the recovery.
+    rng = np.random.default_rng(1)
+    hours = np.arange(60.0)
+    on = hours < 40.0
+    power = np.where(on, 7.2 + 0.01 * rng.standard_normal(60), 0.0).round(3)
+    fluid = np.where(hours == 50.0, -127.0, 12.0 + on * np.log1p(hours)).round(2)
+    rows = np.column_stack([hours, power, fluid])
+    table = tmp_path / "trt.csv"
+    np.savetxt(table, rows, "%g", ",", header="t [h],P [kW],T_f", comments="")
+    equation = EQUATIONS["borehole"]
+    found = measured(table, equation.time_unit)
+    text = files_for(found, tmp_path / "mine", equation)["case.toml"]
+    assert "missing = [-127.0]" in text

@@ -193,6 +193,15 @@ def converts(given: str, unit: str) -> bool:
     return bool(given and unit)
 
 
+def has_states(unit: str) -> bool:
+    """Return whether a constant of an input is a state of it, such as off: a temperature has none.
+
+    >>> has_states("W"), has_states("degC")
+    (True, False)
+    """
+    return unit not in KINDS[-1]
+
+
 def unit_in(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
     """Return the unit in the name of a column; empty if none can be converted to `unit`."""
     for given in filter(None, (pattern.search(name) for pattern in patterns)):

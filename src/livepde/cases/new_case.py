@@ -24,7 +24,16 @@ from livepde.errors import RunError
 from livepde.linalg import Array
 from livepde.models import EQUATIONS, Equation, Variable
 from livepde.streams.oddities import sentinels, switches
-from livepde.units import AFTER_SLASH, IN_BRACKETS, Affine, conversion, converts, in_si, unit_in
+from livepde.units import (
+    AFTER_SLASH,
+    IN_BRACKETS,
+    Affine,
+    conversion,
+    converts,
+    has_states,
+    in_si,
+    unit_in,
+)
 
 SCHEMA_FILE = "livepde.schema.json"  # beside a case that `livepde init` writes
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -118,7 +127,7 @@ def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
     lines = [
         *_top(table, equation, given),
         *_inline("mesh", _mesh(equation)),
-        *_data_lines(table, folder, equation),
+        *_data_lines(table, folder, equation, found),
         *_contents(table),
         *_unknowns(equation, given),
         *_constants(found),
@@ -132,9 +141,17 @@ def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
     return f"{HEAD.format(case=folder / 'case.toml')}{OPEN}{text}\n"
 
 
-def _data_lines(table: Measured, folder: Path, equation: Equation) -> Iterator[str]:
+def _data_lines(
+    table: Measured, folder: Path, equation: Equation, channels: list[FoundChannel]
+) -> Iterator[str]:
     """Yield the line of [data], with a comment on what to check."""
-    data, told = _data(table, folder), list[str]()
+    states = {
+        column
+        for item in channels
+        for column in item.columns
+        if not item.is_sensor and has_states(equation.inputs[item.name].unit)
+    }
+    data, told = _data(table, folder, states), list[str]()
     if len(data.get("missing", ())) > len(table.missing):
         told.append("missing: far outside the other values; check them")
     if table.counted:
@@ -203,8 +220,11 @@ def _mesh(equation: Equation) -> dict[str, Any]:
     return {"from": side, "to": side, "cells": 40, **graded}
 
 
-def _data(table: Measured, folder: Path) -> dict[str, Any]:
-    """Return the format of the files as keys of [data], without defaults."""
+def _data(table: Measured, folder: Path, states: set[str]) -> dict[str, Any]:
+    """Return the format of the files as keys of [data], without defaults.
+
+    Columns in `states` are inputs that may be constant.
+    """
     # Format keys of the first file hold for all; others state only what differs.
     first, *others = (_written(one, folder) for one in table.tables)
     usual = {key: field.default for key, field in DataSpec.model_fields.items() if key != "time"}
@@ -212,7 +232,7 @@ def _data(table: Measured, folder: Path) -> dict[str, Any]:
     if others:
         own = [_unlike(other, first) for other in others]
         found["file"] = [first["file"], *(o if len(o) > 1 else o["file"] for o in own)]
-    if missing := [*table.missing, *_missing(table)]:
+    if missing := [*table.missing, *_missing(table, states)]:
         found["missing"] = missing
     return found
 
@@ -222,15 +242,15 @@ def _unlike(given: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any
     return {key: value for key, value in given.items() if value != usual.get(key)}
 
 
-def _missing(table: Measured) -> list[float]:
+def _missing(table: Measured, states: set[str]) -> list[float]:
     """Return the values that are placeholders in some column, and usual in no other."""
-    columns = table.columns.values()
-    found = {one.value for values in columns for one in sentinels(values)}
+    columns = table.columns.items()
+    found = {n: {one.value for one in sentinels(x, n not in states)} for n, x in columns}
 
-    def usual(value: float, values: Array) -> bool:
-        return value in values and value not in {one.value for one in sentinels(values)}
+    def usual(value: float) -> bool:
+        return any(value in x and value not in found[n] for n, x in columns)
 
-    return sorted(v for v in found if not any(usual(v, values) for values in columns))
+    return sorted(v for v in set().union(*found.values()) if not usual(v))
 
 
 def _written(table: Measured, folder: Path) -> dict[str, Any]:

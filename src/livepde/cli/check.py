@@ -23,6 +23,7 @@ from livepde.showing import in_percent
 from livepde.stepping import ForwardStage
 from livepde.streams import DataTable
 from livepde.streams.oddities import sentinels
+from livepde.units import has_states
 from livepde.verdict.sentences import LONGER_DATA
 
 MOST_CHANNELS = 40  # rows of the table of channels
@@ -102,11 +103,12 @@ def _sentinels(case: Case, samples: DataTable) -> list[str]:
         column = case.columns[name]
         if len(column.names) > 1:  # a mean is none of the values in the file
             continue
+        constants = not (name in case.roles("input") and has_states(case.unit(name)))
         said += [
             f"{name}: {found.value:g} occurs {found.times} times, far outside the other values "
             f"({found.low:.4g} to {found.high:.4g}). If it is a placeholder, add it to "
             f"`data.missing`. Otherwise specify the range with `channels.{name}.valid`."
-            for found in sentinels(np.round((values - column.offset) / column.factor, 9))
+            for found in sentinels(np.round((values - column.offset) / column.factor, 9), constants)
         ]
     return said
 

@@ -46,8 +46,11 @@ class Sentinel(NamedTuple):
     high: float
 
 
-def sentinels(values: Array) -> list[Sentinel]:
+def sentinels(values: Array, constants: bool = True) -> list[Sentinel]:
     """Return the values of a column that may be placeholders.
+
+    Without `constants` only known ones count: a constant of a power or a flow is a state of it,
+    such as off.
 
     >>> [found.value for found in sentinels(np.array([20.0, 21, 22, 21, 20, 22, 21, 23, -127]))]
     [-127.0]
@@ -57,7 +60,7 @@ def sentinels(values: Array) -> list[Sentinel]:
         # The end of the range that lies farther from the median comes first.
         ends = np.array([rest.min(), rest.max()])
         ends = ends[np.argsort(-np.abs(ends - np.median(rest)), kind="stable")]
-        one = next(filter(None, (_at(rest, end) for end in ends.tolist())), None)
+        one = next(filter(None, (_at(rest, end, constants) for end in ends.tolist())), None)
         if one is None:
             break
         found.append(one)
@@ -66,12 +69,12 @@ def sentinels(values: Array) -> list[Sentinel]:
     return [one._replace(low=float(rest.min()), high=float(rest.max())) for one in found]
 
 
-def _at(values: Array, end: float) -> Sentinel | None:
+def _at(values: Array, end: float, constants: bool) -> Sentinel | None:
     """Return an end of the range as a sentinel; None if it is none."""
     rest = values[values != end]
     count = len(values) - len(rest)
     known = end in KNOWN
-    if len(rest) < OTHERS or not (known or count >= REPEATED):
+    if len(rest) < OTHERS or not (known or (constants and count >= REPEATED)):
         return None
     # Of a few levels, such as those of a pump, each is a constant.
     if not known and len(np.unique(rest)) < OTHERS:
