@@ -210,6 +210,17 @@ def test_dispersion_grows_with_the_speed_of_either_sign():
         assert np.allclose(last_state(model, 0.0, times), last_state(plain, 0.0, times))
 
 
+def test_a_pipe_loses_heat_to_its_surroundings():
+    # The steady state of v u_x = -loss (u - ambient) decays exponentially.
+    mesh, v, loss, ambient = lp.interval(0.0, 1.0, 200), 2.0, 1.5, 9.0
+    model = advection_diffusion(mesh, broad(1e-4), {"left": 80.0}, v=broad(v), loss=broad(loss))
+    assert model.channel_units["ambient"] == "degC"
+    assert "ambient" not in advection_diffusion(mesh, broad(1e-4), v=broad(v)).channels
+    found = last_state(model, 80.0, np.linspace(0.0, 2.0, 41), lambda t: {"ambient": ambient})
+    exact = ambient + (80.0 - ambient) * np.exp(-loss * mesh.p[0] / v)
+    assert np.abs(found - exact).max() < 0.01
+
+
 def test_flux_and_head_add_up():
     mesh = lp.interval(0.0, 1.0, 20)
     sides, times = {"left": 1.0, "right": 0.0}, np.linspace(0, 0.5, 11)

@@ -15,6 +15,16 @@ from livepde.fem import Field, Integrand, Piecewise, Place, Scalars, Unknown
 from livepde.fem.fields import SIDES
 from livepde.model import Model
 
+AMBIENT = "ambient"  # input of an exchange with the surroundings
+
+
+def exchange(coefficient: Callable[[Any], Any]) -> list[Any]:
+    """Return coefficient (u - ambient) v as two terms, so that the term in u reads no input."""
+    return [
+        lambda q, u, v, x: coefficient(q) * u * v,
+        lambda q, _, v, x: -coefficient(q) * x.inputs[AMBIENT] * v,
+    ]
+
 
 def around_axis(x: Any) -> Any:
     """Return the volume element of a mesh whose first coordinate is the distance from an axis."""

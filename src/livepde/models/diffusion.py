@@ -14,16 +14,16 @@ from livepde.errors import ModelError
 from livepde.fem.measure import START, Measure
 from livepde.model import Model
 from livepde.models.description import (
+    AMBIENT,
     Equation,
     Fluxes,
     Option,
     Variable,
     by_name,
     everywhere,
+    exchange,
     one_number,
 )
-
-AMBIENT = "ambient"
 
 
 def heat(
@@ -187,10 +187,10 @@ def _terms(
     D = part[equation.conductivity]
     terms: list[Any] = [lambda q, u, v, x: D(q) * fem.dot(fem.grad(u), fem.grad(v))]
     if "loss" in part:
-        terms += _exchange(part["loss"])
+        terms += exchange(part["loss"])
     if "transfer" in part:
         sides = _free_sides(equation, field)
-        terms += [fem.On(side, term) for side in sides for term in _exchange(part["transfer"])]
+        terms += [fem.On(side, term) for side in sides for term in exchange(part["transfer"])]
     if "source" in part:
         terms.append(lambda q, _, v, x: -part["source"](q) * v)
     return terms
@@ -207,14 +207,6 @@ def _free_sides(equation: Equation, field: fem.Field) -> list[str]:
             "none: leave it out, or leave one out of dirichlet."
         )
     return free
-
-
-def _exchange(coefficient: Callable[[Any], Any]) -> list[Any]:
-    """Return coefficient (u - ambient) v as two terms, so that the term in u reads no input."""
-    return [
-        lambda q, u, v, x: coefficient(q) * u * v,
-        lambda q, _, v, x: -coefficient(q) * x.inputs[AMBIENT] * v,
-    ]
 
 
 SURROUNDINGS = {

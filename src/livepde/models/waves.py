@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from operator import attrgetter
 from typing import Any
 
 from livepde.errors import ModelError, require_positive
@@ -21,6 +22,7 @@ from livepde.fem import (
 )
 from livepde.model import Model
 from livepde.models.description import (
+    AMBIENT,
     INITIAL,
     Equation,
     Number,
@@ -29,6 +31,7 @@ from livepde.models.description import (
     autonomous,
     by_name,
     everywhere,
+    exchange,
     state,
 )
 
@@ -41,6 +44,7 @@ def advection_diffusion(
     v: Unknown | None = None,
     K: Unknown | None = None,
     dispersivity: Unknown | None = None,
+    loss: Unknown | None = None,
     source: Unknown | None = None,
     L: float = 1.0,
     ratio: float = 1.0,
@@ -49,11 +53,11 @@ def advection_diffusion(
     element: Any = None,
     unit: str = "degC",
 ) -> Model:
-    """Return u_t + w u_z - div((kappa + dispersivity |w|) grad u) = source, along z = x[0].
+    """Return u_t + w u_z - div(D grad u) + loss (u - ambient) = source, along z = x[0].
 
-    The velocity is w = ratio (flow + v + K dH/L): a measured flux, an unknown flux v, the Darcy
-    flux of a measured head difference dH, or their sum. Examples are heat in a stream bed
-    (Stallman 1965), a pipe with a flow meter, and solutes.
+    D is kappa + dispersivity |w|, and w the velocity ratio (flow + v + K dH/L): a measured flux, an
+    unknown flux v, the Darcy flux of a measured head difference dH, or their sum. Examples are heat
+    in a stream bed (Stallman 1965), a pipe that loses heat, and solutes.
 
     Parameters
     ----------
@@ -70,8 +74,9 @@ def advection_diffusion(
         Hydraulic conductivity in m/s. dH in m is the input channel "dH".
     dispersivity
         Dispersivity in m.
-    source
-        Source in unit/s, as in `heat`.
+    loss, source
+        Rate of exchange in 1/s with surroundings at the input channel "ambient", and source in
+        unit/s, as in `heat`.
     L
         Length in m of the head drop dH.
     ratio
@@ -103,7 +108,14 @@ def advection_diffusion(
         raise ModelError(f"advection_diffusion: {text}")
     for name, value in {"L": L, "ratio": ratio}.items():
         require_positive(f"advection_diffusion: {name}", value, ModelError)
-    every = {"kappa": kappa, "v": v, "K": K, "dispersivity": dispersivity, "source": source}
+    every = {
+        "kappa": kappa,
+        "v": v,
+        "K": K,
+        "dispersivity": dispersivity,
+        "loss": loss,
+        "source": source,
+    }
     unknowns = {name: unknown for name, unknown in every.items() if unknown is not None}
     everywhere("advection_diffusion", mesh, kappa=kappa)
 
@@ -126,28 +138,35 @@ def advection_diffusion(
             moved = moved + upwind(w, spread, x.h) * grad(u)[0] * grad(test)[0]
         return moved if source is None else moved - q.source * test
 
+    units = {"flow": "m/s", "dH": "m", AMBIENT: unit}
+    reads = {"flow": flow, "dH": K is not None, AMBIENT: loss is not None}
     return Model(
         Field(mesh, element or linear(mesh), dirichlet=dict(dirichlet or {}), unit=unit),
         unknowns,
-        A=transport,
-        inputs=({"flow": "m/s"} if flow else {}) | ({"dH": "m"} if K is not None else {}),
+        A=[transport, *(exchange(attrgetter("loss")) if loss is not None else [])],
+        inputs={name: unit for name, unit in units.items() if reads[name]},
         **ADVECTION_DIFFUSION.about(unknowns),
     )
 
 
 ADVECTION_DIFFUSION = Equation(
     name="advection_diffusion",
-    summary="heat or a solute carried by a flow along a column: stream beds",
-    formula="u_t = div((kappa + dispersivity |w|) grad u) - w u_z,  w = ratio (flow + v + K dH/L)",
+    summary="heat or a solute carried by a flow along a column or a pipe: stream beds",
+    formula=(
+        "u_t = div((kappa + dispersivity |w|) grad u) - w u_z - loss (u - ambient),  "
+        "w = ratio (flow + v + K dH/L)"
+    ),
     state=Variable("degC", "temperature"),
     unknowns={
         "kappa": Variable("m^2/s", "diffusivity: a number, by layer, or a field"),
         "v": Variable("m/s", "flux along z", True, transform=""),
         "K": Variable("m/s", "hydraulic conductivity, with the input dH", True),
         "dispersivity": Variable("m", "dispersivity", True),
+        "loss": Variable("1/s", "rate of exchange with the surroundings", True),
         "source": Variable("K/s", "heat gained over heat capacity", True, transform=""),
     },
     inputs={
+        AMBIENT: Variable("degC", "temperature of the surroundings, for loss", True),
         "dH": Variable("m", "head difference, positive if it drives along z", True),
         "flow": Variable("m/s", "measured flux along z", True),
     },
