@@ -274,8 +274,9 @@ def test_what_is_wrong_is_said():
     mesh, T = lp.rectangle((0.0, 60.0), (0.0, 60.0), (4, 4)), positive(1e-2)
     with pytest.raises(ModelError, match=r"'Q' at \(70.0, 0.0\) lies outside"):
         groundwater(mesh, T, T, wells={"Q": (70.0, 0.0)}, radius=30.0)
-    with pytest.raises(ModelError, match=r"radius=21.2 or more \(got 1\)"):
+    with pytest.raises(ModelError, match=r"radius=21.4 or more \(got 1\)"):
         groundwater(mesh, T, T, wells={"Q": (30.0, 10.0)}, radius=1.0)
+    groundwater(mesh, T, T, wells={"Q": (30.0, 10.0)}, radius=21.4)  # not rounded down
     with pytest.raises(ModelError, match="S by region is not possible"):
         groundwater(mesh, T, lp.Piecewise({"a": lambda x: x[0] > 30.0}, lp.Normal(1.0, 1.0)))
     with pytest.raises(ModelError, match="thickness, must be a positive number"):

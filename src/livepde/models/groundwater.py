@@ -193,7 +193,7 @@ def _place(mesh: Any, name: str, at: Sequence[float], radius: float) -> tuple[fl
     if not radius >= width:
         raise ModelError(
             f"groundwater: well '{name}' lies in a cell of diameter {width:.3g} m; refine the mesh "
-            f"there, or give radius={width:.3g} or more (got {radius:g})."
+            f"there, or give radius={1.01 * width:.3g} or more (got {radius:g})."
         )
     return place
 
