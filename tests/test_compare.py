@@ -22,7 +22,7 @@ from livepde.cases.case import with_members
 from livepde.cases.proposals import proposed
 from livepde.cases.read import _with, apply, filled, parse, read_toml
 from livepde.cases.recommendation import conclusions, recommended
-from livepde.cases.remedies import NO_SETTING, freed, with_settings
+from livepde.cases.remedies import NO_SETTING, first_miss, freed, start_missed, with_settings
 from livepde.cases.variants import LastEstimate, Variant, VariantRun, run_variant, variant_of
 from livepde.errors import CaseError
 from livepde.progress import timed
@@ -760,6 +760,15 @@ def test_a_misfit_of_a_response_test_names_the_stored_heat(tmp_path, begin, end,
     assert [one.settings for one in later] == (
         [('data.assimilate_from="27 h"',)] if (begin, end) == (0, 72) else []
     )
+
+
+def test_a_quantity_is_no_reading_of_the_start(tmp_path):
+    # The fluid of a heated borehole is R_b Q/H warmer than its wall from the first reading on.
+    (tmp_path / "test.csv").write_text("time,Q,T\n0,5000,15\n1,5000,16\n")
+    (tmp_path / "case.toml").write_text(RESPONSE)
+    prepared = cases.load(tmp_path / "case.toml").prepare()
+    assert first_miss(prepared) == 0.0
+    assert start_missed(prepared, Verdict("caution", ())) == []
 
 
 def test_a_variant_that_other_readings_make_usable_is_named():

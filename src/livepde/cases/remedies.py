@@ -323,9 +323,11 @@ def first_miss(prepared: Prepared) -> float:
 
 
 def _first_readings(prepared: Prepared) -> Array:
-    """Return the readings of the assimilated sensors in the first sample."""
-    given, names = by_name(prepared.first.z, ()), prepared.case.sensors
-    seen: Array = np.array([float(given[name]) for name in names if name in given])
+    """Return the readings in the first sample of the assimilated sensors that read the state."""
+    given, case = by_name(prepared.first.z, ()), prepared.case
+    specs = {name: case.spec.channels[case.families.get(name, name)] for name in case.sensors}
+    names = [name for name, spec in specs.items() if spec.quantity is None and name in given]
+    seen: Array = np.array([float(given[name]) for name in names])
     return np.compress(np.isfinite(seen), seen)
 
 
