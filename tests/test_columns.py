@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from benchmarks.user_jobs.data import JOBS
 from benchmarks.wrong_channels import Fault, with_fault
 from livepde.cases.case import load
 from livepde.laws.column_errors import UNITS, units_of
+from livepde.laws.columns import Columns
 from livepde.verdict import Cause, Finding, Verdict
 
 LENGTH, CELLS, FINE = 0.1, 120, 10
@@ -400,6 +402,20 @@ def test_a_sensor_that_averages_over_a_length_is_named_and_the_interval_allows_f
     assert first.setting.startswith("channels.TC3.at=; channels.TC3.along=[[0.0")
     one = verdict.errors.unknowns[0]
     assert one.low < alpha < one.plain_low
+
+
+def test_an_input_of_power_is_in_no_unit_of_temperature():
+    mesh = lp.interval(0.0, 1.0, 8)
+    model = lp.Model(
+        lp.Field(mesh, lp.linear(mesh), dirichlet={"left": 0.0}, unit="degC"),
+        {"k": lp.LogNormal(1.0, std=0.1)},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) - x.inputs["Q"] * v,
+        inputs={"Q": "W"},
+    )
+    problem = lp.Identifier(model, lp.Points({"T": 1.0}, noise=0.1, unit="degC"), u0=0.0).problem
+    work: Any = SimpleNamespace(filter=SimpleNamespace(problem=problem))
+    columns = Columns(work, None, {}, ("Q",), lp.Refit())
+    assert (columns.unit("T"), columns.unit("Q")) == ("degC", "W")
 
 
 def test_a_flux_is_in_no_unit_of_temperature():

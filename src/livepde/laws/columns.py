@@ -180,12 +180,13 @@ class Columns:
         return values[np.isfinite(values)]
 
     def unit(self, name: str) -> str:
-        """Return the unit of a sensor, or of the state for its boundary values; else empty."""
+        """Return the unit of a sensor or an input, of the state for its boundary values; or ""."""
         problem = self.work.filter.problem
         observed, single = problem.observed, problem.model.state_space.single
         if single and name in self.inputs and name in boundary_lifts(problem.model):
             return observed.unit
-        return dict(zip(observed.names, observed.units, strict=True)).get(name, "")
+        sensors = dict(zip(observed.names, observed.units, strict=True))
+        return (problem.model.channel_units | sensors).get(name, "")
 
     def cause(self, error: Error, share: float) -> Cause:
         """Return an error that explains a share of the misfit as a cause."""
