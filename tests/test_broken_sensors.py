@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from broken_rod import ALPHA, AT, LENGTH, NOISE, STEP, case_text, left, readings, table
+from commands import call
 from factories import usual
 from typer.testing import CliRunner
 
@@ -354,3 +355,13 @@ def test_init_and_check_propose_them(tmp_path):
     done = CliRunner().invoke(app, ["init", str(out), "--data", str(tmp_path / "rod.csv")])
     assert done.exit_code == 0, done.output
     assert "missing = [-127" in (out / "case.toml").read_text()
+
+
+def test_a_placeholder_of_the_table_is_refused_with_an_empty_setting(tmp_path):
+    # -9999 of a table in which it may be a reading, as the user states.
+    rows = [f"{t},{20 + t % 7}.5" for t in range(20)]
+    (tmp_path / "own.csv").write_text("\n".join(["time_s,T_5cm", *rows, "20,-9999"]))
+    for settings, kept in (((), True), (("--set", "data.missing="), False)):
+        folder = tmp_path / f"mine{len(settings)}"
+        assert call("init", folder, "--data", tmp_path / "own.csv", *settings)[0] == 0
+        assert ("missing = [-9999.0]" in (folder / "case.toml").read_text()) == kept

@@ -100,7 +100,9 @@ def _begin(
 ) -> None:
     """Write a case for tables, with some keys set, and print a summary with its open keys."""
     zone = zone_named(str(changes.get("data.zone") or "UTC"), "--set data.zone")
-    missing = missing_in(changes.pop("data.missing", None), "--set data.missing")
+    missing = missing_in(changes.get("data.missing"), "--set data.missing")
+    if missing:  # else the key goes, and what the table shows with it
+        del changes["data.missing"]
     how: dict[str, Any] = {"time_format": time_format, "skip": skip, "zone": zone}
     how |= {"missing": missing, "stated": str(changes.get("data.time_unit") or "")}
     how |= {key: str(changes.get(f"data.{key}") or "") for key in ("sensor", "value")}
