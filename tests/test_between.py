@@ -659,3 +659,6 @@ def test_an_input_that_is_off_is_not_missing(tmp_path: Path) -> None:
     found = measured(table, equation.time_unit)
     text = files_for(found, tmp_path / "mine", equation)["case.toml"]
     assert "missing = [-127.0]" in text
+    assert 'between = "hold"' in text
+    assert switches(hours, power, off=True)
+    assert not switches(hours, power + 0.01 * rng.standard_normal(60), off=True)

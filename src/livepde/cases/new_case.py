@@ -391,7 +391,7 @@ def _input(table: Measured, entry: str, name: str, model_unit: str) -> FoundChan
     given = {"role": "input", "column": name, **({"unit": unit} if unit else {})}
     comment = _range(values)
     samples = next(one.samples for one in table.tables if name in one.samples.names)
-    if switches(samples.t, values):
+    if switches(samples.t, values, has_states(model_unit)):
         given["between"] = "hold"
         comment += ", constant stretches with jumps"
     return FoundChannel(entry, given, (name,), comment)

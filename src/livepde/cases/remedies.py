@@ -19,7 +19,7 @@ from livepde.linalg import Array
 from livepde.samples import by_name
 from livepde.streams import DataTable
 from livepde.streams.oddities import switches
-from livepde.units import conversion
+from livepde.units import conversion, has_states
 from livepde.verdict import Cause, Finding, Severity, Verdict, channel_setting
 from livepde.verdict.directions import stated_positions, usual_shifts
 from livepde.verdict.sentences import ESTIMATED, FINDINGS, LIKELY, amount_of, clause, estimating
@@ -164,7 +164,7 @@ def switching(case: Case, table: DataTable) -> list[str]:
         for name, channel in case.roles("input").items()
         if "between" not in channel.model_fields_set
         and name in table.names
-        and switches(table.t, table.values[:, table.names.index(name)])
+        and switches(table.t, table.values[:, table.names.index(name)], has_states(case.unit(name)))
     ]
 
 

@@ -87,9 +87,10 @@ def _at(values: Array, end: float, constants: bool) -> Sentinel | None:
     return Sentinel(end, count, low, high)
 
 
-def switches(t: Array, x: Array) -> bool:
+def switches(t: Array, x: Array, off: bool = False) -> bool:
     """Return whether a column has constant stretches with jumps that no two near rows write.
 
+    If the quantity can be `off`, one constant far from all others is enough: these may scatter.
     Jumps of one size between many levels are the resolution of a measured value. A jump between
     two rows that are a moment apart is stated by the rows themselves.
 
@@ -112,6 +113,8 @@ def switches(t: Array, x: Array) -> bool:
     # A log of changes has a value in few rows, and none that repeats the one before.
     changes = repeats == 0.0 and levels < len(x) <= (1.0 - STAYS) * rows
     few = levels <= LEVELS and (repeats >= STAYS or len(x) >= SWITCHED * levels or changes)
+    if off and any(one.value not in KNOWN for one in sentinels(x)):
+        return True
     return few or (repeats >= STAYS and float(sizes.max()) > UNEVEN * float(sizes.min()))
 
 
