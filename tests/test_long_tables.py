@@ -102,7 +102,7 @@ def test_init_uses_stated_columns(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_what_cannot_be_read_is_said(tmp_path: Path) -> None:
     _, long = tables(tmp_path)
     with pytest.raises(DataError, match=r"set `data.sensor` and `data.value`"):
-        read(tmp_path, long.sort_values("when").assign(hot=1, T_1=1, T_2=1), "")
+        read(tmp_path, long.sort_values("when").assign(hot=long.index, T_1=1, T_2=1), "")
     with pytest.raises(DataError, match=r"there is no sensor 'hot'; did you mean 'hot2'"):
         read(tmp_path, long.replace({"name": {"hot": "hot2"}}), LONG)
     with pytest.raises(CaseError, match="sensor and value are two columns"):

@@ -252,9 +252,15 @@ def test_a_point_is_no_decimal_comma_and_a_format_is_kept(csv, old, new, named):
 
 @pytest.mark.parametrize("times", ["0,2,1", "0,1,1"])
 def test_time_has_to_increase(csv, times):
-    rows = "".join(f"{t},1,1\n" for t in times.split(","))
+    rows = "".join(f"{t},{k},1\n" for k, t in enumerate(times.split(",")))
     with pytest.raises(TimeOrderError, match="row 4, column 't'"):
         read_csv(csv("t,a,b\n" + rows), COLUMNS, Clock("t"))
+
+
+def test_rows_that_repeat_the_one_before_are_left_out_and_counted(csv):
+    found = read_csv(csv("t,a,b\n0,1,1\n1,2,\n1,2,\n1,2,\n2,2,3\n"), COLUMNS, Clock("t"))
+    assert found.t.tolist() == [0.0, 1.0, 2.0]
+    assert found.remarks["repeated", ""] == 2
 
 
 NIGHT = datetime(2025, 10, 25, 22, tzinfo=UTC)  # in Berlin the day begins on which 3:00 is 2:00

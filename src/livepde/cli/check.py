@@ -79,6 +79,7 @@ def _refused(prepared: Prepared) -> list[str]:
         "start": "{name}: the first {n} values are outliers. A run counts them as missing.",
         "spike": "{name}: {n} values are spikes. A run rejects them. To use them, set "
         '`channels.{name}.spikes = "keep"`.',
+        "repeated": "{n} rows repeat time and values of the row before. A run leaves them out.",
         "begin": "{name}: the first {n} rows have no value. A run leaves them out.",
         "early": "{name}: the first {n} values are earlier than other data that a run needs at its "
         "start. A run leaves them out.",

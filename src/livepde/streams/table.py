@@ -86,8 +86,8 @@ class DataTable:
         The first sample's date, if times are dates.
     remarks
         (kind, channel) -> how many values were not valid ("invalid"), or without a noise of their
-        own ("missing"), and samples left out because a channel is missing that they need
-        ("skipped").
+        own ("missing"), samples left out because a channel is missing that they need ("skipped"),
+        and rows that repeat the one before, of no channel ("repeated").
     """
 
     t: Array
@@ -247,17 +247,26 @@ def to_table(
     chosen rows of a column, `where` names the data and a row.
     """
     dates = written is not None
+
+    def repeats(one: Any, other: Any) -> Mask:
+        rows = np.concatenate([one, other])
+        pairs = (np.split(numbers(name, rows), 2) for name in decimal_marks(columns))
+        found = np.ones(len(one), dtype=bool)
+        for a, b in pairs:
+            found &= (a == b) | (np.isnan(a) & np.isnan(b))
+        return found
+
     if written is not None:
-
-        def repeats(one: int, other: int) -> bool:
-            pairs = (numbers(name, np.array([one, other])) for name in decimal_marks(columns))
-            return all(np.array_equal(pair[:1], pair[1:], equal_nan=True) for pair in pairs)
-
-        times = with_second_passes(times, written, clock, repeats)
+        times = with_second_passes(
+            times, written, clock, lambda *pair: bool(repeats(*np.array(pair)[:, None]).all())
+        )
     rows = Thinned([column.between for column in columns.values()])
     # Rows that are left out may hold a switch, or a part of a mean.
     stride = rows.stride(every)
-    use = _chosen(times, dates, clock, stride, where)
+    inside = _inside(times, dates, clock, where[0])
+    use = _once(times, inside, clock if dates else None, repeats)
+    repeated = len(inside) - len(use)
+    use = _increasing(times, use[::stride], clock if dates else None, where[1])
     holes = tuple(one for one in missing if not isinstance(one, str))
 
     def scaled(column: Column, of: IntArray) -> Array:
@@ -270,7 +279,7 @@ def to_table(
     values = np.column_stack(
         [scaled(column, use) for column in columns.values()] or [np.zeros((len(use), 0))]
     )
-    remarks = Counter(_noise_remarks(columns, values))
+    remarks = Counter(_noise_remarks(columns, values)) + Counter({("repeated", ""): repeated})
     chosen = np.zeros(len(use), dtype=bool)
     chosen[:: every // stride] = True
     kept = _complete(columns, values, chosen, remarks)
@@ -306,20 +315,38 @@ def _complete(
     return kept
 
 
-def _chosen(
-    times: Array, dates: bool, clock: Clock, every: int, where: tuple[str, Callable[[int], str]]
-) -> IntArray:
-    """Return every n-th of the rows between start and stop, whose times must increase."""
-    source, row = where
+def _inside(times: Array, dates: bool, clock: Clock, source: str) -> IntArray:
+    """Return the rows between start and stop."""
     low, high = clock.bounds(dates, source)
     use = np.flatnonzero((times >= low) & (times <= high))
     if not len(use):
         raise DataError(f"{source}: no row lies between start and stop; check both.")
-    use = use[::every]
+    return use
+
+
+def _once(
+    times: Array, use: IntArray, clock: Clock | None, repeats: Callable[[Any, Any], Mask]
+) -> IntArray:
+    """Return rows without those that have time and values of the one before; `clock`: of dates.
+
+    In an hour that clocks show twice, such a row may be a reading of its own.
+    """
+    again = np.flatnonzero(np.diff(times[use]) == 0.0)
+    if clock is not None:
+        once = [clock.repeated_hour(t) == 0.0 for t in times[use[again]].tolist()]
+        again = again[np.array(once, dtype=bool)]
+    again = again[repeats(use[again], use[again + 1])]
+    return np.delete(use, again + 1)
+
+
+def _increasing(
+    times: Array, use: IntArray, clock: Clock | None, row: Callable[[int], str]
+) -> IntArray:
+    """Return rows, whose times must increase; `clock`: of dates."""
     late = np.flatnonzero(np.diff(times[use]) <= 0)
     if len(late):
         last, t = times[use[late[0] : late[0] + 2]]
-        raise _disorder(row(int(use[late[0] + 1])), t, last, clock if dates else None)
+        raise _disorder(row(int(use[late[0] + 1])), t, last, clock)
     return use
 
 
