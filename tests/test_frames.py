@@ -17,7 +17,7 @@ from livepde.laws.stored_samples import principal
 from livepde.models import heat
 
 PLACES = {"a": (0.15, 0.25), "b": (0.3, 0.5), "c": (0.55, 0.75), "d": (0.8, 0.375)}
-TIMES = 0.1 * np.arange(1, 61)
+TIMES = 0.1 * np.arange(1, 31)
 WIDTH = 0.5
 LAYERS: Any = {"one": lambda x: x[0] < 0.5, "two": lambda x: x[0] > 0.5}
 RATE = 0.3  # of the loss to the surroundings at 15 degrees
@@ -113,17 +113,13 @@ SHEET = Frame(flat=True)
 @pytest.mark.parametrize(
     ("frame", "other"),
     [
-        pytest.param(Frame(), Frame(mirrored=True), id="mirrored"),
-        pytest.param(Frame(), Frame(origin=500.0), id="later", marks=pytest.mark.long),
-        pytest.param(Frame(), Frame(unit=3600.0), id="seconds", marks=pytest.mark.long),
-        pytest.param(Frame(), Frame(split=True), id="groups"),
-        pytest.param(SHEET, replace(SHEET, swapped=True), id="axes"),
-        pytest.param(SHEET, replace(SHEET, scale=1.0 + 1e-12), id="rounding"),
+        (Frame(), Frame(mirrored=True, origin=500.0, unit=3600.0, split=True)),
+        (SHEET, replace(SHEET, swapped=True, scale=1.0 + 1e-12)),  # and rounding
     ],
 )
 def test_verdict_and_intervals_do_not_depend_on_the_frame(frame: Frame, other: Frame):
     one, two = ended(frame), ended(other)
-    assert one.verdict.level == two.verdict.level == "caution"
+    assert one.verdict.level == two.verdict.level != "trusted"
     shown = [
         [
             (finding.what, finding.subject, *[(each.kind, each.subject) for each in finding.causes])
@@ -132,6 +128,7 @@ def test_verdict_and_intervals_do_not_depend_on_the_frame(frame: Frame, other: F
         for estimate in (one, two)
     ]
     assert shown[0] == shown[1]
+    assert max(len(finding.causes) for finding in one.verdict.findings) > 1
     for first, second in zip(one.verdict.findings, two.verdict.findings, strict=True):
         shares = [[cause.share for cause in each.causes] for each in (first, second)]
         assert shares[0] == pytest.approx(shares[1], rel=1e-5, nan_ok=True)
