@@ -294,7 +294,7 @@ def test_causes_are_merged_by_what_they_explain():
 def test_an_early_boundary_is_no_late_sensor_and_the_search_ends(tmp_path: Path):
     """Six layers and four offsets; the upper boundary is an hour early, the data by volumes."""
     (job,) = (job for job in JOBS if job.name == "soil")
-    job.write(tmp_path, rows=70)
+    job.write(tmp_path, rows=52)
     table = pd.read_csv(tmp_path / "data.csv")
     table["T05"] = table["T05"].shift(-1).ffill()
     table.to_csv(tmp_path / "data.csv", index=False)
@@ -327,7 +327,7 @@ EXCHANGED = Fault("heater", ("T_10", "T_60"), "exchanged")
 @pytest.mark.slow
 def test_exchanged_sensors_that_contradict_all_are_found_from_the_start(tmp_path: Path):
     """The gate takes such columns for a disturbance, after which the stored state is wrong."""
-    prepared = walk(tmp_path, EXCHANGED, 140)
+    prepared = walk(tmp_path, EXCHANGED, 90)
     last = prepared.identifier.run(prepared.stream).last
     assert prepared.identifier._state.trial.shape[1] > 0  # there was a disturbance
     found = [finding.causes[0] for finding in last.verdict.findings if finding.causes]
@@ -349,7 +349,7 @@ def test_exchanged_sensors_that_contradict_all_are_found_from_the_start(tmp_path
 def test_wrong_columns_are_named_where_an_unknown_moves(fault: Fault, noise: str, tmp_path: Path):
     """A furnace with an unknown flux that moves: samples are filtered, not fitted, again."""
     settings = {"law.noise": "auto"} if noise else {}
-    rows = 150 if fault.kind == "late" else 70
+    rows = 150 if fault.kind == "late" else 40
     prepared = walk(tmp_path, fault, rows, **settings)
     verdict = prepared.identifier.run(prepared.stream).last.verdict
     first = next(finding.causes[0] for finding in verdict.findings if finding.causes)
@@ -365,7 +365,7 @@ def test_wrong_columns_are_named_where_an_unknown_moves(fault: Fault, noise: str
     "fault", usual([EXCHANGED, Fault("furnace", ("T_cold",), "fahrenheit")]), ids=str
 )
 def test_samples_for_trials_outlive_a_restart(fault: Fault, tmp_path: Path):
-    prepared = walk(tmp_path, fault, 70)
+    prepared = walk(tmp_path, fault, 50)
     first, second = prepared.identifier, load(prepared.case.path).prepare().identifier
     for number, sample in enumerate(prepared.stream):
         expected = first.step(sample.t, sample.z, sample.inputs)

@@ -110,7 +110,7 @@ def test_a_source_that_goes_on_has_no_late_columns(tmp_path):
     ],
 )
 def test_the_cause_of_a_wrong_column_has_the_key_that_corrects_it(tmp_path, change, key):
-    path = short_rod(tmp_path, 121)
+    path = short_rod(tmp_path, 61)
     table = pd.read_csv(path.parent / "rod.csv")
     change(table)
     table.to_csv(path.parent / "rod.csv", index=False)
