@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -35,13 +36,25 @@ def identifier(*, verdict: bool = True) -> lp.Identifier:
     return lp.Identifier(model, sensors, law)
 
 
+@cache
+def readings(count: int) -> np.ndarray:
+    """Return noisy readings of the rod of `identifier`: runs with other ones search for causes."""
+    who = identifier()
+    times = [0.1 * k for k in range(count)]
+    q = who.model.initial_parameter({"k": 0.06})
+    control = lp.Advance(lp.Alexander2(), dt_max=0.05)
+    states = lp.simulate(who.model, q, 0.0, times, control, lambda t: {"left": left(t)})
+    clean = np.array([who.observed.G @ u for _, u in states])
+    return clean + 0.01 * np.random.default_rng(0).standard_normal((count, 2))
+
+
+def left(t: float) -> float:
+    return 1.0 + math.sin(t)
+
+
 def rows(count: int):
-    rng = np.random.default_rng(0)
-    for k in range(count):
-        t = 0.1 * k
-        left = 1.0 + math.sin(t)
-        a, b = (left * f + 0.01 * rng.standard_normal() for f in (0.7, 0.4))
-        yield {"t": t, "a": a, "b": b, "left": left}
+    for k, (a, b) in enumerate(readings(count).tolist()):
+        yield {"t": 0.1 * k, "a": a, "b": b, "left": left(0.1 * k)}
 
 
 def journal(path: Path) -> Journal:

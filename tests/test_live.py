@@ -635,7 +635,8 @@ def test_health_and_metrics(tmp_path):
 
     metrics = Metrics(["a", "b"])
     late = {"t": 0.0, "a": 0.0, "b": 0.0, "left": 0.0}
-    run = live(tmp_path, Rows([*rows(5), late]), sinks=[metrics])
+    wrong = [{**row, "a": 0.7 * row["left"], "b": 0.4 * row["left"]} for row in rows(5)]
+    run = live(tmp_path, Rows([*wrong, late]), sinks=[metrics])
     monitor = Monitor(Address(), lambda: run.health, metrics)
     run.run()
     health = json.loads(ask("/health"))

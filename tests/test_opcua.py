@@ -310,7 +310,8 @@ def written(server, wanted) -> None:
 
 def test_estimates_are_written_to_nodes(server, tmp_path):
     sink = OpcuaSink(OpcuaServer(server.url), WRITTEN)
-    run = live(tmp_path, Rows(rows(12)), sinks=[sink])
+    wrong = ({**row, "a": 0.7 * row["left"], "b": 0.4 * row["left"]} for row in rows(12))
+    run = live(tmp_path, Rows(wrong), sinks=[sink])
     run.run()
     last = [record.numbers for record in run.journal][-1]
     sink.close()  # writes the newest one
