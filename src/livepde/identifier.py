@@ -41,6 +41,7 @@ from livepde.observation import Observation
 from livepde.samples import Channels, Readings, numbers
 from livepde.showing import listed, options_of
 from livepde.start import (
+    assumes_zero,
     check_ignored,
     check_kinds,
     check_parts,
@@ -184,7 +185,7 @@ class Identifier(StreamRuns):
         self._q0 = model.initial_parameter(q0)
         self._u0 = model.initial_values(0.0 if u0 is None else u0)
         self._stated = model.boundary_readings(u0)  # at t0
-        self._assumed = u0 is None and model.form_initial is None  # a state of zero
+        self._assumed = assumes_zero(model, u0)
         self._fingerprint = self._lazy_fingerprint()
         sizes = self.observed.size, len(hidden), len(self.inputs)
         self._so_far = TakenSamples.start(t0, *sizes)

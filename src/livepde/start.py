@@ -60,6 +60,11 @@ def check_start(model: Model, t0: float, u0: Any, uncertain: Mapping[str, Any]) 
         raise ConfigurationError("the model has its own initial state (initial=): leave out u0.")
 
 
+def assumes_zero(model: Model, u0: Any) -> bool:
+    """Return whether nobody states an initial state, so that it is zero."""
+    return u0 is None and model.form_initial is None
+
+
 def check_ignored(names: Iterable[str], validation: tuple[str, ...]) -> None:
     """Refuse names of ignored sensors that are not among those for validation."""
     for name in names:

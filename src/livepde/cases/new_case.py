@@ -145,13 +145,7 @@ def _data_lines(
     table: Measured, folder: Path, equation: Equation, channels: list[FoundChannel]
 ) -> Iterator[str]:
     """Yield the line of [data], with a comment on what to check."""
-    states = {
-        column
-        for item in channels
-        for column in item.columns
-        if not item.is_sensor and has_states(equation.inputs[item.name].unit)
-    }
-    data, told = _data(table, folder, states), list[str]()
+    data, told = _data(table, folder, _with_states(equation, channels)), list[str]()
     if len(data.get("missing", ())) > len(table.missing):
         told.append("missing: far outside the other values; check them")
     if table.counted:
@@ -162,6 +156,13 @@ def _data_lines(
         data["t0"] = _open(table.time_unit)
         told.append("t0: when the process began, at rest")
     yield from _inline("data", data, "; ".join(told))
+
+
+def _with_states(equation: Equation, channels: list[FoundChannel]) -> set[str]:
+    """Return the columns of inputs that may be constant, as a power that is off."""
+    inputs = (item for item in channels if not item.is_sensor)
+    some = (item for item in inputs if has_states(equation.inputs[item.name].unit))
+    return {column for item in some for column in item.columns}
 
 
 def _with_noise(equation: Equation, item: FoundChannel, noise: str) -> FoundChannel:

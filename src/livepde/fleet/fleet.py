@@ -40,7 +40,7 @@ from livepde.samples import (
     numbers,
     sample_of,
 )
-from livepde.start import initial_errors, initial_readings
+from livepde.start import assumes_zero, initial_errors, initial_readings
 from livepde.stepping import Advance, Between, Scheme, Span, own_noise
 from livepde.verdict import Verdict
 
@@ -146,7 +146,7 @@ class Fleet:
         self._q0 = list(map(model.initial_parameter, q0s))
         self._u0 = [model.initial_values(0.0 if u is None else u) for u in u0s]
         self._stated = self._stated_at_start(u0s)
-        self._assumed = [u is None and model.form_initial is None for u in u0s]
+        self._assumed = [assumes_zero(model, u) for u in u0s]
         self.note = law.stepped_alone(self._work)
         self._errors = [initial_errors(model, one) for one in off]
         self._engine = self._stepper(made_of, u0s)

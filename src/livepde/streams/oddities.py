@@ -108,14 +108,22 @@ def switches(t: Array, x: Array, off: bool = False) -> bool:
     jumped = jumps > 0.0
     if not jumped.any() or (steps[jumped] < SHORT * np.median(steps)).all():
         return False
-    levels, sizes = len(np.unique(x)), jumps[jumped]
-    repeats = float(np.mean(~jumped))
-    # A log of changes has a value in few rows, and none that repeats the one before.
-    changes = repeats == 0.0 and levels < len(x) <= (1.0 - STAYS) * rows
-    few = levels <= LEVELS and (repeats >= STAYS or len(x) >= SWITCHED * levels or changes)
     if off and any(one.value not in KNOWN for one in sentinels(x)):
         return True
-    return few or (repeats >= STAYS and float(sizes.max()) > UNEVEN * float(sizes.min()))
+    sizes, repeats = jumps[jumped], float(np.mean(~jumped))
+    uneven = float(sizes.max()) > UNEVEN * float(sizes.min())
+    return (repeats >= STAYS and uneven) or _of_few_levels(x, rows, repeats)
+
+
+def _of_few_levels(x: Array, rows: int, repeats: float) -> bool:
+    """Return whether values switch between few levels; `repeats`: share that is the one before.
+
+    `rows`: of the table, in some of which there may be no value.
+    """
+    levels = len(np.unique(x))
+    # A log of changes has a value in few rows, and none that repeats the one before.
+    changes = repeats == 0.0 and levels < len(x) <= (1.0 - STAYS) * rows
+    return levels <= LEVELS and (repeats >= STAYS or len(x) >= SWITCHED * levels or changes)
 
 
 def unit_factor(before: float, after: float, usual: float, later: float) -> float:

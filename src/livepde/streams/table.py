@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any
@@ -246,16 +247,7 @@ def to_table(
     `written` are the dates as they are written, None if times are numbers. `numbers` gives the
     chosen rows of a column, `where` names the data and a row.
     """
-    dates = written is not None
-
-    def repeats(one: Any, other: Any) -> Mask:
-        rows = np.concatenate([one, other])
-        pairs = (np.split(numbers(name, rows), 2) for name in decimal_marks(columns))
-        found = np.ones(len(one), dtype=bool)
-        for a, b in pairs:
-            found &= (a == b) | (np.isnan(a) & np.isnan(b))
-        return found
-
+    dates, repeats = written is not None, partial(_repeats, numbers, columns)
     if written is not None:
         times = with_second_passes(
             times, written, clock, lambda *pair: bool(repeats(*np.array(pair)[:, None]).all())
@@ -294,6 +286,17 @@ def to_table(
         t = t - t[0]
     remarks = +remarks  # drops counts of zero
     return DataTable(t, values, tuple(columns), origin=origin, remarks=remarks)
+
+
+def _repeats(
+    numbers: Callable[[str, Any], Array], columns: Mapping[str, Column], one: Any, other: Any
+) -> Mask:
+    """Return which rows have the values of others; both are arrays of row numbers."""
+    rows = np.concatenate([one, other])
+    found = np.ones(len(one), dtype=bool)
+    for a, b in (np.split(numbers(name, rows), 2) for name in decimal_marks(columns)):
+        found &= (a == b) | (np.isnan(a) & np.isnan(b))
+    return found
 
 
 def _complete(
