@@ -205,3 +205,12 @@ def test_innovations_beside_an_unread_input_count_for_no_alarm():
         watch, alarm = jumps.add(watch, e, None, None, unread)
         alarms += [k] * bool(alarm[0])
     assert alarms == [150]
+
+
+def test_a_large_jump_begins_with_its_first_sample():
+    """Ratios by the usual scatter of several times are not comparable."""
+    jumps, rng = lp.Jumps(), np.random.default_rng(0)
+    watch = jumps.start(3)
+    for size in np.repeat([1.0, 1.3], [100, 60]):
+        watch, _ = jumps.add(watch, size * rng.standard_normal((1, 3)))
+    assert jumps.onset(watch, np.array([[140.0, np.nan, -3.0]])) == 1

@@ -331,6 +331,7 @@ class Jumps:
         """
         new = watch.add(e, watch.seen < self.settle)
         freedom = np.cumsum(new.counts[0])
-        size = new.scatters[0] ** 2 * np.maximum(freedom, 1.0)
+        # One yardstick for all n, from before all of them: ratios by several are not comparable.
+        size = new.scatters[0, -1] ** 2 * np.maximum(freedom, 1.0)
         ratio = np.maximum(np.cumsum(new.squares[0]) / size, 1.0)
         return 1 + int(np.argmax(freedom * (ratio - 1.0 - np.log(ratio))))
