@@ -6,7 +6,6 @@ import random
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from itertools import product as combinations
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +33,11 @@ from livepde.stepping import ForwardStage, advance
 
 
 def few(count: int, *axes: Iterable[Any]) -> list[tuple[Any, ...]]:
-    """Return some of all combinations, always the same ones."""
-    return random.Random(0).sample(list(combinations(*axes)), count)
+    """Return some combinations, always the same ones, in which each value is about as frequent."""
+    rng, listed = random.Random(0), [list(axis) for axis in axes]
+    picks = [rng.sample([k % len(axis) for k in range(count)], count) for axis in listed]
+    found = dict.fromkeys(zip(*picks, strict=True))
+    return [tuple(axis[k] for axis, k in zip(listed, one, strict=True)) for one in found]
 
 
 def usual(values: Iterable[Any], *, often: int = 1) -> list[Any]:

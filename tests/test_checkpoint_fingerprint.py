@@ -13,6 +13,11 @@ import pytest
 import livepde as lp
 from livepde.fleet import Fleet, Shard
 
+
+def law(**options: Any) -> lp.SensitivityLaw:
+    return lp.SensitivityLaw(shadows=None, **options)
+
+
 PLAIN: dict[str, Any] = {"factor": 1.0, "std": 0.05, "place": 0.5, "left": 1.0, "noise": 0.01}
 STEPS: dict[str, Any] = {"u0": 0.0, "dt_max": np.inf}
 CASES: dict[str, tuple[dict[str, Any], str]] = {
@@ -28,8 +33,8 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     "evolution": ({"evolution": lp.RandomWalk(0.1)}, "another prior"),
     "place": ({"place": 0.51}, "another sensor"),
     "noise": ({"noise": 0.02}, "another sensor"),
-    "gate": ({"law": lp.SensitivityLaw(gate=4.0)}, "another option of the law"),
-    "refit": ({"law": lp.SensitivityLaw(refit=None)}, "another option of the law"),
+    "gate": ({"law": law(gate=4.0)}, "another option of the law"),
+    "refit": ({"law": law(refit=None)}, "another option of the law"),
     "dt_max": ({"dt_max": 0.1}, "another scheme, dt_max"),
     "scheme": ({"scheme": lp.ImplicitEuler()}, "another scheme, dt_max"),
     "initial state": ({"u0": 0.1}, "another u0 or q0"),
@@ -51,9 +56,9 @@ def parts(**changed: Any) -> tuple[Any, dict[str, Any]]:
         f=given.get("f", 0.0),
     )
     sensors = lp.Points({"T": given["place"]}, noise=given["noise"])
-    law = given.get("law", lp.SensitivityLaw())
+    rule = given.get("law", law())
     keywords = {name: given[name] for name in ("q0", "scheme") if name in given}
-    return (model, sensors, law), {**STEPS, **keywords} | {
+    return (model, sensors, rule), {**STEPS, **keywords} | {
         name: given[name] for name in STEPS if name in given
     }
 
@@ -98,7 +103,7 @@ def test_the_same_problem_built_again_continues(options):
 
 
 def test_a_run_that_is_judged_continues_one_that_was_not():
-    rod().restore(begun(law=lp.SensitivityLaw(verdict=False)).dump())
+    rod().restore(begun(law=law(verdict=False)).dump())
 
 
 def test_rounding_of_another_machine_does_not_matter():

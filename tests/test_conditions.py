@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from factories import line, reaction
+from factories import few, line, reaction
 from scipy.linalg import expm
 from skfem import ElementLineP1
 
@@ -359,16 +359,17 @@ def divided(**options: Any) -> lp.Model:
 
 
 @pytest.mark.parametrize(
-    "conditions",
-    [
-        {"boundary": {"left": Flux(6.0)}},
-        {"boundary": {"left": Flux(lp.Channel("J"))}},
-        {"boundary": {"left": [Flux("J"), Exchange(3.0, 50.0)]}},
-        {"sources": {"heater": Source(6.0, lambda x: x[0] < 0.3)}},
-    ],
-)
-@pytest.mark.parametrize(
-    "own", [{}, *({name: lp.Normal(2.0, 1.0)} for name in ("source", "loss", "transfer"))]
+    ("conditions", "own"),
+    few(
+        8,
+        [
+            {"boundary": {"left": Flux(6.0)}},
+            {"boundary": {"left": Flux(lp.Channel("J"))}},
+            {"boundary": {"left": [Flux("J"), Exchange(3.0, 50.0)]}},
+            {"sources": {"heater": Source(6.0, lambda x: x[0] < 0.3)}},
+        ],
+        [{}, *({name: lp.Normal(2.0, 1.0)} for name in ("source", "loss", "transfer"))],
+    ),
 )
 def test_an_unknown_heat_capacity_is_as_the_known_one_of_its_value(conditions, own) -> None:
     """The divided equation and that with C in the mass matrix are one at the same value of C."""

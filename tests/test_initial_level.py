@@ -50,8 +50,7 @@ def run(seed: int, guess: float, noise: str | None, unknown: Any) -> lp.Estimate
     ],
 )
 def test_the_first_guess_of_the_noise_does_not_say_how_certain_u0_is(unknown: Any):
-    for seed in range(2):
-        value, std = run(seed, NOISE, None, unknown).parameters["s"]
-        found, own = run(seed, 0.1 * NOISE, "auto", unknown).parameters["s"]
-        assert own == pytest.approx(std, rel=0.15)
-        assert found == pytest.approx(value, abs=0.3 * std)
+    value, std = run(0, NOISE, None, unknown).parameters["s"]
+    found, own = run(0, 0.1 * NOISE, "auto", unknown).parameters["s"]
+    assert own == pytest.approx(std, rel=0.15)
+    assert found == pytest.approx(value, abs=0.3 * std)

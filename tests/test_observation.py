@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from factories import CASES, excited, excited_q, excited_u, line, observe, product, reaction, turns
+from factories import CASES, excited, excited_q, excited_u, few, line, observe, product, reaction
 from skfem import ElementLineHermite, ElementLineP1, ElementTriP1, MeshTri
 
 import livepde as lp
@@ -42,7 +42,7 @@ KINDS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "name", "dirichlet"), turns(KINDS, CASES, [True, False]))
+@pytest.mark.parametrize(("kind", "name", "dirichlet"), few(24, KINDS, CASES, [True, False]))
 def test_projections(kind, name, dirichlet):
     """P P = P, R R = R, G P = 0, ... to 1e-12, for every element and every kind of sensor."""
     model = CASES[name].model(dirichlet=None if dirichlet else {})

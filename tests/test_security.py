@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from factories import short_rod
 from live_rod import identifier, live, rows
 from patience import PATIENCE
 from typer.testing import CliRunner
@@ -137,7 +138,7 @@ CODE = 'from pathlib import Path\nPath("trace").touch()\ndef equation(*_, **__):
 def hostile(tmp_path, monkeypatch):
     """A run directory that somebody else has made, with a case that names code."""
     monkeypatch.chdir(tmp_path)
-    assert call("init", "mycase")[0] == 0
+    short_rod(tmp_path / "mycase", 21)
     assert call("run", "mycase/case.toml", "--out", "run")[0] == 0
     folder = tmp_path / "run"
     text = (folder / "case.toml").read_text()

@@ -48,13 +48,13 @@ def stored(kind: str, law: lp.SensitivityLaw, t: Any, first: bool, **parts: Any)
             row["b"] = np.nan
         if number % 11 == 5:
             row = dict.fromkeys(PLACES, np.nan)
-        inputs = {"T_0": 10.0 + 3.0 * np.sin(time), "T_1": 10.0 + 2.0 * (time > 2.0)}
+        inputs = {"T_0": 10.0 + 3.0 * np.sin(time), "T_1": 10.0 + 2.0 * (time > 1.0)}
         identifier.step(float(time), row, inputs)
     return StoredSamples.of(identifier._work, identifier._state)
 
 
-EVEN = 0.05 * np.arange(1, 81)
-PACES = np.cumsum(np.where(np.arange(80) < 40, 0.05, 0.125))
+EVEN = 0.05 * np.arange(1, 41)
+PACES = np.cumsum(np.where(np.arange(40) < 20, 0.05, 0.125))
 
 
 @pytest.mark.slow
@@ -64,7 +64,7 @@ PACES = np.cumsum(np.where(np.arange(80) < 40, 0.05, 0.125))
         ("plain", EVEN, True, {}, {}),
         ("plain", PACES, False, {}, {"between": {"T_0": "hold", "T_1": "next"}}),
         ("layers", EVEN, True, {}, {"dt_max": 0.02, "between": {"T_1": "hold"}}),
-        ("plain", EVEN[:24], False, {}, {"dt_max": 0.001}),  # intervals of more steps than a block
+        ("plain", EVEN[:12], False, {}, {"dt_max": 0.001}),  # intervals of more steps than a block
         ("offset", EVEN, True, {"shadows": None}, {"scheme": lp.ImplicitEuler()}),
         ("plain", PACES, False, {}, {"u0_errors": [1.0, lambda x: x[0]]}),
     ],
@@ -76,7 +76,7 @@ def test_a_pass_is_that_of_the_stages_one_by_one(
     samples = stored(kind, law, t, first, **parts)
     r = len(samples.alive)
     points = 0.5 * np.random.default_rng(1).standard_normal((5, r)) * samples.alive
-    monkeypatch.setattr(sweep, "BLOCK", 37)
+    monkeypatch.setattr(sweep, "BLOCK", 17)
     used = np.isfinite(samples.readings)
 
     def passed() -> tuple[Passed, Any, Any]:

@@ -131,8 +131,7 @@ def named(found: Verdict) -> list[tuple[str, str]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stated", [1.0, 3.0, 1 / 3])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(("stated", "seed"), [(1.0, 1), (3.0, 2), (1 / 3, 1)])
 def test_a_right_model_is_trusted_whatever_noise_is_stated(stated: float, seed: int):
     _, estimate = run(shown() + errors(seed), stated=stated)
     assert estimate.verdict.level == "trusted"
