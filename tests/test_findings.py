@@ -42,7 +42,10 @@ def issued() -> set[str]:
     """Return module and kind of each finding that the source can issue."""
     found = set()
     for path in SOURCE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        text = path.read_text(encoding="utf-8")
+        if not any(f"{name}(" in text for name in ISSUE):
+            continue
+        for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ISSUE and node.args:
                 kind = node.args[0]
                 if isinstance(kind, ast.Constant):
@@ -201,7 +204,7 @@ def unjudged_readings(*, spoiled: bool) -> list[str]:
 @cache
 def decayed(deviation: float, *, in_python: bool = False) -> list[str]:
     """Return the findings on a decay four times as fast as its prior, of some width."""
-    far = [np.exp(-2.0 * (k + 1) * 0.1) for k in range(40)]
+    far = [np.exp(-2.0 * (k + 1) * 0.1) for k in range(24)]
     unknown = lp.LogNormal(0.5, deviation)
     result = latent.run(latent.decay(unknown), latent.stream(far))
     if in_python:

@@ -62,7 +62,7 @@ def test_a_spike_does_not_take_a_latent_value_beyond_its_ends(prior: Any, law: A
 @pytest.mark.slow
 def test_what_is_reached_is_told():
     unknown = lp.LogNormal(0.5, 0.01)
-    far = [np.exp(-2.0 * (k + 1) * 0.1) for k in range(40)]  # four times the prior: 139 deviations
+    far = [np.exp(-2.0 * (k + 1) * 0.1) for k in range(24)]  # four times the prior: 139 deviations
     data = run(decay(unknown), stream(far)).to_xarray()
     assert data["k"].values[-1] == pytest.approx(0.5 * np.exp(10 * 0.02))
     assert data["bounded"].values[-1] == 1.0

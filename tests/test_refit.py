@@ -110,7 +110,7 @@ def test_beyond_a_bound_the_other_unknowns_are_those_of_the_best_fit_within():
 
     best = least_squares(residuals, [0.3, 0.0], bounds=([low, -10.0], [1.0, 10.0])).x
     free = least_squares(residuals, [0.3, 0.0]).x
-    mesh = lp.interval(0.0, 16.0, 80)
+    mesh = lp.interval(0.0, 16.0, 40)
     model = lp.Model(
         lp.Field(mesh, lp.fem.quadratic(mesh), dirichlet={"left": 0.0}),
         {"v": v, "D": lp.LogNormal(0.05, std=0.05)},
@@ -222,9 +222,9 @@ def rows(z: np.ndarray) -> list[tuple[float, dict[str, float]]]:
 
 @pytest.mark.slow
 def test_a_sensor_that_was_set_aside_is_not_fitted():
-    z = broken_rod.readings(200)
+    z = broken_rod.readings(130)
     whole = rod().run(rows(z)).last["alpha"]
-    z[120:170, 1] = -127.0  # unplugged
+    z[80:115, 1] = -127.0  # unplugged
     last = rod().run(rows(z)).last
     assert last.fit.converged
     value, std = last.parameters["alpha"]
@@ -317,15 +317,15 @@ def test_a_refit_apart_goes_on_from_where_one_at_once_would():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("at", [130, 143, 147, 150])
-def test_a_refit_apart_survives_restarts_and_copies(at: int):
-    samples, (_, whole) = rod_samples(), undisturbed()
-    first, second = insulated(apart=True), insulated(apart=True)
-    before = numbers_of(first, samples[:at])
-    second.restore(first.dump())
-    twin = copy.deepcopy(first)
-    for one in (first, second, twin):
-        assert np.array_equal(np.concatenate([before, numbers_of(one, samples[at:])]), whole)
+def test_a_refit_apart_survives_restarts_and_copies():
+    samples, (_, whole), first = rod_samples(), undisturbed(), insulated(apart=True)
+    for at, sample in enumerate(samples):
+        if at in (130, 143, 147, 150):
+            restored, twin = insulated(apart=True), copy.deepcopy(first)
+            restored.restore(first.dump())
+            for one in (restored, twin):
+                assert np.array_equal(numbers_of(one, samples[at:]), whole[at:])
+        assert np.array_equal(numbers_of(first, [sample])[0], whole[at])
 
 
 def apart_only(monkeypatch: pytest.MonkeyPatch, before: Any) -> None:
