@@ -570,7 +570,11 @@ def test_an_exchange_that_the_case_lacks_is_named_and_found(tmp_path):
 @pytest.mark.parametrize(
     ("name", "error", "truth"),
     [
-        ("layers of alpha", {"upper": 4e-5}, {"alpha[layer_1]": 2e-5, "alpha[layer_2]": 4e-5}),
+        (
+            "layers of alpha",
+            {"upper": 4e-5, "step": 20.0},
+            {"alpha[layer_1]": 2e-5, "alpha[layer_2]": 4e-5},
+        ),
         pytest.param(
             "source that jumps",
             {"switched": 0.003},
