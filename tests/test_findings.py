@@ -32,7 +32,7 @@ from livepde import cases
 from livepde.cases.remedies import start_missed
 from livepde.runs import clock_findings, input_findings, sampling_findings, verdict
 from livepde.stepping import Advance, simulate
-from livepde.verdict import Cause, Finding, Verdict
+from livepde.verdict import Cause, Finding, Verdict, flat
 
 SOURCE = Path(lp.__file__).parent
 ISSUE = ("Finding", "_each")  # calls with the kind of a finding as their first argument
@@ -382,3 +382,13 @@ def test_a_finding_appears_where_it_should_and_nowhere_else(name: str):
     kind = name.partition(": ")[2]
     assert kind in RUNS[name].appears()
     assert kind not in RUNS[name].not_here()
+
+
+@pytest.mark.parametrize("severity", ["caution", "do not trust"])
+def test_an_interval_that_a_gross_misfit_widens_does_not_ask_for_longer_data(severity):
+    misfit = Finding("misfit", severity, "It misfits.")
+    verdict = Verdict.of([misfit]).with_findings([flat("k", 1.0)])
+    (found,) = (one for one in verdict.findings if one.what == "flat")
+    assert ("longer data" in found.sentence) == (severity == "caution")
+    assert ("cause of the misfit" in found.sentence) == (severity == "do not trust")
+    assert verdict.with_findings([flat("k", 1.0)]) == verdict

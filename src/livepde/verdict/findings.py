@@ -224,6 +224,22 @@ def flat(label: str, left: float) -> Finding:
     return Finding("flat", "caution", text, label, left, remedy=remedy)
 
 
+def _after_misfit(findings: Iterable[Finding]) -> list[Finding]:
+    """Return findings; beside a gross misfit, a wide interval shows nothing about the data."""
+    given = list(findings)
+    if not any((one.what, one.severity) == ("misfit", "do not trust") for one in given):
+        return given
+    found = []
+    for one in given:
+        if one.what == "flat":
+            text, remedy = FINDINGS["flat, misfit"].filled(
+                label=one.subject, left=percent(one.evidence)
+            )
+            one = replace(one, text=text, remedy=remedy)
+        found.append(one)
+    return found
+
+
 def _ranked(findings: Iterable[Finding], errors: ModelErrors) -> list[Finding]:
     """Return findings whose severities follow from fit and effect, with what these are."""
     given = [finding for finding in findings if finding.what != "effect"]
@@ -314,6 +330,7 @@ class Verdict:
         """Return the verdict of some findings: the worst of them counts."""
         if errors is not None:
             findings = _ranked(findings, errors)
+        findings = _after_misfit(findings)
 
         def rank(finding: Finding) -> int:
             return LEVELS.index(WORST[finding.severity])

@@ -101,6 +101,10 @@ FINDINGS: dict[str, Sentence] = {
         "the prior's.",
         LONGER_DATA,
     ),
+    "flat, misfit": Sentence(
+        "The misfit widens the standard deviation of `{label}` to {left} of the prior's.",
+        "Find the cause of the misfit first.",
+    ),
     "bound": Sentence(
         "`{label}` is at its bound {value:g}: the bound determines the estimate, not the data."
     ),
