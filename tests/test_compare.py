@@ -27,6 +27,7 @@ from livepde.cases.variants import LastEstimate, Variant, VariantRun, run_varian
 from livepde.errors import CaseError
 from livepde.progress import timed
 from livepde.verdict import Cause, Finding, ModelErrors, Verdict
+from livepde.verdict.directions import stated_positions
 from livepde.verdict.sentences import estimating
 
 OFFSET = 0.5  # K
@@ -773,6 +774,8 @@ def test_a_quantity_is_no_reading_of_the_start(tmp_path):
     prepared = cases.load(tmp_path / "case.toml").prepare()
     assert first_miss(prepared) == 0.0
     assert start_missed(prepared, Verdict("caution", ())) == []
+    # Nor has it a position that could be wrong: `at_std` requires `at`.
+    assert stated_positions(prepared.identifier.observed) is None
 
 
 def test_a_variant_that_other_readings_make_usable_is_named():

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import NamedTuple, TypeAlias, cast
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
@@ -462,10 +462,15 @@ def _leaves(observed: Observed) -> list[Observed]:
 
 
 def _stated(observed: Observed) -> Points | None:
-    """Return the sensors of an observation if each has a position that is not estimated anyway."""
+    """Return the sensors of an observation if each has a position that is not estimated anyway.
+
+    Sensors that all depend directly on the parameter read another quantity than the state at a
+    place, such as the fluid of a borehole.
+    """
     observation = observed.observation
-    found = isinstance(observation, Points) and observation.position_std is None
-    return cast("Points", observation) if found else None
+    if not isinstance(observation, Points) or observation.position_std is not None:
+        return None
+    return None if set(observed.names) <= set(observation.direct) else observation
 
 
 def stated_positions(observed: Observed) -> Array | None:
