@@ -601,6 +601,17 @@ def test_a_layer_for_each_sensor_and_a_source_that_jumps_are_tried(tmp_path, nam
         assert abs(one.value / value - 1.0) < 0.1
 
 
+def test_a_source_that_changes_all_the_time_is_tried(tmp_path):
+    # Heat of hydration or of a compost rises and decays: neither constant nor a jump.
+    path = tmp_path / "case.toml"
+    path.write_text(HEATED)
+    heated(switched=0.003).to_csv(tmp_path / "rod.csv", index=False)
+    doubted = ended("as stated", 0.0, 1.0, errors={"T_5": 0.3})
+    variants = {one.name: one for one in proposed(cases.load(path).prepare(), doubted)}
+    prepared = cases.load(path, settings=parse(variants["source that changes"].settings)).prepare()
+    assert prepared.case.model.parameter_space.unknown_of("source").evolution.moves
+
+
 SWITCHED = """
 equation = "pumping_test"
 initial = 0

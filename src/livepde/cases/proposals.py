@@ -12,7 +12,7 @@ import numpy as np
 from livepde.cases.case import Case, Prepared
 from livepde.cases.case_channels import noise_of
 from livepde.cases.process import unread_without
-from livepde.cases.read import settings_in, toml_key, toml_value
+from livepde.cases.read import parse, settings_in, toml_key, toml_value
 from livepde.cases.remedies import (
     first_miss,
     freed,
@@ -114,6 +114,8 @@ def _process(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     law = prepared.case.spec.law
     if source and law.kind == "sensitivity" and not law.jumps:
         yield Variant("source that jumps", (*source, 'law.jumps=["source"]'))
+    if source:
+        yield Variant("source that changes", (*source, _walking("source", source[0], time)))
     yield Variant("loss", freed(prepared, Cause("loss", "", "", size=0.1 / time)))
     causes = (Cause("boundary", name, "", size=error) for name in prepared.case.roles("boundary"))
     if offsets := tuple(chain.from_iterable(freed(prepared, cause) for cause in causes)):
@@ -126,6 +128,16 @@ def _at_boundaries(prepared: Prepared, terms: Mapping[str, float]) -> Iterator[V
     for name, (kind, size) in product(map(str, prepared.case.mesh.boundaries or {}), terms.items()):
         settings = freed(prepared, Cause(kind, name, "", size=size))
         yield Variant(NAMES[kind].format(name), settings)
+
+
+def _walking(name: str, added: str, time: float) -> str:
+    """Return the setting of a random walk that changes by its standard deviation within a time.
+
+    `added`: the setting that adds the unknown.
+    """
+    (spec,) = parse([added]).values()
+    walk = {"kind": "random-walk", "rate": float(f"{spec['std'] / math.sqrt(time):.2g}")}
+    return f"unknowns.{toml_key(name)}.evolution={toml_value(walk)}"
 
 
 def _sensors(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
