@@ -147,7 +147,7 @@ def _shown(result: Any) -> int:
         result.verdict.level,
         result.last.to_dict()["verdict"],
         verdict(stored).to_dict()["level"],
-        verdict_table(verdict(stored)).title.removeprefix("Verdict: "),
+        verdict_table(verdict(stored)).title.removeprefix("Verdict: ").partition(" (")[0],
     ]
     return sum(level != "not judged" for level in shown)
 
