@@ -109,18 +109,23 @@ def _process(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     if not (isinstance(table, DataTable) and len(table) > 1 and error > 0.0):
         return
     time = SAMPLES * float(np.median(np.diff(table.t)))
-    source = freed(prepared, Cause("source", "", "", size=error / time))
-    yield Variant("source", source)
-    law = prepared.case.spec.law
-    if source and law.kind == "sensitivity" and not law.jumps:
-        yield Variant("source that jumps", (*source, 'law.jumps=["source"]'))
-    if source:
-        yield Variant("source that changes", (*source, _walking("source", source[0], time)))
+    yield from _sources(prepared, error / time, time)
     yield Variant("loss", freed(prepared, Cause("loss", "", "", size=0.1 / time)))
     causes = (Cause("boundary", name, "", size=error) for name in prepared.case.roles("boundary"))
     if offsets := tuple(chain.from_iterable(freed(prepared, cause) for cause in causes)):
         yield Variant("offsets of the boundary values", offsets)
     yield from _at_boundaries(prepared, {"flux": error / time, "transfer": 0.1 / time})
+
+
+def _sources(prepared: Prepared, size: float, time: float) -> Iterator[Variant]:
+    """Iterate over sources of a size: constant, one that jumps, and one that changes in a time."""
+    source, law = freed(prepared, Cause("source", "", "", size=size)), prepared.case.spec.law
+    if not source:
+        return
+    yield Variant("source", source)
+    if law.kind == "sensitivity" and not law.jumps:
+        yield Variant("source that jumps", (*source, 'law.jumps=["source"]'))
+    yield Variant("source that changes", (*source, _walking("source", source[0], time)))
 
 
 def _at_boundaries(prepared: Prepared, terms: Mapping[str, float]) -> Iterator[Variant]:
