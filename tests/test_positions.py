@@ -71,7 +71,7 @@ def test_shifts_are_found_and_what_they_cost_is_in_the_interval():
     assert shifts_inside >= 26
 
 
-def test_it_is_a_quadratic_in_the_shift():
+def test_a_shift_moves_the_reading_along_the_state():
     model = rod().with_unknowns(lp.Points(AT, position_std=0.02).unknowns)
     points = lp.Points(AT, position_std=0.02, noise=0.005)
     observed = observe(model, points)
@@ -84,6 +84,17 @@ def test_it_is_a_quadratic_in_the_shift():
     assert G @ u == pytest.approx(observed.predict(u, q, None))
     assert np.diag(H_q[:, 1:]) == pytest.approx(3.0 * np.cos(3.0 * at), abs=0.06)
     assert np.count_nonzero(H_q) == 3
+
+
+@pytest.mark.parametrize("shift", [-0.2, -0.03, 0.15, 0.28])
+def test_a_far_shift_reads_the_state_where_the_sensor_is(shift):
+    """Of a profile that no quadratic follows; a found shift of half a deviation biased others."""
+    points = lp.Points({"T": 0.5}, position_std=0.1, noise=0.1)
+    observed = observe(rod().with_unknowns(points.unknowns), points)
+    u = observed.state.interpolate(lambda x: np.tanh(8.0 * (x[0] - 0.4)))
+    q, there = np.array([0.1, shift]), np.tanh(8.0 * (0.1 + shift))
+    assert observed.predict(u, q, None) == pytest.approx([there], abs=3e-3)
+    assert observed.jacobian(u, q, None)[1][0, 1] == pytest.approx(8.0 * (1.0 - there**2), abs=0.1)
 
 
 @pytest.mark.parametrize(("at", "shift"), [(0.99, 0.03), (1.0, -0.03), (0.0, 0.02), (0.5, 0.1)])

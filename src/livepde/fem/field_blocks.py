@@ -538,6 +538,12 @@ class FieldBlock(Block):
         """Return True if a point, shape (d,), lies in the mesh."""
         return self._located(point[:, None])[1] is None
 
+    def widths(self, point: Array) -> Array:
+        """Return the widths along the axes of the cell at a point of the mesh, shape (d,)."""
+        (cell,), _ = self._located(point[:, None])
+        mesh = self.field.mesh
+        return np.asarray(np.ptp(mesh.p[:, mesh.t[:, cell]], axis=1))
+
     def _located(self, points: Array) -> tuple[IntArray, int | None]:
         """Return the cell of each point, of shape (d, k), and the number of the first one outside.
 

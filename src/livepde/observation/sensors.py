@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -23,6 +24,8 @@ AXES = "xyz"
 # Distance from the end of the mesh, in standard deviations of the position, within which a sensor
 # lies on the end.
 NEAR = 1e-6
+REACH = 3.0  # standard deviations to each side within which values at a shifted place are exact
+PER_STD = 4  # places in a standard deviation between which they are interpolated
 
 
 def shift_names(sensor: str, dimension: int) -> list[str]:
@@ -146,7 +149,8 @@ class Points(Observation):
         Standard deviation of the true positions, along each coordinate: one number for all sensors,
         or a mapping from sensor name to number for some, with one common value. The shifts are then
         additional unknowns: `position[NAME]`, in more than one dimension `position[NAME.x]` and so
-        on.
+        on. The effects of shifts along several coordinates are added, which is exact to first
+        order.
     component
         Number of the component that is measured, from 0, if the state is a vector at each point:
         one for all sensors, or one for each. Two components at one place are two sensors.
@@ -282,40 +286,42 @@ class Points(Observation):
 
 @dataclass(frozen=True, eq=False)
 class _Shift:
-    """Effect of shifting one sensor along one coordinate by d: a quadratic interpolant.
+    """Effect of shifting one sensor along one coordinate by d: a cubic spline.
 
-    The quadratic interpolates the values at -a, 0 and b (`below`, `above`), about a standard
-    deviation to each side. A derivative is not used because u has none at a node of linear
-    elements. At the end of the mesh a or b is 0, and the interpolant is the straight line to the
-    other side; where both are, at the top of a disc say, the shift has no effect. The rows `low`
-    and `high` evaluate the differences of u there to u at 0, shape (1, n); `column` is the position
-    of the shift in q.
+    It interpolates the values at `places`, some shifts up to `REACH` standard deviations to each
+    side or to the end of the mesh; beyond them it is a straight line. Where the mesh reaches to
+    neither side, at the top of a disc say, the shift has no effect. A derivative of u is not used
+    because it has none at a node of linear elements. `rows` evaluate the differences of u there to
+    u at 0, shape (places, n); `column` is the position of the shift in q.
     """
 
     sensor: int
     column: int
-    below: float
-    above: float
-    low: sp.csr_array
-    high: sp.csr_array
+    places: Array
+    rows: sp.csr_array
 
-    def weights(self, d: float) -> tuple[float, float]:
-        """Return the interpolation weights of both differences at a shift d."""
-        a, b = self.below, self.above
-        if a == 0.0 or b == 0.0:
-            return (-d / a if a else 0.0), (d / b if b else 0.0)
-        return d * (d - b) / (a * (a + b)), d * (d + a) / (b * (a + b))
+    @cached_property
+    def _spline(self) -> Any:
+        from scipy.interpolate import CubicSpline  # slow to import, and seldom needed
 
-    def slopes(self, d: float) -> tuple[float, float]:
+        return CubicSpline(self.places, np.eye(len(self.places)))
+
+    def weights(self, d: float) -> Array:
+        """Return the interpolation weights of all differences at a shift d."""
+        if len(self.places) < 2:
+            return np.zeros(len(self.places))
+        within = min(max(d, self.places[0]), self.places[-1])
+        return np.asarray(self._spline(within) + (d - within) * self._spline(within, 1))
+
+    def slopes(self, d: float) -> Array:
         """Return the derivatives of `weights`."""
-        a, b = self.below, self.above
-        if a == 0.0 or b == 0.0:
-            return (-1.0 / a if a else 0.0), (1.0 / b if b else 0.0)
-        return (2.0 * d - b) / (a * (a + b)), (2.0 * d + a) / (b * (a + b))
+        if len(self.places) < 2:
+            return np.zeros(len(self.places))
+        return np.asarray(self._spline(min(max(d, self.places[0]), self.places[-1]), 1))
 
 
 class PlacedObserved(Observed):
-    """Bound `Points` at uncertain positions: linear in u, quadratic in the shifts."""
+    """Bound `Points` at uncertain positions: linear in u, a spline in each shift."""
 
     observation: Points
     linear = False
@@ -325,9 +331,12 @@ class PlacedObserved(Observed):
         block, _ = self.state.component(points.of)
         names, labels = points.names(len(at)), self.parameter.labels
 
-        def difference(sensor: int, point: Array) -> sp.csr_array:
-            values = points.rows(self.state, np.array([at[sensor], point]), [sensor, sensor])
-            return sp.csr_array(values[[1]] - values[[0]])
+        def differences(sensor: int, axis: int, shifts: Array) -> sp.csr_array:
+            there = np.repeat(at[[sensor]], len(shifts), axis=0)
+            there[:, axis] += shifts
+            every = np.concatenate([at[[sensor]], there])
+            values = points.rows(self.state, every, [sensor] * len(every))
+            return sp.csr_array(values[1:] - values[np.zeros(len(shifts), dtype=int)])
 
         self.shifts = []
         for name in points.uncertain:
@@ -340,30 +349,29 @@ class PlacedObserved(Observed):
                         "an Identifier adds it for assimilated sensors; elsewhere take "
                         "model.with_unknowns(observation.unknowns)."
                     )
-                start = at[sensor]
-                # The interpolation points lie a standard deviation away, where the shift is
-                # expected, and are moved into the mesh at its boundary.
-                low, high = (_reached(block, start, axis, step) for step in (-std, std))
-                below, above = float(start[axis] - low[axis]), float(high[axis] - start[axis])
-                ends = (difference(sensor, low), difference(sensor, high))
-                self.shifts.append(_Shift(sensor, labels[label], below, above, *ends))
+                start, reach = at[sensor], REACH * std
+                low, high = (_reached(block, start, axis, step) for step in (-reach, reach))
+                # Between the nodes of linear elements u has no second derivative.
+                step = min(std, max(float(block.widths(start)[axis]), std / PER_STD))
+                places = _spaced(low[axis] - start[axis], high[axis] - start[axis], step)
+                rows = differences(sensor, axis, places)
+                self.shifts.append(_Shift(sensor, labels[label], places, rows))
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
         z = super().predict(u, q, moment)
         weights = [shift.weights(float(q[shift.column])) for shift in self.shifts]
-        np.add.at(z, self._sensors, np.ravel(weights) * (self._differences @ u))
+        np.add.at(z, self._sensors, np.concatenate(weights) * (self._differences @ u))
         return z
 
     def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
         direct = self._direct(moment)
         H_q = np.zeros((self.size, self.parameter.dim)) if direct is None else direct.copy()
-        differences = (self._differences @ u).reshape(-1, 2)
         weights = []
-        for shift, difference in zip(self.shifts, differences, strict=True):
+        for shift in self.shifts:
             d = float(q[shift.column])
-            H_q[shift.sensor, shift.column] += float(difference @ shift.slopes(d))
+            H_q[shift.sensor, shift.column] += float(shift.slopes(d) @ (shift.rows @ u))
             weights.append(shift.weights(d))
-        return self._placed(np.ravel(weights)), H_q
+        return self._placed(np.concatenate(weights)), H_q
 
     def _placed(self, weights: Array) -> sp.csr_array:
         """Return G at the shifted positions, for weights of all differences, shape (sensors, n)."""
@@ -374,13 +382,13 @@ class PlacedObserved(Observed):
     @cached_property
     def _sensors(self) -> IntArray:
         """Number of the sensor of each row of `_differences`."""
-        return np.repeat([shift.sensor for shift in self.shifts], 2)
+        counts = [len(shift.places) for shift in self.shifts]
+        return np.repeat([shift.sensor for shift in self.shifts], counts)
 
     @cached_property
     def _differences(self) -> sp.csr_array:
-        """Rows `low` and `high` of each shift in turn, shape (2 shifts, n)."""
-        ends = [end for shift in self.shifts for end in (shift.low, shift.high)]
-        return sp.csr_array(sp.vstack(ends, format="csr"))
+        """Rows of each shift in turn, shape (places, n)."""
+        return sp.csr_array(sp.vstack([shift.rows for shift in self.shifts], format="csr"))
 
     @cached_property
     def _parts(self) -> tuple[sp.csr_array, Array]:
@@ -397,6 +405,12 @@ class PlacedObserved(Observed):
             own = np.asarray(self._differences[np.full_like(row, k), pattern.indices])
             values.append(np.where(row == sensor, own, 0.0))
         return pattern, np.array(values)
+
+
+def _spaced(low: float, high: float, step: float) -> Array:
+    """Return 0 and numbers from low to high, no farther apart than a step."""
+    ends = (np.linspace(0.0, end, 1 + math.ceil(abs(end) / step - NEAR)) for end in (low, high))
+    return np.unique(np.concatenate([*ends, [0.0]]))
 
 
 def _reached(block: FieldBlock, start: Array, axis: int, step: float) -> Array:
