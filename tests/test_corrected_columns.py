@@ -116,8 +116,10 @@ def test_the_cause_of_a_wrong_column_has_the_key_that_corrects_it(tmp_path, chan
     table.to_csv(path.parent / "rod.csv", index=False)
     prepared = cases.load(path).prepare()
     verdict = with_settings(prepared, prepared.identifier.run(prepared.stream).last.verdict)
-    settings = [cause.setting for finding in verdict.findings for cause in finding.causes]
-    assert any(setting.startswith(key) for setting in settings), verdict.sentences
+    causes = [cause for finding in verdict.findings for cause in finding.causes]
+    assert any(cause.setting.startswith(key) for cause in causes), verdict.sentences
+    late = [cause for cause in causes if cause.kind == "lag"]
+    assert all(f"set `{cause.setting}`" in cause.remedy for cause in late), verdict.sentences
 
 
 def test_the_noise_of_a_reading_has_its_time(tmp_path):

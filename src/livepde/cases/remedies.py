@@ -140,6 +140,8 @@ def _with_remedy(case: Case, cause: Cause, settings: tuple[str, ...]) -> Cause:
         return replace(cause, remedy=f"Specify its uncertainty: `{settings[0]}`.")
     if cause.kind == "jump" and _may_jump(case, cause.subject):
         return replace(cause, remedy=JUMPED)
+    if cause.kind == "lag" and settings:
+        return replace(cause, remedy=f"{cause.remedy} If the clock is wrong, set `{settings[0]}`.")
     if cause.kind not in KEYS or cause.subject not in case.roles("sensor"):
         return cause
     table = case.families.get(cause.subject, cause.subject)  # a family has one table
