@@ -462,8 +462,11 @@ def test_the_page_follows_a_run_and_looks_back(tmp_path):
             wait(page, lambda p: count(p) > seen + 5)  # it goes on
             wait(page, lambda p: profile(p, "State u") != drawn)
 
-            thumb = page.find_element(By.CSS_SELECTOR, "#slider [role=slider]")
-            thumb.send_keys(Keys.HOME)
+            def at_start(p) -> bool:
+                # The slider is drawn anew with each sample, maybe as the key arrives.
+                p.find_element(By.CSS_SELECTOR, "#slider [role=slider]").send_keys(Keys.HOME)
+                return text(p, "#shown") == "history: 2025-04-01 00:00:00"
+
             with Journal.open(folder / JOURNAL) as journal:
                 first = next(iter(journal))
             past, number = first.snapshot.profiles["u"], f"{first.numbers[0]:.3f}"
@@ -472,7 +475,7 @@ def test_the_page_follows_a_run_and_looks_back(tmp_path):
                 there = np.allclose(profile(p, "State u") or np.inf, past)
                 return there and text(p, ".card .value").startswith(number)
 
-            wait(page, lambda p: text(p, "#shown") == "history: 2025-04-01 00:00:00")
+            wait(page, at_start)
             wait(page, back)
             seen = count(page)
             wait(page, lambda p: count(p) > seen + 5)  # the run goes on, the page stays there
