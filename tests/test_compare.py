@@ -14,7 +14,7 @@ import pytest
 import scipy
 import tomlkit
 from commands import bad, call
-from factories import short_rod
+from factories import ROD_CASE, short_rod
 
 from benchmarks.first_hour import FOLDER
 from livepde import cases
@@ -776,6 +776,16 @@ def test_a_misfit_of_a_response_test_names_the_stored_heat(tmp_path, begin, end,
     assert [one.settings for one in later] == (
         [('data.assimilate_from="27 h"',)] if (begin, end) == (0, 72) else []
     )
+
+
+def test_sensors_of_a_family_are_readings_of_the_start(tmp_path):
+    (tmp_path / "rows.csv").write_text("t,u_0,u_1,left\n0,23,17,20\n9,24,18,20\n")
+    boundary = 'left = { role = "boundary", column = "left", at = "left" }'
+    family = 'u = { role = "sensor", column = "u_{}", each = ["20 cm", "40 cm", 2] }'
+    (tmp_path / "case.toml").write_text(
+        f"{ROD_CASE}noise = 0.1\n[channels]\n{boundary}\n{family}\n"
+    )
+    assert first_miss(cases.load(tmp_path / "case.toml").prepare()) == pytest.approx(3.0)
 
 
 def test_a_quantity_is_no_reading_of_the_start(tmp_path):

@@ -326,9 +326,8 @@ def first_miss(prepared: Prepared) -> float:
 
 def _first_readings(prepared: Prepared) -> Array:
     """Return the readings in the first sample of the assimilated sensors that read the state."""
-    given, case = by_name(prepared.first.z, ()), prepared.case
-    specs = {name: case.spec.channels[case.families.get(name, name)] for name in case.sensors}
-    names = [name for name, spec in specs.items() if spec.quantity is None and name in given]
+    given, channels = by_name(prepared.first.z, ()), prepared.case.roles("sensor")
+    names = [name for name, item in channels.items() if item.quantity is None and name in given]
     seen: Array = np.array([float(given[name]) for name in names])
     return np.compress(np.isfinite(seen), seen)
 
