@@ -141,7 +141,8 @@ def _with_remedy(case: Case, cause: Cause, settings: tuple[str, ...]) -> Cause:
     if cause.kind == "jump" and _may_jump(case, cause.subject):
         return replace(cause, remedy=JUMPED)
     if cause.kind == "lag" and settings:
-        return replace(cause, remedy=f"{cause.remedy} If the clock is wrong, set `{settings[0]}`.")
+        check = LIKELY["lag"].remedy.format(name=cause.subject)
+        return replace(cause, remedy=f"{check} If the clock is wrong, set `{settings[0]}`.")
     if cause.kind not in KEYS or cause.subject not in case.roles("sensor"):
         return cause
     table = case.families.get(cause.subject, cause.subject)  # a family has one table
