@@ -676,6 +676,8 @@ def test_estimates_of_a_recommended_variant_that_is_not_trusted_are_not_to_be_us
     assert "All variants agree" not in said
     usable = replace(best, verdict=sound.verdict)
     assert "All variants agree" in " ".join(conclusions(base, [usable]))
+    unjudged = replace(best, verdict=Verdict.unjudged().to_dict())
+    assert "Do not use" not in " ".join(conclusions(base, [unjudged]))
 
 
 def test_a_variant_without_an_unknown_lacks_what_is_read_for_it_alone(tmp_path):

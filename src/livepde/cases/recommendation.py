@@ -92,7 +92,7 @@ def _recommendation(base: VariantRun, best: VariantRun) -> str:
         text += f" Its error at the validation sensors is {errors}."
     else:
         text += " No validation sensor confirms it."
-    if best.level not in USABLE:
+    if best.level == "do not trust":
         text += " Do not use its estimates: no variant explains the data."
     return text
 
