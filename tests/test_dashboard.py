@@ -463,7 +463,7 @@ def test_the_page_follows_a_run_and_looks_back(tmp_path):
             wait(page, lambda p: profile(p, "State u") != drawn)
 
             def at_start(p) -> bool:
-                # The slider is drawn anew with each sample, maybe as the key arrives.
+                # Each sample redraws the slider, and a key may be lost then.
                 p.find_element(By.CSS_SELECTOR, "#slider [role=slider]").send_keys(Keys.HOME)
                 return text(p, "#shown") == "history: 2025-04-01 00:00:00"
 

@@ -123,7 +123,9 @@ def _sources(prepared: Prepared, size: float, time: float) -> Iterator[Variant]:
     if not source:
         return
     yield Variant("source", source)
-    if law.kind == "sensitivity" and not law.jumps:
+    if law.kind != "sensitivity":  # changes are found by a covariance
+        return
+    if not law.jumps:
         yield Variant("source that jumps", (*source, 'law.jumps=["source"]'))
     yield Variant("source that changes", (*source, _walking("source", source[0], time)))
 

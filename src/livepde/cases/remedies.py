@@ -213,7 +213,7 @@ def _of_sensor(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
 
 
 def _is_settled(channel: ChannelSpec, key: str) -> bool:
-    """Return whether a sensor cannot have an error of its own: it has one, or no position."""
+    """Return whether a sensor cannot get an unknown error: it has one, or no position."""
     placed = channel.is_point and not channel.is_flux
     return getattr(channel, key) is not None or (key == "at_std" and not placed)
 

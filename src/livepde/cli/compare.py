@@ -186,7 +186,7 @@ def _all(
 def _run(
     case: Path, settings: Sequence[str], variant: Variant, *, data: str | None, allow_code: bool
 ) -> VariantRun:
-    """Run one variant, in a process of its own."""
+    """Run one variant with one thread."""
     with threadpool_limits(1):
         return run_variant(case, settings, variant, data, allow_code)
 

@@ -332,7 +332,7 @@ def _once(
 ) -> IntArray:
     """Return rows without those that have time and values of the one before; `clock`: of dates.
 
-    In an hour that clocks show twice, such a row may be a reading of its own.
+    In an hour that clocks show twice, such a row may be another reading.
     """
     again = np.flatnonzero(np.diff(times[use]) == 0.0)
     if clock is not None:
