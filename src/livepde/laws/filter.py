@@ -1,16 +1,16 @@
-"""The filter: state and reduced unknowns with a joint square root, about a linearisation point.
+"""Reduced-order extended Kalman filter in square-root form, linear about a linearisation point.
 
-Reduced-order filter of Moireau, Chapelle and Le Tallec (2008), written for several members at once:
-the leading axis of every array is the members. One is an identifier, any number a fleet. With
-a ~ N(0, I) the reduced unknowns, S the Jacobian of a step, A the derivative of A(u) q in q and
-P = [U C]^T [U C] the joint covariance of u and a,
+The filter of Moireau, Chapelle and Le Tallec (2008), for several members at once: the leading axis
+of every array is the members. An identifier has one member, a fleet any number. Let a ~ N(0, I) be
+the reduced unknowns, S the Jacobian of a step, A the derivative of A(u) q in q and
+P = [U C]^T [U C] the joint covariance of u and a. Then
 
     predict   one implicit step for u;   U+ S^T = U M/h - C Phi^T A(u+)^T
     update    d = z - h(u, q),  Y = U H_u^T + C Phi^T H_q^T,  W W^T = (I + Y N^-1 Y^T)^-1
               [u; a] += [U C]^T W W^T Y N^-1 d,   [U C] <- W^T [U C]
 
-For unknowns that stay as they are U = C L^T with the sensitivity L = du/da. The covariance that is
-reported is wider where the innovations require it (`robust_factors`).
+For constant unknowns, U = C L^T with the sensitivity L = du/da. The reported covariance is wider
+where the innovations require it (`robust_factors`).
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ from livepde.verdict import Judge
 
 Steps: TypeAlias = int | IntArray
 
-FEW_SUBSTEPS = 600  # of a pause, to find how uncertain it leaves the state
-FEW = 8  # members up to which LAPACK is called for each
-BLOCK = 32  # columns that LAPACK's QR takes at once
+FEW_SUBSTEPS = 600  # largest number of substeps that propagate the uncertainty of a pause
+FEW = 8  # largest number of members for which LAPACK is called member by member
+BLOCK = 32  # block size of LAPACK's QR, in columns
 
 
 class Update(NamedTuple):
-    """Matrices and vectors of an update, with W as in the docstring of this module."""
+    """Matrices and vectors of an update; W is defined in the docstring of this module."""
 
     # Shapes (members, r, r) and (members, r, sensors).
     W: Array
@@ -72,37 +72,33 @@ class Update(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Filter:
-    """Predicts and updates, linear about the point of a `FilterState`.
+    """Predict and update, linear about the linearisation point of a `FilterState`.
 
-    Overflow is no error here: callers check that the results are finite.
+    Overflow raises no error: callers check that the results are finite.
     """
 
-    # Model and sensors; the implicit stage of all members; the observation operator of all members;
-    # the reduced coordinates of the unknowns.
-    problem: Problem
-    stage: MemberStage
-    sensors: MemberSensors
-    reduction: Reduction
+    problem: Problem  # model and sensors
+    stage: MemberStage  # implicit stage of the time scheme, for all members
+    sensors: MemberSensors  # observation operator of all members
+    reduction: Reduction  # reduced coordinates of the unknowns
     noise: Array  # standard deviation of each sensor, shape (sensors,)
-    # A square root of more than `rank` rows is compressed; `scale`, shape (n,), weighs the
-    # coefficients of the state then: the square root of the mass of each.
+    # A square root of more than `rank` rows is compressed. The norm of the state weighs its
+    # coefficients by `scale`, the square roots of their normalised diagonal masses, shape (n,).
     rank: int
     scale: Array
-    # Prior variances gained per unit of time by unknowns without an evolution of their own, one for
-    # each member number, shape (numbers,), or (1,) for all.
+    # Prior variances gained per unit of time by unknowns without an evolution, one value for each
+    # member number, shape (numbers,), or one for all, shape (1,).
     drift: Array
-    # Time constant with which the cross-covariance of state and unknowns decays.
-    fading: float = np.inf
-    judge: Judge | None = None  # keeps the sums behind the verdict; None: there is no verdict
-    # Discretisation errors that are followed beside the filter; None: none is.
-    shadows: ShadowSet | None = None
+    fading: float = np.inf  # time constant of decay of the cross-covariance of state and unknowns
+    judge: Judge | None = None  # accumulates the statistics of the verdict; None: no verdict
+    shadows: ShadowSet | None = None  # estimated discretisation errors; None: no error is estimated
 
     def drifts(self, member: IntArray) -> Array:
         return self.drift[member] if len(self.drift) > 1 else np.repeat(self.drift, len(member))
 
     @cached_property
     def anchor(self) -> Anchor:
-        """Correction of the state by readings that do not change the unknowns."""
+        """Operator that corrects the state alone, by readings that do not change the unknowns."""
         return Anchor(self.problem, self.sensors)
 
     @cached_property
@@ -110,36 +106,36 @@ class Filter:
         return self.reduction.moves or bool(self.drift.any())
 
     def span(self, interval: Interval) -> Span:
-        """Return the interval of one process as that of its one member."""
+        """Return the span of a filter with one member for an interval."""
         return Span.of(interval.driven(self.problem.control.held), self.problem.channels)
 
     @cached_property
     def _driving(self) -> IntArray:
-        """Columns of the channels that drive the model as lines."""
+        """Columns of the input channels that are interpolated linearly between readings."""
         channels = self.problem.channels
         return np.array([channels.index(name) for name in lines(self.problem)], dtype=np.int64)
 
     def input_gaps(self, span: Span) -> Mask | None:
-        """Return for which members an input was not read in a span, (members,); None: for none.
+        """Return the members with an input that was not read in a span, (members,), or None.
 
-        Innovations may then be due to that input.
+        Their innovations may be due to that input. None means that all inputs were read.
         """
         if span.gaps is None:
             return None
-        found: Mask = np.asarray((span.gaps[:, :, self._driving] > 0.0).any(axis=(1, 2)))
-        return found if np.count_nonzero(found) else None
+        unread: Mask = np.asarray((span.gaps[:, :, self._driving] > 0.0).any(axis=(1, 2)))
+        return unread if np.count_nonzero(unread) else None
 
     def learns(self, Y: Array) -> bool:
         """Return whether readings with the rows Y, (members, r, sensors), change an estimate.
 
-        Sensors at uncertain positions in a uniform state have rows of rounding errors.
+        The rows of a sensor at an uncertain position in a uniform state contain rounding errors.
         """
         return bool((np.square(Y / self.noise) > np.finfo(float).eps).any())
 
     def noise_of(self, x: FilterState, z: Span | Interval) -> Array:
         """Return the standard deviation of each reading at the end, shape (members, sensors).
 
-        That of the reading where it has one, else that of the sensor; at the level of each member.
+        The default is the noise of the sensor. Both are scaled by the noise level of the member.
         """
         noise: Array = self.noise
         if z.noise is not None:
@@ -147,11 +143,11 @@ class Filter:
         return np.asarray(np.sqrt(x.level)[:, None] * noise)
 
     def estimate(self, x: FilterState) -> Array:
-        """Return the estimated latent parameters, not yet bounded, shape (members, m)."""
+        """Return the estimated latent parameters before bounds are applied, shape (members, m)."""
         return x.q + x.da @ self.reduction.Phi.T
 
     def _with_noise(self, x: FilterState, h: float, noise: NoiseRows | None) -> FilterState:
-        """Return the state with the unknowns predicted over a time h, their noise in new rows."""
+        """Return the state with the unknowns predicted over a time h and rows for their noise."""
         end = self.unknowns_after(x, h)
         if noise is None:
             return end
@@ -160,13 +156,13 @@ class Filter:
         return changed(end, U=U, C=C, past=past, causes=causes)
 
     def _noise(self, x: FilterState, start: float, h: float) -> NoiseRows | None:
-        """Return the process noise of a step; None if no coordinate gains any."""
+        """Return the process noise of a step; None if no coordinate gains variance."""
         if h == 0.0 or not self.moves:
             return None
         drifts = self.drifts(x.member)
         variance = np.einsum("brk,brk->bk", x.C, x.C)
         gained = self.reduction.gained(h, variance, drifts)
-        # A coordinate that gains in one member has rows in all of them: members share one array.
+        # Members share one array: a coordinate that gains in one member has rows in all members.
         (grows,) = np.asarray((gained > 0.0).any(axis=0)).nonzero()
         if not len(grows):
             return None
@@ -183,7 +179,7 @@ class Filter:
         )
 
     def unknowns_after(self, x: FilterState, h: float) -> FilterState:
-        """Return q, da, C and the shifts by shadows after a time h without process noise."""
+        """Return the state with its unknowns and their shadows predicted without process noise."""
         if h == 0.0 or not self.reduction.moves:
             return changed(x, age=x.age + h)
         F = self.reduction.transition(h)
@@ -196,10 +192,9 @@ class Filter:
     def predict(self, x: FilterState, span: Span) -> tuple[FilterState, Steps, StepFailed | None]:
         """Return the state at the end of a span, the number of substeps, and the failure or None.
 
-        That number is one for each member if they differ.
-
-        The process noise of the unknowns is independent from substep to substep. Where the division
-        of the substeps is not chosen yet (`Span.parts`), the error of the time step decides.
+        The number of substeps is an array over the members if they differ. The process noise of the
+        unknowns is independent from substep to substep. If `Span.parts` is None, the error of the
+        time step determines into how many parts the substeps are divided.
         """
         shadows, parts = self.shadows, x.parts if span.parts is None else span.parts
         if shadows is None:
@@ -219,8 +214,8 @@ class Filter:
             if len(group) == len(x):
                 end, taken, failure = self._by_parts(x, span, parts)
                 continue
-            some = take(x, group), span.part(group), parts[group]
-            after, steps, failure = self._by_parts(*some)
+            subset = take(x, group), span.part(group), parts[group]
+            after, steps, failure = self._by_parts(*subset)
             end, taken = put(end, group, after), np.broadcast_to(taken, (len(x),)).copy()
             taken[group] = steps
         return x, taken, failure
@@ -228,15 +223,15 @@ class Filter:
     def _by_parts(
         self, x: FilterState, span: Span, parts: IntArray
     ) -> tuple[FilterState, Steps, StepFailed | None]:
-        """Return the same with substeps in so many parts, (members,)."""
+        """Predict over a span with the substeps divided into `parts`, shape (members,)."""
         if (parts == parts[0]).all():
             end, taken, failure = self._predicted(x, replace(span, parts=parts))
             return changed(end, parts=parts), taken, failure
         ends, steps = list[FilterState](), np.zeros(len(x), dtype=np.int64)
         groups = [np.flatnonzero(parts == count) for count in sorted(set(parts.tolist()))]
         for group in groups:
-            some = take(x, group), span.part(group), parts[group]
-            after, steps[group], failure = self._by_parts(*some)
+            subset = take(x, group), span.part(group), parts[group]
+            after, steps[group], failure = self._by_parts(*subset)
             if failure is not None:
                 return x, steps, failure
             ends.append(after)
@@ -245,7 +240,7 @@ class Filter:
     def _predicted(
         self, x: FilterState, span: Span
     ) -> tuple[FilterState, Steps, StepFailed | None]:
-        """Return the same of members that divide their substeps alike."""
+        """Predict over a span, for members that divide their substeps equally."""
         x, end, taken, failure = self._divided(x, span)
         if failure is None:
             end, failure = self._with_inputs(x, end, span)
@@ -260,14 +255,14 @@ class Filter:
     def _with_inputs(
         self, x: FilterState, end: FilterState, span: Span
     ) -> tuple[FilterState, StepFailed | None]:
-        """Return the state with the errors of inputs, also in a pause."""
+        """Add the errors of noisy and unread inputs, and of inputs in a pause, to a prediction."""
         noise, failure = self.problem.input_noise, None
         if noise:
             end, failure = with_input_errors(self.carried, x, end, span, noise)
-        # A refit of constant unknowns takes held values as exact, and so does their filter.
+        # For constant unknowns, held values count as exact here, as they do in a refit.
         if failure is None and (self.moves or noise) and self.input_gaps(span) is not None:
-            off = unread_inputs(self.problem, x, span)
-            end, failure = with_input_errors(self.carried, x, end, span, off)
+            errors = unread_inputs(self.problem, x, span)
+            end, failure = with_input_errors(self.carried, x, end, span, errors)
             end = self._limited(end)
         end = changed(end, driven=x.driven.after(span))
         if failure is None and np.count_nonzero(end.driven.pause):
@@ -277,7 +272,7 @@ class Filter:
         return end, failure
 
     def _coarse(self, length: float) -> Filter:
-        """Return the filter with so long substeps that an interval has at most `FEW_SUBSTEPS`."""
+        """Return the filter with substeps long enough that `length` has at most `FEW_SUBSTEPS`."""
         control, longest = self.problem.control, length / FEW_SUBSTEPS
         if longest <= control.dt_max:
             return self
@@ -288,7 +283,7 @@ class Filter:
     def _divided(
         self, x: FilterState, span: Span
     ) -> tuple[FilterState, FilterState, Steps, StepFailed | None]:
-        """Return the state at the start with the rate that the step needs, and as `carried`."""
+        """Return the start with the `rate` that the step requires, and the results of `carried`."""
         if not self.moves:
             return x, *self._through(x, span, [span.t1])
         length, more = span.t1 - span.start, True
@@ -298,7 +293,7 @@ class Filter:
                 break
             rate = np.maximum(x.rate, end.rate)
             more = bool((grades(rate, length) > grades(x.rate, length)).any())
-            if more:  # what the readings see of the process noise changes faster than was known
+            if more:  # the readings forget the process noise faster than `x.rate` allows for
                 x = changed(x, rate=rate)
         return x, end, taken, failure
 
@@ -306,23 +301,23 @@ class Filter:
         """Return the state at the end of a span whose inputs are known exactly."""
         if not self.moves:
             return self._through(x, span, [span.t1])
-        # Each part of a step has process noise of its own.
+        # Each part of a step has independent process noise.
         parts, taken = grades(x.rate, span.t1 - span.start), np.zeros(len(x), dtype=np.int64)
         for count in sorted(set(parts.tolist())):
             times = pieces(self.problem.control, span.start, span.t1, count)
             if (parts == count).all():
                 return self._through(x, span, times)
             group = np.flatnonzero(parts == count)
-            some, steps, failure = self._through(take(x, group), span.part(group), times)
+            after, steps, failure = self._through(take(x, group), span.part(group), times)
             if failure is not None:
                 return x, steps, failure
-            x, taken[group] = put(x, group, some), steps
+            x, taken[group] = put(x, group, after), steps
         return x, taken, None
 
     def _through(
         self, x: FilterState, span: Span, times: list[float]
     ) -> tuple[FilterState, int, StepFailed | None]:
-        """Return the state after the parts of a span that end at some times."""
+        """Return the state after the parts of a span that end at `times`."""
         first, taken = span.start, 0
         for stop in times:
             x, steps, failure = self._advanced(x, span, first, stop)
@@ -334,11 +329,11 @@ class Filter:
     def _advanced(
         self, x: FilterState, span: Span, start: float, stop: float
     ) -> tuple[FilterState, int, StepFailed | None]:
-        """Return the state at the end of a part of a span."""
+        """Return the state at time `stop`, the end of a part of a span that begins at `start`."""
         noise, rows = self._noise(x, start, stop - start), x.U.shape[1]
         end, kept = self._with_noise(x, stop - start, noise) if self.moves else x, x.kept
-        off: Mask = np.asarray(x.da.any(axis=1) | x.du.any(axis=1))
-        deviates = bool(off.any())
+        shifted: Mask = np.asarray(x.da.any(axis=1) | x.du.any(axis=1))
+        deviates = bool(shifted.any())
         shadows = x.shadows.u.shape[1]
 
         at_end = self._directions(end, end.C, deviates)
@@ -353,15 +348,15 @@ class Filter:
             nonlocal kept
             q, along = end.q, at_end
             if self.moves and (t != stop or (noise and noise.weight == 1.0)):
-                # An inner stage sees the unknowns at its own time: those of the end would reduce
-                # the order of the time scheme.
+                # An inner stage requires the unknowns at its own time: the unknowns at the end of
+                # the step would reduce the order of the time scheme.
                 now = self.unknowns_after(x, t - start) if t != stop else end
                 C = now.C[:, :rows]
                 if noise:
                     C = np.concatenate([C, noise.at_stage(t, begun, length)], axis=1)
                 q, along = now.q, self._directions(now, C, deviates)
             same = factors if q is end.q else {}
-            work = StageOfMembers(x.member, q, along, h, span.at(t), kept, off, same, shadows)
+            work = StageOfMembers(x.member, q, along, h, span.at(t), kept, shifted, same, shadows)
             y, kept = self.stage.advance(columns, work)
             return y
 
@@ -385,21 +380,21 @@ class Filter:
 
     def _directions(self, at: FilterState, C: Array, deviates: bool) -> Array:
         """Return the derivatives of q along all tangents, (members, tangents, m)."""
-        # The estimate relative to the linearisation point, [du; da], is propagated as one more
-        # tangent: so it follows the same linear model as the rows of [U C].
+        # The estimate relative to the linearisation point, [du; da], is one more tangent, so that
+        # it follows the same linear model as the rows of [U C].
         C = np.concatenate([C, at.da[:, None]], axis=1) if deviates else C
-        found = self.reduction.directions(at.q, C)
-        if not at.shadows.u.shape[1]:  # which change no number of the others
-            return found
-        apart = self.reduction.directions(at.q, at.shadows.a)
-        return np.concatenate([found, apart], axis=1)
+        directions = self.reduction.directions(at.q, C)
+        if not at.shadows.u.shape[1]:
+            return directions
+        # A separate call keeps the other directions the same to the last bit.
+        return np.concatenate([directions, self.reduction.directions(at.q, at.shadows.a)], axis=1)
 
     def _rate(self, x: FilterState, noise: NoiseRows, span: Span) -> Array:
         """Return how fast the readings at the end forget the process noise, shape (members,)."""
         U = x.U[:, -len(noise) :]
-        C = np.zeros((*U.shape[:2], x.C.shape[2]))  # a sensor of the unknown itself forgets nothing
+        C = np.zeros((*U.shape[:2], x.C.shape[2]))  # direct readings of an unknown do not fade
         Y = self.sensors.rows(x, U, C, span.end)
-        # The noise of the sensors, not that of the readings: a forecast takes the same parts.
+        # The noise of the sensors, not of the readings, gives the same parts in a forecast.
         level = np.sqrt(x.level)[:, None]
         return noise.rate(x.rate, Y / (level * self.noise)[:, None])
 
@@ -410,14 +405,14 @@ class Filter:
         """Return the fields of the state after a sample, and the matrices of the update.
 
         `Y`, `d`: observed square root, (members, r, sensors), and innovations, (members, sensors),
-        in units of the noise; zero where no value is. `causes`: `FilterState.causes` before the
+        in units of the noise; zero for missing values. `causes`: `FilterState.causes` before the
         update.
         """
         W, half, misfit = contraction(Y, d)
         Wt, row = W.transpose(0, 2, 1), half[:, None]
         U, C, parts = product(Wt, x.U), product(Wt, x.C), {"causes": causes}
-        # Past values and causes are coordinates on the rows of the square root, and so have to be
-        # multiplied by the same matrix as U and C.
+        # Past values and causes are coordinates on the rows of the square root, so that W^T applies
+        # to them too.
         if x.past.shape[2]:
             parts["past"] = past = Wt @ x.past
             parts["dpast"] = x.dpast + (row @ past)[:, 0]
@@ -427,27 +422,26 @@ class Filter:
         return parts | {"da": da, "du": du, "U": U, "C": C}, Update(W, Y, half, misfit)
 
     def remembered(self, x: FilterState) -> FilterState:
-        """Return the state that follows the values of a of now also from now on."""
+        """Return the state with the present values of a appended to `past`, to be smoothed."""
         now = self.reduction.reduced(x.q - self.problem.model.latent.prior) + x.da
-        # As columns of their own on the same rows, these values keep their covariance with the
-        # later ones, by which every later sample smooths them.
+        # As additional columns on the same rows, these values keep their covariance with later
+        # values, by which every later sample smooths them.
         past, dpast = np.concatenate([x.past, x.C], axis=2), np.concatenate([x.dpast, now], axis=1)
         return changed(x, past=past, dpast=dpast)
 
     def relinearised(self, x: FilterState) -> FilterState:
         """Return the state with its linearisation point at the estimate, within the bounds.
 
-        Bounds (`Reduction.ends`) hold for linearisation points and for reported estimates, not for
-        the linear filter: an excess beyond them stays in da and du, so that no information of the
-        data is lost.
+        Bounds (`Reduction.ends`) apply to linearisation points and reported estimates, not to the
+        linear filter. An excess beyond a bound stays in da and du, so that no information is lost.
         """
         estimate = x.q + x.da.dot(self.reduction.Phi.T)
         within = self.reduction.bounded(estimate)
         da, du, u = np.zeros(x.da.shape), np.zeros(x.du.shape), x.u + x.du
         if within is not estimate:
             beyond = (within != estimate).any(axis=1)
-            # Least squares raises on a square root that is not finite: such a member fails with a
-            # status of its own, and must not stop the others.
+            # Least squares raises an error if a square root is not finite. Such a member fails with
+            # its own status and must not stop the others.
             for k in np.flatnonzero(beyond & np.isfinite(x.C).all(axis=(1, 2))).tolist():
                 shift = self.reduction.reduced(within[k] - x.q[k])
                 da[k] = x.da[k] - shift
@@ -457,22 +451,20 @@ class Filter:
         return changed(x, u=u, q=estimate, du=du, da=da)
 
     def inflated(self, x: FilterState, size: float, chosen: Mask | None = None) -> FilterState:
-        """Return the state with the covariance of each unknown inflated.
+        """Return the state with the covariance of the unknowns inflated.
 
         An independent error of `size` prior standard deviations is added to each reduced
-        coordinate; the covariance of u stays as it is. With `chosen`, shape (k,), to these
-        coordinates only.
+        coordinate, or to those in `chosen`, shape (k,). The covariance of u does not change.
         """
         members, k = x.da.shape
-        # The added rows are zero in U, which makes the added error independent of the state.
+        # The added rows are zero in U, so that the added error is independent of the state.
         rows = size * (np.eye(k) if chosen is None else np.eye(k)[chosen])
         U = np.zeros((members, len(rows), x.u.shape[1]))
         return self._limited(with_rows(x, U, np.broadcast_to(rows, (members, *rows.shape))))
 
     def with_prior(self, x: FilterState) -> FilterState:
-        """Return the state with the prior of the unknowns, and u as it is estimated."""
-        # The prior has no covariance with the state or with earlier values: a zero U, past and
-        # causes say that nothing learned so far counts any more.
+        """Return the state with the prior of the unknowns and the estimate of u."""
+        # The prior is independent of the state and of earlier values: U, past and causes are zero.
         members, k = x.da.shape
         prior = np.broadcast_to(self.problem.model.latent.prior, x.q.shape)
         C = np.broadcast_to(np.eye(k), (members, k, k))
@@ -489,9 +481,9 @@ class Filter:
     def compressed(self, x: FilterState) -> FilterState:
         """Return the state with a square root of `rank` rows.
 
-        A rotation gathers all that is uncertain about the unknowns, and the state with them, in the
-        first rows: they stay as they are. Of the rest, which is the state's alone, the leading
-        directions are kept, measured by `scale`.
+        A rotation moves the uncertainty of the unknowns, and its correlation with the state, to the
+        first k rows, which are kept. The other rows concern the state alone: their leading
+        directions in the norm of `scale` are kept.
         """
         k = x.C.shape[2]
         rotation, root = np.linalg.qr(x.C, mode="complete")
@@ -499,10 +491,10 @@ class Filter:
         rotated, past, causes = (turned @ part for part in (x.U, x.past, x.causes))
         alone = rotated[:, k:]
         weighted = alone * self.scale
-        # The Gram matrix of the rows is small however fine the mesh is; halved digits do not matter
-        # for the choice of directions.
+        # The size of the Gram matrix does not depend on the mesh. The loss of half the digits does
+        # not matter for the choice of directions.
         square = weighted @ weighted.transpose(0, 2, 1)
-        square[~np.isfinite(square).all(axis=(1, 2))] = 0.0  # reported by the caller
+        square[~np.isfinite(square).all(axis=(1, 2))] = 0.0  # the caller reports such members
         _, vectors = np.linalg.eigh(square)
         leading = vectors[:, :, ::-1][:, :, : self.rank - k].transpose(0, 2, 1)
         C = extended(root[:, :k], leading.shape[1])
@@ -515,8 +507,8 @@ class Filter:
 def contraction(Y: Array, d: Array) -> tuple[Array, Array, Array]:
     """Return W with W W^T = (I + Y Y^T)^-1, (members, r, r), W^T Y d, and d^T (I + Y^T Y)^-1 d.
 
-    R = W^-1, c = W^T Y d and the square root s of the last come as [R c; 0 s] from a QR
-    factorisation of [I 0; Y^T d]: no matrix is squared, which would halve the digits.
+    A QR factorisation of [I 0; Y^T d] gives [R c; 0 s] with R = W^-1, c = W^T Y d, and s the square
+    root of the last result. No matrix is squared, which would halve the digits.
     """
     members, r, sensors = Y.shape
     stacked = np.zeros((members, r + 1, r + sensors))  # transposed: LAPACK counts down the columns
@@ -525,11 +517,11 @@ def contraction(Y: Array, d: Array) -> tuple[Array, Array, Array]:
     if members > FEW:
         upper: Array = np.asarray(np.linalg.qr(stacked.transpose(0, 2, 1), mode="r"))
         good = np.isfinite(upper).all(axis=(1, 2))
-        # An inverse of entries that are not finite may raise, and so stop all members.
+        # Inverting entries that are not finite may raise an error, which would stop all members.
         inverse = np.full((members, r, r), np.nan)
         inverse[good] = np.linalg.inv(upper[good, :r, :r])
         return inverse, upper[:, :r, r], upper[:, r, r] ** 2
-    # A call of NumPy for stacks of matrices takes ten times longer than LAPACK for one.
+    # For one matrix, NumPy's call for stacks of matrices takes ten times longer than LAPACK.
     inverse, last = np.empty((members, r, r)), np.empty((members, r + 1))
     for k in range(members):
         factored = lapack.dgeqrf(stacked[k].T, lwork=BLOCK * (r + 1), overwrite_a=1)[0]
@@ -548,15 +540,14 @@ def _upper(r: int) -> Array:
 def robust_factors(reduction: Reduction, x: FilterState) -> tuple[Array, Array]:
     """Return a square root [U C] of the robust covariance, (members, r, n) and (members, r, k).
 
-    The sandwich V = P (1 + lambda F) P of Huber (1967) and White (1982), with the prior inside: in
-    units of the prior of this time P is the covariance of the filter, F = P^-1 - 1 the information
-    of the samples, and lambda the square of `Innovations.inflation`, the factor by which a mean of
-    the innovations scatters more than the filter expects. A direction with the remaining share p of
-    its prior variance gets the variance p (p + lambda (1 - p)), and never more than its prior: an
-    unobserved direction keeps its variance, however wrong the sensors are.
+    The sandwich V = P (1 + lambda F) P of Huber (1967) and White (1982), including the prior. In
+    units of the prior at this time, P is the covariance of the filter and F = P^-1 - 1 the
+    information in the samples. The factor lambda is the square of `Innovations.inflation`, by which
+    a mean of the innovations scatters more than expected. A direction with the remaining share p of
+    its prior variance gets the variance p (p + lambda (1 - p)), at most its prior variance. The
+    variance of an unobserved direction stays the same, however wrong the sensors are.
 
-    The uncertainty of the state beside the unknowns has no prior: its variance counts `lambda`
-    times.
+    Uncertainty of the state alone has no prior: its variance is multiplied by lambda.
     """
     inflation = x.innovations.inflation
     right = inflation == 1.0
@@ -565,23 +556,23 @@ def robust_factors(reduction: Reduction, x: FilterState) -> tuple[Array, Array]:
     k = x.C.shape[2]
     finite = np.isfinite(x.C).all(axis=(1, 2)) & np.isfinite(inflation)
     C = reduction.in_prior_units(np.where(finite[:, None, None], x.C, 0.0), x.age)
-    # In the principal axes of the posterior relative to the prior each direction has its share p of
-    # its own, `left` squared.
-    rotation, left, _ = np.linalg.svd(C)
-    share = np.minimum(left * left, 1.0)
-    # Factors on standard deviations: for the first k rows as the docstring says, for the others,
-    # which are the state's alone, the square root of lambda.
+    # In the principal axes of the posterior relative to the prior, each direction has its own
+    # share p, the square of a singular value.
+    rotation, singular, _ = np.linalg.svd(C)
+    share = np.minimum(singular * singular, 1.0)
+    # Factors on standard deviations: the formula of the docstring for the first k rows, and the
+    # square root of lambda for the others, which concern the state alone.
     widths = np.repeat(inflation[:, None], rotation.shape[1], axis=1)
     widened = share + inflation[:, None] ** 2 * (1.0 - share)
     widths[:, :k] = np.sqrt(np.minimum(widened, 1.0 / np.maximum(share, np.finfo(float).tiny)))
     widths[~finite] = 1.0
     rows = widths[:, :, None] * rotation.transpose(0, 2, 1)
-    rows[right] = np.eye(rows.shape[1])  # one of several members is as it is alone
+    rows[right] = np.eye(rows.shape[1])  # results do not depend on the other members
     return rows @ x.U, rows @ x.C
 
 
 def reported_factors(filter_: Filter, x: FilterState) -> tuple[Array, Array]:
-    """Return `robust_factors` with a row more for the discretisation error, as reported."""
+    """Return `robust_factors` with one additional row for the discretisation error."""
     U, C = robust_factors(filter_.reduction, x)
     if filter_.shadows is None:
         return U, C

@@ -1,8 +1,8 @@
-"""State of the filter: mean and covariance square root of each member, and what surrounds them.
+"""State of the filter: mean and covariance square root of each member, and its statistics.
 
-Pauses of a source: in an interval much longer than usual, inputs are no straight lines. After a
-pause the state is as uncertain as inputs could have made it that varied in the pause as they did
-before. So the next readings correct the state and hardly the unknowns, which are kept.
+In a pause, an interval much longer than usual, linear interpolation of the inputs is not valid. The
+state after a pause is as uncertain as if the inputs had varied as before the pause. Therefore the
+next readings mainly correct the state and barely change the unknowns.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from livepde.linalg.member_arrays import changed
 from livepde.stepping import KeptFactors, Span
 from livepde.verdict import Ledger
 
-PAUSE = 5.0  # usual intervals: in a longer one inputs are not known
-SETTLED = 20  # intervals before which none is usual
-FORGOTTEN = 50.0  # shorter intervals that follow, until the pace has fallen by 63 %
+PAUSE = 5.0  # usual intervals: a longer interval is a pause
+SETTLED = 20  # intervals required before a pause can be detected
+FORGOTTEN = 50.0  # time constant, in intervals, with which the pace decreases
 SPREAD = 1.0 / np.sqrt(8.0)  # standard deviation of a sine over its range
-NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not judged
+NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # for a filter without a verdict
 
 
 @dataclass(frozen=True, eq=False)
 class InputHistory:
-    """Ranges and rates of the inputs so far, and the pace of their samples."""
+    """Ranges and rates of change of the inputs so far, and the usual interval between samples."""
 
-    # Range of each input, and its largest rate of change, shapes (members, channels).
+    # Range of each input and its largest rate of change, shapes (members, channels).
     low: Array
     high: Array
     steepest: Array
-    # Longest usual interval, which fades while shorter ones follow: a pause a week is no pace.
-    # Shape (members,); 0 before.
+    # Longest usual interval, which decays while shorter intervals follow, so that rare pauses do
+    # not count as usual. Shape (members,); 0 before the first interval.
     pace: Array
-    count: Array  # intervals so far, at most `SETTLED`, shape (members,)
+    count: Array  # number of intervals so far, at most `SETTLED`, shape (members,)
     pause: Mask  # whether the last interval was a pause, shape (members,)
 
     @classmethod
@@ -50,20 +50,20 @@ class InputHistory:
         )
 
     def after(self, span: Span) -> InputHistory:
-        """Return the value after an interval; a pause does not show how steep inputs are."""
+        """Return the history after an interval; rates of change in a pause are ignored."""
         length = span.t1 - span.t0
         if not length.all():
             return self
         pause: Mask = (length > PAUSE * self.pace) & (self.count >= SETTLED)
-        # The first interval, from t0 on, may be of any length.
+        # The first interval begins at t0 and may have any length.
         late = (self.count == 1.0) & (self.pace > PAUSE * length)
         pace = np.where(late, length, self.pace)
-        known = self.low.shape[1]  # a fleet's validation sensors may read more channels
+        known = self.low.shape[1]  # validation sensors of a fleet may use additional channels
         first, last = span.inputs0[:, :known], span.inputs1[:, :known]
         slopes = np.abs(last - first) / length[:, None]
         if np.count_nonzero(pause):
             slopes = np.where(pause[:, None], 0.0, slopes)
-            # A pace that changes for good is usual after a few samples.
+            # With this limit, a permanently slower pace counts as usual after a few samples.
             length = np.where(pause, PAUSE * pace, length)
         return InputHistory(
             low=np.fmin(self.low, last),
@@ -75,75 +75,74 @@ class InputHistory:
         )
 
     def deviation(self, length: Array) -> Array:
-        """Return by how much inputs may leave their lines in pauses, (members, channels)."""
+        """Return the standard deviations of inputs from straight lines, (members, channels)."""
         spread = SPREAD * (self.high - self.low)
-        found: Array = np.minimum(spread, 0.5 * self.steepest * length[:, None])
-        return np.where(np.isfinite(found), found, 0.0)
+        deviation: Array = np.minimum(spread, 0.5 * self.steepest * length[:, None])
+        return np.where(np.isfinite(deviation), deviation, 0.0)
 
 
 def pauses(times: Sequence[float] | Array) -> list[int]:
-    """Return the numbers of the samples that end a pause, by the rule of `InputHistory`."""
-    found, pace = [], 0.0
+    """Return the indices of the samples that end a pause, by the rule of `InputHistory`."""
+    ends, pace = [], 0.0
     for k, length in enumerate(np.diff(times).tolist()):
         if k == 1 and pace > PAUSE * length:
             pace = length
         if k >= SETTLED and length > PAUSE * pace:
-            found.append(k + 1)
+            ends.append(k + 1)
             length = PAUSE * pace
         pace = max(pace + (length - pace) / FORGOTTEN, length)
-    return found
+    return ends
 
 
 @dataclass(frozen=True, eq=False)
 class ShadowState:
-    """Shifts of the estimates of each member; the leading axis of every array is the members."""
+    """Estimated discretisation errors; the leading axis of every array is the members."""
 
-    # Shifts of state and reduced unknowns by the discretisation, a row for each shadow, shapes
-    # (members, shadows, n) and (members, shadows, k).
+    # Shifts of state and reduced unknowns due to the discretisation, one row for each shadow,
+    # shapes (members, shadows, n) and (members, shadows, k).
     u: Array
     a: Array
-    # Steps so far, and at which the shadows were taken last and are taken next, (members,).
+    # Number of steps so far, and step numbers of the last and the next shadow step, (members,).
     count: IntArray
     last: IntArray
     due: IntArray
-    # Change of the state per unit of time in the last step, how much that usually differs from one
-    # step to the next, and the count of steps at which it last differed by much more; shapes
-    # (members, n), (members,) and (members,).
+    # Rate of change of the state in the last step, (members, n); usual change of this rate from one
+    # step to the next, (members,); and step number of the last much larger change, (members,).
     rate: Array
     usual: Array
     jumped: IntArray
-    size: Array  # norm of the last error that the step shadow found, (members,); infinite before
-    # Time, state and inputs where the shadows were taken last; the state without columns if no
-    # shadow needs it. Shapes (members,), (members, n) and (members, channels).
+    size: Array  # norm of the last error of the step shadow, (members,); infinite before the first
+    # Time, state and inputs at the last shadow step, shapes (members,), (members, n) and (members,
+    # channels). The state has no columns if no shadow requires it.
     begun: Array
     u0: Array
     inputs0: Array
-    # Of the last interval, infinite before the first, and how inputs changed in it per unit of
-    # time; shapes (members,) and (members, channels).
+    # Length of the last interval, infinite before the first, and rate of change of the inputs in
+    # it; shapes (members,) and (members, channels).
     length: Array
     slope: Array
-    # Integral over the last interval of the difference of the inputs from straight lines, and the
-    # sum of these integrals that no shadow has stepped with yet, shapes (members, channels).
+    # Integral over the last interval of the deviation of the inputs from straight lines, and sum of
+    # these integrals since the last shadow step that used them, shapes (members, channels).
     bend: Array
     missed: Array
-    # Of inputs that are held: last value, last change, and sums of the squares of changes and of
-    # their differences, shape (members, 4, channels).
+    # For inputs that are held: last value, last change, and sums of squares of the changes and of
+    # the differences of successive changes, shape (members, 4, channels).
     held: Array
     # Warm-start data of the last stages of halved steps, and of a block of steps.
     halves: KeptFactors
     blocks: KeptFactors
-    # The state on the halved mesh minus that of the filter, shape (members, N), and the warm-start
-    # data of the last stage on the halved mesh.
+    # State on the mesh of half the width minus the state of the filter, shape (members, N), and
+    # warm-start data of the last stage on that mesh.
     fine: Array
     fine_stage: KeptFactors
-    seen: Array  # the difference in the predicted readings due to `fine`, shape (members, sensors)
-    # Sum of the gains of the samples since the shadows were taken last, each times the time since
-    # then, shape (members, sensors, k); without sensors if no shadow needs it.
+    seen: Array  # change of the predicted readings due to `fine`, shape (members, sensors)
+    # Sum of the gains of the samples since the last shadow step, each times the time since that
+    # step, shape (members, sensors, k). The sensor axis is empty if no shadow requires the gains.
     gains: Array
-    failed: IntArray  # how many shadow steps had no solution, shape (members,)
-    # Error of the last step that the step shadow took, over what is allowed, shape (members,).
+    failed: IntArray  # number of shadow steps without a solution, shape (members,)
+    # Error of the last shadow step of the step shadow over the tolerance, shape (members,).
     excess: Array
-    # How many steps were left with a larger one, and the largest `excess` of them, (members,).
+    # Number of steps whose error exceeded the tolerance, and their largest `excess`, (members,).
     coarse: IntArray
     coarsest: Array
 
@@ -152,7 +151,7 @@ class ShadowState:
 
     @classmethod
     def none(cls, members: int, n: int, k: int) -> ShadowState:
-        # No step writes into the arrays of a state, so that several fields may share one.
+        # Fields may share an array, because steps never write into the arrays of a state.
         zero, time = np.zeros(members, dtype=np.int64), np.zeros(members)
         counts = ("count", "last", "due", "jumped", "failed", "coarse")
         empty = ("u0", "inputs0", "slope", "bend", "missed", "fine", "seen")
@@ -171,7 +170,7 @@ class ShadowState:
         )
 
     def without_stages(self) -> ShadowState:
-        """Return the shifts alone, without the data that only the next steps need."""
+        """Return the state without warm-start data and other data for the next steps."""
         nothing = np.zeros((len(self), 0))
         return changed(
             self,
@@ -186,43 +185,43 @@ class ShadowState:
 
 @dataclass(frozen=True, eq=False)
 class FilterState:
-    """State of a filter for each member, after the samples so far."""
+    """State of the filter of each member after the samples so far."""
 
     member: IntArray  # numbers of the members, shape (members,)
-    # Linearisation point: state and latent parameter, shapes (members, n) and (members, m).
+    # Linearisation point: state and latent parameters, shapes (members, n) and (members, m).
     u: Array
     q: Array
     # Estimated differences of u and of the reduced unknowns a from the linearisation point,
     # (members, n) and (members, k).
     du: Array
     da: Array
-    # Square root of the joint covariance of u and a, shapes (members, r, n) and (members, r, k). As
-    # long as nothing moves, r = k.
+    # Square root of the joint covariance of u and a, shapes (members, r, n) and (members, r, k);
+    # r = k for constant unknowns.
     U: Array = field(metadata={"grows": 1})
     C: Array = field(metadata={"grows": 1})
-    # Square root and estimate of earlier values of a, one after the other, that a smoother follows;
-    # shapes (members, r, p) and (members, p), p = 0 otherwise.
+    # Square root and estimate of earlier values of a, concatenated, for a smoother; shapes
+    # (members, r, p) and (members, p), with p = 0 without a smoother.
     past: Array = field(metadata={"grows": 1})
     dpast: Array
-    age: Array  # time for which the unknowns have moved, shape (members,)
-    # How fast the readings forget the process noise of unknowns that move, by which steps are
-    # divided, shape (members,).
+    age: Array  # time over which the prior of the unknowns has evolved, shape (members,)
+    # Rate at which the readings forget the process noise of moving unknowns, shape (members,). It
+    # determines how steps are divided.
     rate: Array
     innovations: Innovations  # statistics of the innovations
-    # In how many parts the substeps since the sample before were divided, shape (members,).
+    # Number of parts into which the substeps of the last interval were divided, shape (members,).
     parts: IntArray
     screened: Screened  # memory of the gate, by sensor
-    # Square of the noise as a multiple of the stated one, 1 unless the filter finds it, and how
-    # many samples that stands for, shapes (members,).
+    # Noise variance over its stated value, 1 unless the filter estimates it, and the number of
+    # samples that this estimate is worth, shapes (members,).
     level: Array
     samples: Array
-    # Logarithm of the likelihood of all readings so far, each sample given those before; a reading
-    # that is refused counts as one at the limit of the gate, (members,).
+    # Log-likelihood of all readings so far, each sample given the samples before, (members,). A
+    # refused reading counts as a reading at the limit of the gate.
     evidence: Array
-    kept: KeptFactors  # warm-start data of the last stage for the next one
-    # Data of the verdict: the shifts of the estimate by possible causes of misfit, as coordinates
-    # on the rows of the square root, (members, r, columns), and running sums; see
-    # `livepde.verdict`. The filter itself never reads them.
+    kept: KeptFactors  # warm-start data of the last stage for the next stage
+    # Data of the verdict, which the filter never reads: shifts of the estimate by possible causes
+    # of misfit, as coordinates on the rows of the square root, (members, r, columns); and running
+    # sums. See `livepde.verdict`.
     causes: Array = field(metadata={"grows": 1, "begins_anew": True})
     ledger: Ledger = field(metadata={"begins_anew": True})
     shadows: ShadowState  # estimated discretisation error
@@ -233,19 +232,19 @@ class FilterState:
 
 
 def coordinates(C: Array, shift: Array) -> Array:
-    """Return the least xi with C^T xi = shift: the expected one if xi ~ N(0, I) and a = C^T xi."""
+    """Return the least-norm xi with C^T xi = shift: its mean if xi ~ N(0, I) and a = C^T xi."""
     return np.asarray(np.linalg.lstsq(C.T, shift, rcond=None)[0])
 
 
 def along(x: FilterState, k: int, shift: Array) -> Array:
-    """Return by how much the state of a member is expected to move with a shift of a, (n,)."""
+    """Return the expected shift of the state of member `k` for a given shift of a, (n,)."""
     if not shift.any():
         return np.zeros(x.u.shape[1])
     return np.asarray(coordinates(x.C[k], shift) @ x.U[k])
 
 
 def extended(rows: Array, count: int) -> Array:
-    """Return rows of a square root, (members, r, ...), and so many rows of zeros."""
+    """Return rows of a square root, (members, r, ...), with `count` rows of zeros appended."""
     members, r, size = rows.shape
     longer = np.zeros((members, r + count, size))
     longer[:, :r] = rows
@@ -253,7 +252,7 @@ def extended(rows: Array, count: int) -> Array:
 
 
 def with_rows(x: FilterState, U: Array, C: Array) -> FilterState:
-    """Return a filter state with more rows [U C], independent of the past and of all causes."""
+    """Append rows [U C] to a filter state, independent of the past and of all causes."""
     past, causes = (extended(part, U.shape[1]) for part in (x.past, x.causes))
     U, C = np.concatenate([x.U, U], axis=1), np.concatenate([x.C, C], axis=1)
     return changed(x, U=U, C=C, past=past, causes=causes)
@@ -265,6 +264,6 @@ def unjudged(x: FilterState) -> FilterState:
 
 
 def unaccompanied(x: FilterState) -> FilterState:
-    """Return a filter state without its ledger and without the errors of the discretisation."""
+    """Return a filter state without its ledger and without discretisation errors."""
     members, k = x.da.shape
     return changed(unjudged(x), shadows=ShadowState.none(members, x.u.shape[1], k))

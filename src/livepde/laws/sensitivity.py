@@ -1,4 +1,4 @@
-"""The second law: a reduced-order filter for the parameters, carried by sensitivities."""
+"""The sensitivity law: a reduced-order extended Kalman filter for state and parameters."""
 
 from __future__ import annotations
 
@@ -71,76 +71,73 @@ from livepde.stepping import (
 )
 from livepde.verdict import Verdict
 
-GATE = 6.0  # expected standard deviations: one value of a thousand million lies beyond by chance
-FIRST = 20  # Gauss-Newton steps of a first sample that a nonlinear initial state takes at most
-GUESS = 2.0  # samples that the first guess of the noise counts for
+GATE = 6.0  # expected standard deviations: a Gaussian value lies beyond with probability 2e-9
+FIRST = 20  # largest number of Gauss-Newton steps for a sample at the initial time
+GUESS = 2.0  # weight of the initial guess of the noise level, in samples
 
 
 @dataclass(frozen=True)
 class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
-    """State and parameter from sparse, noisy sensors, with a covariance.
+    """Estimate state and parameters from sparse, noisy sensors, with a covariance.
 
-    Reduced-order filter of Moireau, Chapelle and Le Tallec (2008); Zhang's adaptive observer;
-    recursive prediction error. q = q_prior + Phi a with a ~ N(0, I): Phi is the prior standard
-    deviation for numbers and the leading modes of the prior for fields. The joint covariance of u
-    and a has the square root [U; C]. With S the Jacobian of a step and A the derivative of A(u) q
-    in q,
+    Reduced-order filter of Moireau, Chapelle and Le Tallec (2008), related to Zhang's adaptive
+    observer and to recursive prediction error methods. The parameter is q = q_prior + Phi a with
+    a ~ N(0, I). Phi is the prior standard deviation for numbers, and the leading prior modes for
+    fields. The joint covariance of u and a has the square root [U; C]. Let S be the Jacobian of a
+    step and A the derivative of A(u) q in q. Then
 
         predict   one implicit step for u;   S U+ = M U/h - A(u+) Phi C
         update    d = z - G u+ - D q,  Y = G U+ + D Phi C:   a += C K d,  u += U+ K d,
                   K = (I + Y^T N^-1 Y)^-1 Y^T N^-1,  [U; C] times the square root of (I + ...)^-1
 
-    A sample costs one step and one block of back-substitutions. For unknowns that stay as they are
-    U is L C with the sensitivity L = du/da. An unknown that moves (`evolution`, or `drift` for all)
-    adds new columns at each substep, independent of the older ones; the factor is then compressed
-    to `rank` columns, so that no forgetting factor has to be chosen.
+    A sample costs one step and one block of back-substitutions. For constant unknowns, U = L C with
+    the sensitivity L = du/da. The process noise of a moving unknown (`evolution`, or `drift` for
+    all) adds independent columns at each substep, and the factor is compressed to `rank` columns.
 
-    Bounds of numbers, and those of latent values (`within` of an unknown), hold for the reference
-    about which the filter is linear, and for reported estimates; the filter itself stays linear.
+    Bounds of numbers and of latent values (`within` of an unknown) apply to the linearisation point
+    and to reported estimates; the filter itself stays linear.
 
     Parameters
     ----------
     modes
-        Number of modes for each field: one number, or name -> number. "auto": so many that they
-        hold 99.99 % of the prior variance, at most 60.
+        Number of modes for each field: one number, or name -> number. "auto": the number of modes
+        that contain 99.99 % of the prior variance, at most 60.
     noise
         Standard deviation of the measurement noise; default the noise of the observation. "auto":
-        the noise of the observation is a first guess, and the level is found from the samples, the
-        same multiple for all sensors. Without `refit` the first samples keep the weight of the
-        guess: intervals are too narrow if it is too small.
+        the noise of the observation is an initial guess, and one common factor for all sensors is
+        estimated from the samples. Without `refit` the first samples keep the weight of the guess:
+        intervals are too narrow if it is too small.
     drift
-        Variance of a gained per unit of time, relative to the prior, by every unknown without an
-        evolution of its own: > 0 follows parameters that change. An unknown gains the less, the
-        closer its variance is to that of the prior, so that no variance winds up without data.
+        Variance of a gained per unit of time, relative to the prior, by every unknown without its
+        own evolution; > 0 tracks parameters that change. The gain decreases as the variance of an
+        unknown approaches its prior variance, so that no variance winds up without data.
     memory
         Time constant with which the cross-covariance of state and parameters decays.
     refit
         Fit the stored samples again whenever their number has doubled; None: never.
     rank
-        Columns of the factor while unknowns move; default the number of coordinates and five times
-        that of those that move.
+        Largest number of columns of the factor; default: one for each reduced coordinate, five more
+        for each that moves or may jump, and some for errors of the inputs.
     gate
-        Innovations of more than this many expected standard deviations, times the usual size of
-        normalised innovations where that exceeds 1, are not used; infinity: all are.
+        Innovations are refused beyond this many expected standard deviations, times the usual size
+        of normalised innovations where that exceeds 1. Infinity: all innovations are used.
     gate_patience
-        After so many refusals in a row a sensor is believed if most others misfit as well, else set
-        aside: see `livepde.laws.gate`.
+        After this many refusals in a row, the readings of a sensor are accepted if most other
+        sensors misfit too. Otherwise the sensor is excluded: see `livepde.laws.gate`.
     jumps
-        Test for sudden changes; an alarm is noted as "jump" and lets the unknowns move.
+        Test for sudden changes. An alarm is noted as "jump", and allows the unknowns to change.
     guards
         Safeguards against an overconfident linearisation and a runaway estimate; None: none.
     shadows
-        Discretisation errors that widen the reported covariance; None: no error does.
+        Discretisation errors that widen the reported covariance; None: none.
     verdict
-        Judge the run as it goes on (`Estimate.verdict`): True; "cheap", without the directions that
-        cost solves, those of terms that the process may lack; False: not at all.
+        True: run the model checks (`Estimate.verdict`). "cheap": skip the checks for terms missing
+        from the process, which require additional solves. False: no checks.
 
     Examples
     --------
     >>> import livepde as lp
-    >>> law = lp.SensitivityLaw(
-    ...     modes=20, gate=5.0
-    ... )  # fields have 20 modes; 5 deviations are outliers
+    >>> law = lp.SensitivityLaw(modes=20, gate=5.0)  # 20 modes for each field
     >>> law.gate
     5.0
     """
@@ -156,16 +153,16 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     jumps: Jumps | None = None
     guards: Guards | None = field(default_factory=Guards)
     shadows: Shadows | None = field(default_factory=Shadows)
-    # A run may be judged that was not judged before: fleets are not.
+    # A run may resume with another setting: fleets run without a verdict.
     verdict: bool | str = field(default=True, metadata={"begins_anew": True})
 
-    scheme: ClassVar[Scheme] = Alexander2()  # no interval holds the error of a first-order scheme
+    scheme: ClassVar[Scheme] = Alexander2()  # intervals do not cover the error of first order
     graded_start: ClassVar[bool] = True
     relinearises: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         stated = isinstance(self.noise, int | float) and np.isfinite(self.noise) and self.noise > 0
-        gate: Any = self.gate  # None is no gate elsewhere
+        gate: Any = self.gate  # users may pass None, which other settings accept
         kinds = (("refit", Refit), ("jumps", Jumps), ("guards", Guards), ("shadows", Shadows))
         parts = [(getattr(self, name), name, kind) for name, kind in kinds]
         for holds, name, rule in (
@@ -207,8 +204,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 "observation (one number, or one for each sensor) or to the law."
             )
         reduction = Reduction.of(problem, self.modes)
-        # Constant unknowns never need more rows than coordinates. Moving ones and noisy inputs add
-        # rows at each step, and a compression needs room for the state's own uncertainty.
+        # Constant unknowns need one row for each coordinate. Moving unknowns and noisy inputs add
+        # rows at each step, and a compression needs rows for the uncertainty of the state alone.
         moving = reduction.moving(self.drift)
         if self.jumps is not None:
             jumping = int(reduction.named(self.jumps.unknowns, "Jumps: unknowns").sum())
@@ -244,7 +241,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             parts = problem, reduction, filter_.sensors.rows, noise, filter_.stage, self.shadows
             followed = ShadowSet.of(*parts, moves=filter_.moves)
             filter_ = replace(filter_, shadows=followed)
-        # Unknowns that move, or that may jump, follow a change of the process themselves.
+        # Unknowns that move or may jump follow a change of the process; constants do not.
         anchors = not (filter_.moves or self.jumps is not None)
         gate = Gate(self.gate, self.gate_patience, anchors)
         return SensitivityWork(
@@ -263,7 +260,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def _init(
         self, work: SensitivityWork, q0: Array, u0: Array, moment: Moment | None
     ) -> SensitivityState:
-        """Return the state before the first sample; its shadows begin at a moment."""
+        """Return the state before the first sample; the shadows start at `moment`."""
         filter_, problem = work.filter, work.filter.problem
         k, n, sensors = filter_.reduction.size, len(u0), problem.observed.size
         one, zero = np.ones(1), np.zeros(1, dtype=np.int64)
@@ -325,28 +322,28 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             parts = (filter_.problem, filter_.reduction, filter_.noise)
             x = with_initial_rows(state.now, *parts, moment)
             return state if x is state.now else _started(work, state, x)
-        # The initial state is a functional of the unknowns here: its derivative is the cross-
-        # covariance with them, so that samples correct both together from the first one on.
+        # The initial state depends on the unknowns. Its derivative gives their cross-covariance, so
+        # that samples correct both from the first one on.
         U = model.initial_directions(q0, work.filter.reduction.Phi, moment).T[None]
         x = changed(state.now, U=U)
         return changed(_started(work, state, x), initial=np.ones(1, dtype=bool))
 
-    @nonfinite_allowed()  # such a sample is not used
+    @nonfinite_allowed()  # a sample with a nonfinite result is not used
     def begin(
         self, work: SensitivityWork, state: SensitivityState, interval: Interval
     ) -> SensitivityState:
         filter_, x, interval = work.filter, state.now, work.filter.problem.unread(interval)
         span = filter_.span(interval)
         state = changed(state, log=added(state.log, span, np.ones(1, dtype=bool), x.parts))
-        # A state that is known, seen by sensors that see no unknown, has nothing to learn.
+        # The readings carry no information if the state is known and no sensor sees an unknown.
         if not filter_.learns(filter_.sensors.observe(x, span.end)[1]):
-            # The readings count all the same: another case may assimilate them.
+            # Their evidence counts, so that it is comparable with a case that assimilates them.
             seen, _ = absorb(filter_, x, span, work.options)
             return state.counted(seen.evidence)
         problem = filter_.problem
         form = problem.model.form_initial
-        # The safeguards of a step never see a sample at the initial time: where this is not linear
-        # in the unknowns, it has to be iterated here.
+        # The safeguards of a step do not cover the sample at the initial time. If the initial state
+        # or the sensors are nonlinear, the update is iterated here.
         iterates = form is not None and not form.linear_in_parameter
         if self.guards is not None:
             iterates = iterates or not problem.observed.linear
@@ -366,7 +363,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             if not iterates or distance(filter_, begun) <= AGREED:
                 break
             x = placed(filter_, begun, next_reference(filter_, begun))
-            # The noise level is that before the sample, which would count in each iteration else.
+            # Restore the noise level, so that the sample counts once and not in each iteration.
             level, samples = state.now.level, state.now.samples
             x = changed(x, level=level, samples=samples, kept=state.now.kept)
         now = filter_.relinearised(now) if self.relinearises else now
@@ -374,7 +371,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return changed(state, now=now, older=now, newer=now, opening=opening)
 
     def stepped_alone(self, work: SensitivityWork) -> str:
-        if type(self) is not SensitivityLaw:  # a subclass may step in a way of its own
+        if type(self) is not SensitivityLaw:  # a subclass may override `step`
             return super().stepped_alone(work)
         stage = work.filter.stage
         if not isinstance(stage, BandedStage):
@@ -389,75 +386,77 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         state, reports = self.step_members(work, state, work.filter.span(interval))
         return state, reports.member(0)
 
-    @nonfinite_allowed()  # reported as a status
+    @nonfinite_allowed()  # nonfinite results are reported as a status
     def step_members(
         self, work: SensitivityWork, state: SensitivityState, span: Span
     ) -> tuple[SensitivityState, MemberReports]:
-        """Return state and reports of all members after a sample of each, and refits that are due.
+        """Return state and reports of all members after one sample each and the refits due.
 
-        They step as arrays; whoever meets something out of the ordinary, a safeguard, an alarm, a
-        failure, or is late, steps alone.
+        Members are stepped as arrays. A member with a safeguard, an alarm, a failure or a late
+        sample is stepped separately.
         """
-        # A window goes back to the time and inputs of its first row, which a run without a sample
-        # at the initial time does not have yet.
+        # A window needs a first row with time and inputs, which a run without a sample at the
+        # initial time does not have yet.
         begun = state if state.log.shape[1] else changed(state, log=opened(state.log, span))
-        new, told, usual = self._together(work, begun, span)
-        reports = reports_of(work, new.now, told)
-        if np.count_nonzero(usual) < usual.size:
-            new, reports = self._apart(work, begun, new, reports, usual, span)
-            usual = np.array([status.ok for status in reports.statuses])
-            if not usual.any():
+        new, outcome, regular = self._step_jointly(work, begun, span)
+        reports = reports_of(work, new.now, outcome)
+        if np.count_nonzero(regular) < regular.size:
+            new, reports = self._step_separately(work, begun, new, reports, regular, span)
+            regular = np.array([status.ok for status in reports.statuses])
+            if not regular.any():
                 return (new if len(state) > 1 else state), reports
         new, moved = refit_due(work, new)
         if moved is not None:
-            taken = usual
+            taken = regular
             reports = reports.updated(moved.each(lambda number: np.where(taken, number, np.nan)))
         if len(new.fork):
             new = go_on(work, new)
         return shortened(work, new), reports
 
-    def _together(
+    def _step_jointly(
         self, work: SensitivityWork, state: SensitivityState, span: Span
     ) -> tuple[SensitivityState, Assimilation, Mask]:
-        """Return all members after a sample, and which of them needed no special treatment."""
+        """Return all members after a sample, the assimilation, and the mask of regular members."""
         filter_, before = work.filter, state.now
-        x, told = assimilate(filter_, before, span, work.options)
-        usual = told.finite
-        if told.status.code != "ok":
-            return state, told, usual
+        x, outcome = assimilate(filter_, before, span, work.options)
+        regular = outcome.finite
+        if outcome.status.code != "ok":
+            return state, outcome, regular
         if len(span.t0) > 1:
-            usual = usual & span.together
-        scale = state.scale.add(span.z1, span.z1 - told.predicted)
+            regular = regular & span.together
+        scale = state.scale.add(span.z1, span.z1 - outcome.predicted)
         parts: dict[str, Any] = {"scale": scale.without_refused(state.scale, x.screened.refused)}
         if self.guards is not None:
-            usual = usual & _within(self.guards, filter_, before, x, told, scale, span)
+            regular = regular & _within(self.guards, filter_, before, x, outcome, scale, span)
         if self.jumps is not None and span.present.any():
             parts["watch"], alarm = watched(work, self.jumps, state, x, span)
-            usual = usual & ~alarm
+            regular = regular & ~alarm
         if self.relinearises:
             x = filter_.relinearised(x)
-        if np.count_nonzero(usual) < usual.size:
-            if not usual.any():
-                return state, told, usual
-            x = where(usual, x, before)
-            parts = {name: where(usual, part, getattr(state, name)) for name, part in parts.items()}
-        return stored(work, state, x, span, usual, told.disturbed, **parts), told, usual
+        if np.count_nonzero(regular) < regular.size:
+            if not regular.any():
+                return state, outcome, regular
+            x = where(regular, x, before)
+            parts = {
+                name: where(regular, part, getattr(state, name)) for name, part in parts.items()
+            }
+        return stored(work, state, x, span, regular, outcome.disturbed, **parts), outcome, regular
 
-    def _apart(
+    def _step_separately(
         self,
         work: SensitivityWork,
         state: SensitivityState,
         new: SensitivityState,
         reports: MemberReports,
-        usual: Mask,
+        regular: Mask,
         span: Span,
     ) -> tuple[SensitivityState, MemberReports]:
-        """Return state and reports after those members that are not `usual` have stepped alone."""
+        """Return state and reports after stepping each member outside `regular` separately."""
         alone: dict[int, Report] = {}
         each: dict[int, SensitivityState] = {}
-        for k in np.flatnonzero(~usual).tolist():
+        for k in np.flatnonzero(~regular).tolist():
             one, alone[k] = step_alone(work, take(state, k), span.member(k))
-            # The members share the rows of one log: whoever failed has an empty row there.
+            # All members share the rows of the log: a member whose step failed gets an empty row.
             while work.keeps_log and one.log.shape[1] <= state.log.shape[1]:
                 one = changed(one, log=skipped(one.log))
             each[k] = one
@@ -472,8 +471,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return state.fit.member(0)
 
     def diagnosed(self, work: SensitivityWork, state: SensitivityState) -> Diagnostics[float]:
-        told = no_readings(state.now, work.filter.problem.observed.size)
-        return reports_of(work, state.now, told).member(0).diagnostics
+        outcome = no_readings(state.now, work.filter.problem.observed.size)
+        return reports_of(work, state.now, outcome).member(0).diagnostics
 
     def settled(self, work: SensitivityWork, state: SensitivityState) -> SensitivityState:
         return settle(work, state)[0]
@@ -502,7 +501,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return self.member_belief(work, state.now, 0)
 
     def deferred(self, work: SensitivityWork, state: SensitivityState) -> Deferred:
-        # Kept estimates must not hold ledgers and warm-start data, which are larger than a belief.
+        # Stored estimates omit ledgers and warm-start data, which are larger than a belief.
         now, fit = kept_for_estimates(state.now), state.fit.member(0)
         judge, level = judged(work.filter, state.now, now), float(now.level[0])
 
@@ -518,7 +517,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         self, work: SensitivityWork, state: SensitivityState, *, columns: bool = True
     ) -> Deferred:
         belief, before = self.deferred(work, state)
-        # Of a later window the fit knows nothing of the readings before.
+        # The fit of a later window does not cover the readings before that window.
         whole = state.fit.member(0) if not state.window[0] else None
         if not self.verdict:
             return Deferred(belief, lambda: after_fit(before(), whole))
@@ -532,11 +531,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return Deferred(belief, verdict)
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
-        """Return the square root [U C] of the covariance that is reported, of all members."""
+        """Return the square root [U C] of the reported covariance of all members."""
         return reported_factors(work.filter, x)
 
     def member_belief(self, work: SensitivityWork, now: FilterState, k: int) -> Belief:
-        """Return the belief of one member, in latent coefficients."""
+        """Return the belief of member `k`, in latent coefficients."""
         return self._beliefs([(work, take(now, k))])[0]
 
     def _beliefs(self, samples: Sequence[tuple[SensitivityWork, FilterState]]) -> list[Belief]:
@@ -561,16 +560,16 @@ def _within(
     filter_: Filter,
     before: FilterState,
     x: FilterState,
-    told: Assimilation,
+    outcome: Assimilation,
     scale: Scale,
     span: Span,
 ) -> Mask:
-    """Return which members a sample neither moves too far, nor finds far off, (members,)."""
+    """Return which members need no safeguard, from move and innovations, shape (members,)."""
     near = guards.within_reach(x.da - before.da)
-    # Ranges are at least as large as the noise, so that smaller innovations cannot run away: most
-    # samples are spared the exact test.
-    if told.worst > guards.runaway:
-        beyond = scale.beyond(span.z1 - told.predicted, filter_.noise_of(before, span))
+    # Ranges are at least as large as the noise, so that smaller innovations cannot be a runaway.
+    # This bound saves most samples the exact test.
+    if outcome.worst > guards.runaway:
+        beyond = scale.beyond(span.z1 - outcome.predicted, filter_.noise_of(before, span))
         near = near & ~(beyond > guards.runaway)
     return near
 
