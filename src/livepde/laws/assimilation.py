@@ -1,4 +1,4 @@
-"""One sample of every member: predict, gate outliers, update, keep the innovation statistics."""
+"""Assimilation of one sample of each member: predict, gate, update, innovation statistics."""
 
 from __future__ import annotations
 
@@ -22,50 +22,50 @@ from livepde.stepping import Span
 from livepde.verdict import Judge, Ledger, ScoredSample
 
 OK = Status()
-MEMORY = 500.0  # samples: older ones fade from the noise level
+MEMORY = 500.0  # samples: memory of the noise level
 HALF_LOG = 0.5 * math.log(2.0 * math.pi)
-LEARN = 0.3  # of a sample each adds to the count: errors of the first guess fade fast
+LEARN = 0.3  # increase of the weight of the past for each sample: < 1 to forget early errors faster
 
 
 @dataclass(frozen=True, eq=False)
 class MemberReports:
-    """Report of a step of all members, in addition to the new state."""
+    """Report of a step of all members, which accompanies the new state."""
 
     statuses: tuple[Status, ...]  # status of the step of each member
     predicted: Array  # predicted value of each sensor, shape (members, sensors)
-    steps: Array  # substeps taken, shape (members,)
-    # Function that returns the diagnostics, numbers of shape (members,); called when read.
+    steps: Array  # number of substeps, shape (members,)
+    # Returns the diagnostics, arrays of shape (members,); called when they are read.
     diagnose: Callable[[], Diagnostics[Array]] = Diagnostics
-    # In how many parts the substeps were divided, shape (members,); None: not at all.
+    # Number of parts into which the substeps were divided, shape (members,); None: undivided.
     parts: IntArray | None = None
 
     @cached_property
     def diagnostics(self) -> Diagnostics[Array]:
-        """Innovation statistics, safeguards, and other numbers of the law."""
+        """Innovation statistics, actions of safeguards, and other numbers of the law."""
         return self.diagnose()
 
     def member(self, k: int) -> Report:
         steps = int(self.steps[k])
         parts = 1 if self.parts is None else int(self.parts[k])
-        diagnose = then(self.diagnose, lambda found: found.member(k))
+        diagnose = then(self.diagnose, lambda diagnostics: diagnostics.member(k))
         return Report(self.statuses[k], self.predicted[k], steps, diagnose, parts)
 
     def updated(self, more: Diagnostics[Array]) -> MemberReports:
-        """Return the reports with all that other diagnostics know among their own."""
+        """Return the reports with the known values of `more` in their diagnostics."""
         return replace(self, diagnose=lambda: self.diagnostics.updated(more))
 
     def with_members(self, reports: Mapping[int, Report]) -> MemberReports:
         if not reports:
             return self
         statuses, predicted, steps = list(self.statuses), self.predicted.copy(), self.steps.copy()
-        for k, one in reports.items():
-            statuses[k], predicted[k], steps[k] = one.status, one.predicted, one.steps
+        for k, report in reports.items():
+            statuses[k], predicted[k], steps[k] = report.status, report.predicted, report.steps
 
         def diagnosed() -> Diagnostics[Array]:
-            found = {k: one.diagnostics for k, one in reports.items()}
+            members = {k: report.diagnostics for k, report in reports.items()}
             rest = (k for k in range(len(statuses)) if k not in reports)
-            found |= {k: self.diagnostics.member(k) for k in rest}
-            return stacked([found[k] for k in range(len(statuses))])
+            members |= {k: self.diagnostics.member(k) for k in rest}
+            return stacked([members[k] for k in range(len(statuses))])
 
         return MemberReports(tuple(statuses), predicted, steps, diagnosed, self.parts)
 
@@ -74,28 +74,28 @@ class GateDecision(NamedTuple):
     """Decision of a gate on a sample."""
 
     refused: Mask  # readings that do not correct the unknowns, shape (members, sensors)
-    anchored: Mask  # those of them that correct the state alone
+    anchored: Mask  # refused readings that correct the state alone, shape (members, sensors)
 
 
 class Assimilation(NamedTuple):
     """Outcome of the assimilation of a sample."""
 
     predicted: Array  # predicted value of each sensor, shape (members, sensors)
-    steps: int | IntArray  # substeps taken, one number for all members or shape (members,)
-    status: Status  # why no member could be stepped, or ok
-    finite: Mask  # members whose numbers are finite, shape (members,)
-    refused: Mask  # values that the gate refused, shape (members, sensors)
-    worst: float  # largest innovation of all members in units of the noise; 0 without
-    anchored: Mask | None = None  # those that correct the state alone; None: none does
+    steps: int | IntArray  # number of substeps, an int for all members or shape (members,)
+    status: Status  # ok, or the reason why no member could be stepped
+    finite: Mask  # members with finite results, shape (members,)
+    refused: Mask  # readings that the gate refused, shape (members, sensors)
+    worst: float  # largest innovation of all members in units of the noise; 0 without readings
+    anchored: Mask | None = None  # readings that correct the state alone; None: no such reading
 
     @property
     def disturbed(self) -> Mask | None:
-        """Members of which a reading has corrected the state alone, (members,); None: none."""
+        """Members with a reading that corrected the state alone, (members,), or None."""
         return None if self.anchored is None else np.asarray(self.anchored.any(axis=1))
 
     @property
     def good(self) -> bool:
-        """True if the step of the one member was taken and its numbers are finite."""
+        """True if the step of the first member succeeded and its results are finite."""
         return self.status.ok and bool(self.finite[0])
 
 
@@ -107,19 +107,19 @@ def no_readings(x: FilterState, sensors: int) -> Assimilation:
 
 @dataclass(frozen=True)
 class UpdateOptions:
-    """Predict and update with the options of a law."""
+    """Options of a law for the update."""
 
-    gate: Gate = field(default_factory=Gate)  # which readings are used
-    # True if the noise is a first guess whose multiple is found from the samples.
+    gate: Gate = field(default_factory=Gate)  # selects the readings that are used
+    # True if the noise is an initial guess and a common factor is estimated from the samples.
     adaptive: bool = False
-    # An earlier decision of the gate on the sample, which holds again; None: the gate decides.
+    # An earlier decision of the gate on the sample, to be repeated; None: the gate decides.
     decision: GateDecision | None = None
 
 
 def assimilate(
     filter_: Filter, x: FilterState, span: Span, options: UpdateOptions
 ) -> tuple[FilterState, Assimilation]:
-    """Predict over a span and update at its end, linear about the linearisation points."""
+    """Predict over a span and update at its end, about the linearisation points."""
     end, steps, failure = filter_.predict(x, span)
     if failure is None:
         return absorb(filter_, end, span, options, steps)
@@ -132,9 +132,9 @@ def assimilate(
 def absorb(
     filter_: Filter, x: FilterState, span: Span, options: UpdateOptions, steps: int | IntArray = 0
 ) -> tuple[FilterState, Assimilation]:
-    """Update a state at the end of a span by the measurements there.
+    """Update a state predicted to the end of a span with the measurements there.
 
-    Gate, verdict, update, statistics; `steps` are the substeps that have led to the state.
+    Includes gate, verdict and statistics. `steps`: number of substeps of the prediction.
     """
     predicted, Y = filter_.sensors.observe(x, span.end)
     d = span.z1 - predicted
@@ -155,45 +155,46 @@ def _updated(
     innovations: Array,
     steps: int | IntArray,
 ) -> tuple[FilterState, Assimilation]:
-    """Return the same after a sample with a reading, from [U C] H^T and the innovations."""
+    """Update a state with a sample that has readings, from Y = [U C] H^T and the innovations."""
     at, judge, shadows = span.end, filter_.judge, filter_.shadows
     present: Mask = np.isfinite(innovations)
     whole = np.count_nonzero(present) == present.size
     measured = None if whole else np.asarray(present.any(axis=1))
     noise = filter_.noise_of(x, span)
-    # From here on in units of the noise: variance of an innovation 1 + |Y|^2.
+    # From here on, values are in units of the noise: an innovation has the variance 1 + |Y|^2.
     Y, d = Y / noise[:, None], innovations / noise
     sizes = np.abs(d)
     worst = float(np.fmax.reduce(sizes, axis=None))
     variance = 1.0 + np.add.reduce(Y * Y, axis=1)
-    e, told = d / np.sqrt(variance), d
-    off, shift = np.zeros(0), None
+    e, corrected = d / np.sqrt(variance), d
+    errors, shift = np.zeros(0), None
     if shadows is not None:
-        x, off = shadows.in_readings(x, at)
-        # Shifts of the innovations by the known discretisation error have a finding of their own:
-        # neither the gate nor the verdict may count them again.
-        shift = np.add.reduce(off[:, shadows.counted], axis=1) / noise
-        told = d + shift
+        x, errors = shadows.in_readings(x, at)
+        # The estimated discretisation error has its own finding: the gate and the verdict must not
+        # count its effect on the innovations a second time.
+        shift = np.add.reduce(errors[:, shadows.counted], axis=1) / noise
+        corrected = d + shift
     kept = _admitted(options, x, span, present, innovations, noise, (e, d, variance, shift))
     used, parts = kept.used, dict[str, Any](kept.parts)
     if used is not present:
         whole, e = bool(used.all()), np.where(used, e, np.nan)
-    if not whole:  # missing values take part as zeros, which carry no information
-        d, told = np.where(used, d, 0.0), np.where(used, told, 0.0)
+    if not whole:  # zeros in place of missing values carry no information
+        d, corrected = np.where(used, d, 0.0), np.where(used, corrected, 0.0)
         Y = np.where(used[:, None], Y, 0.0)
     causes = x.causes
     if judge is not None:
-        causes, parts["ledger"] = _judged(judge, filter_, x, Y, told, used, noise, predicted, span)
+        sample = Y, corrected, used, noise, predicted
+        causes, parts["ledger"] = _judged(judge, filter_, x, *sample, span)
     parts["innovations"] = x.innovations.add(e, measured, kept.newest)
-    changes, made = filter_.update(x, Y, d, causes)
+    changes, update = filter_.update(x, Y, d, causes)
     parts |= changes
-    parts["evidence"] = x.evidence + _density(options, x, made, noise, present, kept.refused)
+    parts["evidence"] = x.evidence + _density(options, x, update, noise, present, kept.refused)
     if options.adaptive:
-        parts |= _learned(x, used, d, made)
+        parts |= _noise_level(x, used, d, update)
     if shadows is not None:
-        weights = used / noise  # missing values have none
-        U, C, off = parts["U"], parts["C"], np.where(used[:, None], off, 0.0)
-        parts["shadows"] = shadows.update(x, U, C, made.left, weights, off, span.t1)
+        weights = used / noise  # zero for missing values
+        U, C, errors = parts["U"], parts["C"], np.where(used[:, None], errors, 0.0)
+        parts["shadows"] = shadows.update(x, U, C, update.left, weights, errors, span.t1)
     new = changed(x, **parts)
     if kept.anchored is not None and kept.anchored.any():
         new = filter_.anchor.corrected(new, innovations, kept.anchored, at)
@@ -204,29 +205,30 @@ def _updated(
 def _density(
     options: UpdateOptions,
     x: FilterState,
-    made: Update,
+    update: Update,
     noise: Array,
     present: Mask,
     refused: Mask,
 ) -> Array:
-    """Return the logarithm of the density of the readings, (members,)."""
+    """Return the log density of the readings given the samples before, shape (members,)."""
     logs = ((np.log(noise) + HALF_LOG) * present).sum(axis=1)
-    density = -0.5 * made.misfit - made.spread - logs
+    density = -0.5 * update.misfit - update.spread - logs
     if np.count_nonzero(refused) and options.gate.beyond < math.inf:
-        # The same readings count whatever is refused: one that is counts as one at the limit.
+        # A refused reading counts as a reading at the limit of the gate, so that the evidence
+        # covers the same readings whatever is refused.
         limit = options.gate.beyond**2 * np.maximum(x.innovations.ratio, 1.0)
         density = density - 0.5 * limit * refused.sum(axis=1)
     return np.asarray(density)
 
 
 class _Admitted(NamedTuple):
-    """Which readings are used, which are refused, and the memory of the gate."""
+    """Readings that are used and refused, and fields of the filter state that change."""
 
     used: Mask
     refused: Mask
-    anchored: Mask | None = None  # those of the refused that correct the state alone
+    anchored: Mask | None = None  # refused readings that correct the state alone
     newest: Array | None = None  # normalised innovations that count in the test for jumps
-    parts: Mapping[str, Any] = {}  # fields of the filter state to exchange
+    parts: Mapping[str, Any] = {}  # fields of the filter state to replace
 
 
 def _admitted(
@@ -240,7 +242,7 @@ def _admitted(
 ) -> _Admitted:
     """Return the readings that are used, by an earlier decision or by the gate.
 
-    `scaled`: normalised innovations, and what `_far` takes besides.
+    `scaled`: arguments `e`, `d`, `variance` and `shift` of `_far`.
     """
     refused = np.zeros(present.shape, dtype=bool)
     if options.decision is not None:
@@ -249,15 +251,15 @@ def _admitted(
     if not options.gate.beyond < math.inf:
         return _Admitted(present, refused)
     z, pause = span.z1, x.driven.pause
-    if z.shape != present.shape:  # members may share one sample
+    if z.shape != present.shape:  # members that share one sample
         z = np.broadcast_to(z, present.shape)
     far = _far(x, *scaled, pause, present, options.gate.beyond)
     if far is None:
         return _Admitted(present, refused, parts={"screened": x.screened.fitted(z, present)})
-    found = options.gate(x.screened, z, innovations, noise, far, present, span.t1, pause)
-    newest = np.where(found.counted, scaled[0], np.nan)
-    parts = {"screened": found.state}
-    return _Admitted(found.kept, present & ~found.kept, found.anchored, newest, parts)
+    gated = options.gate(x.screened, z, innovations, noise, far, present, span.t1, pause)
+    newest = np.where(gated.counted, scaled[0], np.nan)
+    parts = {"screened": gated.state}
+    return _Admitted(gated.kept, present & ~gated.kept, gated.anchored, newest, parts)
 
 
 def _far(
@@ -270,16 +272,14 @@ def _far(
     used: Mask,
     beyond: float,
 ) -> Mask | None:
-    """Return which values do not fit; None if all do, of members that refuse no sensor.
+    """Return the mask of misfitting readings, or None if all fit and no sensor is being refused.
 
-    The gate is as much wider as the innovations are usually larger than expected, so that a noise
-    that is stated too small does not close it.
-
-    `e`, `d`, `variance`: normalised innovations, and innovations with their variance, in units of
-    the noise. `shift`: known errors of the innovations, which widen the gate but after a pause;
-    None: none.
+    The limit grows with the usual size of normalised innovations, so that an understated noise does
+    not make the gate refuse most readings. `e`: normalised innovations. `d`, `variance`:
+    innovations and their variance, in units of the noise. `shift`: estimated discretisation errors
+    in the innovations, which widen the gate except after a pause, or None.
     """
-    # Values within the bare gate pass, whatever widens it: most samples are spared the limits.
+    # Values within the unwidened limits pass in any case, which saves most samples the rest.
     near, quiet = np.abs(e) <= beyond, not np.count_nonzero(x.screened.refused)
     if quiet and np.count_nonzero(near) == near.size:
         return None
@@ -292,10 +292,10 @@ def _far(
 
 
 def _finite(x: FilterState, sizes: Array, worst: float) -> Mask:
-    """Return which members are finite, with the squares of their innovations, (members,)."""
-    # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
-    # square overflows would leave statistics that are not finite. The squares of all members tell
-    # at once that nothing of this has happened.
+    """Return the members with finite estimates and innovation statistics, shape (members,)."""
+    # A nonfinite entry of U makes du nonfinite, whatever its weight. An innovation whose square
+    # overflows makes the statistics nonfinite. One finite sum of squares excludes both for all
+    # members at once.
     squares = np.vdot(x.u, x.u) + np.vdot(x.du, x.du) + np.vdot(x.da, x.da)
     if squares + worst * worst < math.inf:
         return np.asarray(x.member >= 0)
@@ -314,14 +314,14 @@ def _judged(
     predicted: Array,
     span: Span,
 ) -> tuple[Array, Ledger]:
-    """Return causes before an update and the ledger, with the sample added to the sums."""
+    """Return the causes before the update, and the ledger with the sample added to its sums."""
     prior = filter_.problem.model.latent.prior
 
     def a() -> Array:
-        found: Array = filter_.reduction.reduced(x.q - prior) + x.da
+        reduced: Array = filter_.reduction.reduced(x.q - prior) + x.da
         if filter_.shadows is not None:
-            found -= np.add.reduce(x.shadows.a[:, filter_.shadows.counted], axis=1)
-        return found
+            reduced -= np.add.reduce(x.shadows.a[:, filter_.shadows.counted], axis=1)
+        return reduced
 
     def q() -> Array:
         return filter_.estimate(x)
@@ -344,20 +344,20 @@ def _judged(
     return judge.add(x.ledger, sample)
 
 
-def _learned(x: FilterState, used: Mask, d: Array, made: Update) -> dict[str, Array]:
-    """Return the noise level after a sample.
+def _noise_level(x: FilterState, used: Mask, d: Array, update: Update) -> dict[str, Array]:
+    """Return the fields of the noise level after a sample.
 
-    The noise level is found by expectation maximisation, sample by sample: under the right level
-    the mean square of the residual after an update, plus the posterior variance of the prediction,
-    is the variance of the noise, also while the unknowns are uncertain.
+    One step of expectation maximisation. At the right level, the mean square of the residuals after
+    the update plus the posterior variance of the predictions equals the noise variance, even while
+    the unknowns are uncertain.
     """
-    left = made.left
-    missed = d - (made.half[:, None] @ left)[:, 0]
-    count, told = np.maximum(used.sum(axis=1), 1), used.any(axis=1)
-    square = ((missed * missed).sum(axis=1) + (left * left).sum(axis=(1, 2))) / count
+    left = update.left
+    residual = d - (update.half[:, None] @ left)[:, 0]
+    count, measured = np.maximum(used.sum(axis=1), 1), used.any(axis=1)
+    square = ((residual * residual).sum(axis=1) + (left * left).sum(axis=(1, 2))) / count
     samples = np.minimum(x.samples + LEARN, MEMORY)
     level = x.level * (1.0 + (square - 1.0) / samples)
     return {
-        "level": np.where(told, level, x.level),
-        "samples": np.where(told, samples, x.samples),
+        "level": np.where(measured, level, x.level),
+        "samples": np.where(measured, samples, x.samples),
     }

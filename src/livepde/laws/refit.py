@@ -1,13 +1,13 @@
-"""The refit: the most probable constant unknowns given the stored samples, from any honest prior.
+"""The refit: the most probable constant unknowns (MAP estimate) given the stored samples.
 
 Levenberg-Marquardt steps within a trust region in prior standard deviations (More 1978, Conn, Gould
-and Toint 2000), with a second-order part that follows curved valleys (Transtrum and Sethna 2012).
-Where the end does not explain the samples, the search begins again at the best of some screened
-points. The gate acts once a search has ended, and may take back readings.
+and Toint 2000), with geodesic acceleration in curved valleys (Transtrum and Sethna 2012). If the
+solution does not explain the samples, the search is repeated from the best of several screened
+points. The gate is applied after a search, and may accept readings that were refused before.
 
-A refit that is due is made at once, or in a thread while samples continue. It is a function of the
-state where it began, so that it may run at any time, and again after a restart. When the filter
-goes over to it depends on the number of samples alone.
+A refit runs at once when it is due, or in a thread while samples continue. It depends only on the
+state at its start, so that it may run at any time, and a second time after a restart. The number of
+samples alone determines when the filter switches to its result.
 """
 
 from __future__ import annotations
@@ -41,39 +41,39 @@ from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.linalg.member_arrays import changed, put_each, take
 
-DELTA = 1.5  # prior standard deviations of the first step at most: 0.5 to 3 do much the same
-ENDS = 0.03  # posterior standard deviations of a last step
-ENDS_EARLY = 1.0  # the same where the samples will be fitted again when there are twice as many
+DELTA = 1.5  # first trust radius, in prior standard deviations: 0.5 to 3 perform similarly
+ENDS = 0.03  # a search has converged at a step of this many posterior standard deviations
+ENDS_EARLY = 1.0  # same limit if the samples will be fitted again when their number has doubled
 ACCEPTED = 1e-4  # least ratio of actual and predicted decrease of the cost
 POOR, GOOD = 0.25, 0.75  # ratios below and above which the trust region changes
-SHORTER = 0.5  # radius of the next trial over that of the one before
-CLOSE = 0.1  # part of a step over which its second derivative is taken
-SHORT = 0.1  # prior standard deviations of a step whose second-order part is left out
+SHORTER = 0.5  # ratio of successive trust radii
+CLOSE = 0.1  # fraction of a step over which its second derivative is taken
+SHORT = 0.1  # prior standard deviations: shorter steps have no second-order part
 CURVED = 0.75  # largest second-order part of a step over its first-order part (Transtrum 2012)
-SHORTEST, LEAST = 1e-7, 1e-9  # step, and predicted decrease relative to the cost, that are none
-LARGE, DOUBTFUL = 30.0, 2.5  # mean squares of residuals that need a new search, the second one
-FAR = 6.0  # prior standard deviations from the prior: no honest prior is so wrong
-UNSURE = 0.5  # only where a direction keeps more than this share of its prior standard deviation
+SHORTEST, LEAST = 1e-7, 1e-9  # negligible step, and negligible relative decrease of the cost
+LARGE, DOUBTFUL = 30.0, 2.5  # misfits above which to search again: always, and if `UNSURE` holds
+FAR = 6.0  # prior standard deviations from the prior mean: a plausible prior is not so wrong
+UNSURE = 0.5  # a direction keeps more than this share of its prior standard deviation
 ROUNDING = 1e-12  # share of a variance
-AT_BOUND = 1e-6  # prior standard deviations from a bound at which a fit is held by it
-QUANTILE, BLOCKS = 0.8, 8  # of mean squares, over sensors and blocks of samples
-SCREENED, FITTED, SPREAD = 32, 3, 1.5  # points, best of them that are tried, and their deviation
-# Searches from elsewhere that must end at the best trajectory, and what they leave of their misfit
-# at most: where no reading sees an unknown all of them end at the prior, and prove nothing.
+AT_BOUND = 1e-6  # distance to an active bound, in prior standard deviations
+QUANTILE, BLOCKS = 0.8, 8  # quantile of mean squares, over sensors and blocks of samples
+SCREENED, FITTED, SPREAD = 32, 3, 1.5  # screened points, best points that start a search, deviation
+# Searches from other points that must end at the best trajectory, and the largest ratio of final to
+# initial misfit. Without the ratio, an unobserved unknown would always end at the prior and count.
 AGREED, LEFT = 3, 0.5
-# Samples over those of a search that began again in vain, from which another one does: the model is
-# most likely in error. The second at the end of a run.
+# Ratio of the number of samples to that of the last screening in vain, from which points are
+# screened again; second value: at the end of a run. The model is most likely in error.
 ANEW, ANEW_LAST = 4, 2
-STAYS = 1.0  # prior standard deviations within which that end is the same
-LAST, LAST_SPREAD = 8, 1.2  # fits from drawn points, before the search is given up
+STAYS = 1.0  # prior standard deviations within which a solution counts as unchanged
+LAST, LAST_SPREAD = 8, 1.2  # searches from random points before the search is given up, deviation
 GATE_ROUNDS = 4
-WILD = 30.0  # usual deviations beyond which a reading is refused before there is a fit
-GATE = 4.0  # the same for residuals, from those before and after them
-LEVERAGE = 0.1  # least share of its noise that the residual of a reading in use is taken to keep
-AT_ONCE = 64  # samples up to which a refit takes no thread of its own: it is as short as ten steps
-NEAR = 1.0  # standard deviations within which a refit that another one follows keeps these sums
-LATER = 8  # a refit of n samples is used n / 8 samples after it began
-AT_A_TIME = 3  # samples since then that a step takes with the filter of the refit
+WILD = 30.0  # usual deviations beyond which a reading is refused before a fit
+GATE = 4.0  # usual deviations between a residual and its neighbours
+LEVERAGE = 0.1  # least variance of the residual of a reading in use, in units of the noise
+AT_ONCE = 64  # largest number of samples fitted without a thread: about as long as ten steps
+NEAR = 1.0  # standard deviations within which an intermediate refit keeps the verdict's sums
+LATER = 8  # the result of a refit of n samples is used n / 8 samples after its start
+AT_A_TIME = 3  # samples since then that each step assimilates with the filter of the refit
 
 UNDER_WAY: WeakKeyDictionary[FilterState, Future[SensitivityState]] = WeakKeyDictionary()
 LOCK = threading.Lock()
@@ -81,25 +81,25 @@ LOCK = threading.Lock()
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """End of a search."""
+    """Result of a search."""
 
-    best: Passed  # the samples about the trajectory where it ended
+    best: Passed  # the samples about the best trajectory
     used: Mask  # readings in use, shape (samples, sensors)
-    # True if no step lowers the cost any more, and samples that are not explained pin all unknowns,
-    # or searches from elsewhere end here as well: then the model is in error, not the search.
+    # True if no step lowers the cost further and a remaining misfit is due to the model, not to the
+    # search: the samples determine all unknowns, or searches from other points end here as well.
     converged: bool
-    passes: float  # passes over the samples that it took
-    screened: bool  # True if it began again at screened points, and that was no use
+    passes: float  # number of passes over the samples
+    screened: bool  # True if points were screened in vain
 
 
 def refitted(
     samples: StoredSamples, options: Refit, *, last: bool, screened: int = 0
 ) -> Found | None:
-    """Return the end of a search from the present estimate; None if no trajectory is possible.
+    """Return the result of a search from the present estimate; None if every trajectory fails.
 
-    `last`: True for the end of a run: the search converges. Else it ends within a standard
-    deviation, as the same samples are fitted again later. `screened`: how many samples the last
-    search had that began again at screened points in vain.
+    `last`: True at the end of a run, for full convergence. Otherwise the search stops within a
+    standard deviation, because the samples are fitted again later. `screened`: number of samples in
+    the last search that screened points in vain.
     """
     search = _Search(samples, options, last, lacking=1 if screened else AGREED)
     screens = search.search(screened)
@@ -120,7 +120,7 @@ def refitted(
 
 
 def plausible(samples: StoredSamples, options: Refit, one: Passed) -> Mask:
-    """Return the readings that a fit which has ended at a trajectory uses, (samples, sensors)."""
+    """Return the readings that a fit with a given solution uses, shape (samples, sensors)."""
     search = _Search(samples, options, last=True)
     search.best = one
     return search.plausible if samples.gated else search.used
@@ -128,12 +128,12 @@ def plausible(samples: StoredSamples, options: Refit, one: Passed) -> Mask:
 
 @dataclass(eq=False)
 class _Search:
-    """A search for the most probable trajectory; it keeps the best one, and counts its passes."""
+    """A search for the most probable trajectory, which counts its passes over the samples."""
 
     samples: StoredSamples
     options: Refit
     last: bool
-    lacking: int = AGREED  # searches from elsewhere that have yet to end at the best trajectory
+    lacking: int = AGREED  # searches from other points that must still end at the best trajectory
     used: Mask = field(init=False)
     best: Passed | None = None
     settled: bool = False
@@ -147,20 +147,20 @@ class _Search:
 
     @property
     def plausible(self) -> Mask:
-        """Readings near the best trajectory, (samples, sensors); not only those in use.
+        """Readings near the best trajectory, shape (samples, sensors), in use or not.
 
-        A residual is refused that is far from those before and after it, and one far beyond what
-        the noise and what is left unknown allow; of few samples there is the latter only.
+        A reading is refused if its residual is far from its neighbours in time, or far beyond its
+        standard deviation. With few samples only the second test applies.
         """
-        one, gate = self.best, self.samples.work.options.gate.beyond
-        if one is None:
+        best, gate = self.best, self.samples.work.options.gate.beyond
+        if best is None:
             return self.used
-        H, _ = one.model(self.used)
+        H, _ = best.model(self.used)
         sizes, axes = principal(H)
-        J, r = one.slopes, one.residuals
-        shown = ((J @ axes) ** 2 / sizes).sum(axis=-1)
-        # Residuals of readings in use vary less than the noise, those of others more.
-        e = r / np.sqrt(np.where(self.used, np.maximum(1.0 - shown, LEVERAGE), 1.0 + shown))
+        J, r = best.slopes, best.residuals
+        variance = ((J @ axes) ** 2 / sizes).sum(axis=-1)
+        # A residual varies less than the noise if its reading is in use, and more otherwise.
+        e = r / np.sqrt(np.where(self.used, np.maximum(1.0 - variance, LEVERAGE), 1.0 + variance))
         near = near_neighbours(r, GATE)
         for k, column in enumerate(e.T):
             usual = usual_size(column[self.used[:, k]])
@@ -170,13 +170,13 @@ class _Search:
         return near
 
     def search(self, screened: int) -> bool:
-        """Search from the present estimate, and from elsewhere if the end needs it.
+        """Search from the present estimate, and from other points if the solution is suspicious.
 
-        `screened` as in `refitted`. Returns whether it began again at screened points.
+        `screened`: as in `refitted`. Returns True if points were screened.
         """
         start = self.samples.reached
         self.descend(start)
-        # Fewer samples have shown that there is no other end, if this is the same.
+        # An unchanged solution was already compared with other points, on fewer samples.
         stays = self.best is not None and np.linalg.norm(self.best.xi - start) < STAYS
         more = len(self.samples) >= (ANEW_LAST if self.last else ANEW) * screened
         screens = self.suspicious and (more or (self.far and not stays))
@@ -189,13 +189,13 @@ class _Search:
         return screens
 
     def begin(self, used: Mask) -> None:
-        """Search again from the best trajectory, with other readings in use."""
+        """Repeat the search from the best trajectory, with other readings in use."""
         before, self.used, self.best = self.best, used, None
         if before is not None:
             self._descend(before)
 
     def descend(self, xi: Array) -> None:
-        """Search from a trajectory, and keep where that ends if it is better."""
+        """Search from a trajectory, or from the prior mean if a step along it fails."""
         start = self._about(self.samples.within_bounds(xi))
         if start is None and xi.any():
             start = self._about(np.zeros_like(xi))
@@ -207,7 +207,7 @@ class _Search:
         return self.samples.about(xi)
 
     def _elsewhere(self, xi: Array) -> None:
-        """Search from another point, and note whether that ends at the best trajectory."""
+        """Search from another point, and count it if it ends at the best trajectory."""
         start, best = self._about(self.samples.within_bounds(xi)), self.best
         if start is None:
             return
@@ -219,7 +219,7 @@ class _Search:
             self.lacking = AGREED
 
     def _descend(self, start: Passed) -> Passed:
-        """Take Levenberg-Marquardt steps from a pass, and keep the end if it is the best."""
+        """Take Levenberg-Marquardt steps from a trajectory, and keep the result if it is best."""
         end, settled, ends = start, False, ENDS if self.last else ENDS_EARLY
         budget, delta = self.passes + self.options.passes, DELTA
         while self.passes < budget:
@@ -237,7 +237,7 @@ class _Search:
         return end
 
     def _free(self, one: Passed, g: Array) -> Array:
-        """Return a basis of the directions in which no bound is in the way, (r, free)."""
+        """Return a basis of the directions without an active bound, shape (r, free)."""
         samples = self.samples
         reduction, start = samples.filter.reduction, samples.start
         lower, upper = reduction.ends
@@ -254,9 +254,9 @@ class _Search:
     def _stepped(
         self, one: Passed, model: _Quadratic, delta: float, budget: float
     ) -> tuple[Passed | None, float]:
-        """Return the pass after an accepted step, None if there is none, and the trust region."""
+        """Return the pass after an accepted step, or None, and the trust radius."""
         cost, bend = one.cost(self.used), None
-        several = 1  # one trial, and where it fails shorter ones at once
+        several = 1  # one trial; if it fails, several shorter trials together
         while self.passes < budget:
             if several == 1 and (better := self._short_step(one, model, delta)):
                 return better, delta
@@ -276,9 +276,9 @@ class _Search:
     def _trials(
         self, one: Passed, model: _Quadratic, delta: float, several: int, bend: Array | None
     ) -> tuple[list[Array], list[float], Array | None]:
-        """Return steps of shrinking length, the decrease that each predicts, and the bend.
+        """Return steps of decreasing length, their predicted decreases of the cost, and the bend.
 
-        `bend`: that of `_bend`, None before it is known.
+        `bend`: result of `_bend`, or None if it has not been computed.
         """
         steps, predicted, cost = list[Array](), list[float](), one.cost(self.used)
         for radius in delta * SHORTER ** np.arange(several):
@@ -295,7 +295,7 @@ class _Search:
         return steps, predicted, bend
 
     def _short_step(self, one: Passed, model: _Quadratic, delta: float) -> Passed | None:
-        """Return the pass after a step so short that it needs no second-order part, or None."""
+        """Return the pass after a step short enough to omit its second-order part, or None."""
         step, _ = model.step(delta)
         gain, cost = model.gain(step), one.cost(self.used)
         if not SHORTEST <= np.linalg.norm(step) < SHORT or gain < LEAST * cost:
@@ -305,7 +305,7 @@ class _Search:
         return better if accepted else None
 
     def _bend(self, one: Passed, step: Array) -> Array:
-        """Return J' d2r/ds2 of the residuals r along a step, by a difference; zero if it fails."""
+        """Return J' d2r/ds2 of the residuals r along a step, by differences; zero on failure."""
         near = self.samples.residuals(one.xi + CLOSE * step)
         self.passes += 1.0 / (1 + int(self.samples.alive.sum()))
         if near is None:
@@ -317,31 +317,28 @@ class _Search:
 
     @property
     def suspicious(self) -> bool:
-        """True if the best trajectory does not explain the samples, or contradicts the prior.
-
-        So do wrong minima.
-        """
+        """True if the misfit, or the distance from the prior, suggests a wrong local minimum."""
         return self.lost or self.far or self._square > LARGE
 
     @property
     def far(self) -> bool:
-        """True if the best trajectory is far outside the prior, N(0, I) of all coordinates."""
+        """True if the best trajectory is far outside the prior N(0, I)."""
         if self.best is None:
             return False
         return float(self.best.xi @ self.best.xi) > FAR**2 + 2.0 * float(self.samples.alive.sum())
 
     @property
     def lost(self) -> bool:
-        """True if samples that are not explained leave an unknown as uncertain as its prior.
+        """True if the samples are not explained and leave a direction of the unknowns uncertain.
 
-        Unless searches from elsewhere end at the same trajectory.
+        False if searches from other points end at the same trajectory.
         """
         if self.best is None:
             return True
         if not self.unexplained or self.lacking <= 0:
             return False
         H, _ = self.best.model(self.used)
-        # Of the unknowns: rows of an uncertain start, and padding, may stay as they were.
+        # Compare covariances of the unknowns only: rows of an uncertain start may keep theirs.
         C = self.samples.start.C[0]
         sizes, axes = principal(H)
         left = axes.T @ C
@@ -352,7 +349,7 @@ class _Search:
 
     @property
     def unexplained(self) -> bool:
-        """True if the best trajectory leaves more than the noise."""
+        """True if the residuals of the best trajectory are larger than the noise."""
         return self._square > DOUBTFUL
 
     @property
@@ -362,12 +359,12 @@ class _Search:
         return _misfit(self.best.residuals, self.samples.readings, self.used)
 
     def screen(self) -> None:
-        """Search from the best of some points of the prior."""
+        """Search from the best of a sample of points around the prior."""
         points = self._spread(SPREAD * _normal(SCREENED, int(self.samples.alive.sum())))
         costs, taken = self.samples.costs(points, self.used)
         self.passes += taken
         order = np.argsort(costs)
-        # At the end of a run a misfit that pins all unknowns is most likely an error of the model.
+        # At the end of a run, a misfit that determines all unknowns most likely is a model error.
         fitted = 1 if self.last and not self.lost else FITTED
         for place in order[:fitted].tolist():
             known = self.best is not None and self._near(self.best, points[place])
@@ -377,7 +374,7 @@ class _Search:
                 return
 
     def _spread(self, points: Array) -> Array:
-        """Return points in all coordinates, within the bounds of the unknowns."""
+        """Return points in all coordinates, moved into the bounds of the unknowns."""
         alive = self.samples.alive
         whole = np.zeros((len(points), len(alive)))
         whole[:, alive] = points
@@ -393,7 +390,7 @@ class _Search:
         return float((one.residuals[self.used] ** 2).sum())
 
     def draw(self) -> None:
-        """Search from drawn points, before it is given up."""
+        """Search from random points, as a last attempt."""
         drawn = np.random.default_rng(0).standard_normal((LAST, int(self.samples.alive.sum())))
         for xi in self._spread(LAST_SPREAD * drawn):
             self._elsewhere(xi)
@@ -403,50 +400,50 @@ class _Search:
 
 @dataclass(frozen=True, eq=False)
 class _Quadratic:
-    """The quadratic model of the cost about a trajectory, in its free principal directions."""
+    """Quadratic model of the cost about a trajectory, in its free principal directions."""
 
-    # Hessian and direction of descent, principal values and axes, and g along these.
+    # Hessian, negative gradient, principal values and axes, and components of g along the axes.
     H: Array
     g: Array
     sizes: Array
     axes: Array
     along: Array
-    decrease: float  # by which the model falls to its minimum
+    decrease: float  # decrease of the model from the trajectory to its minimum
 
     @classmethod
     def of(cls, H: Array, g: Array, free: Array) -> _Quadratic:
-        """Return the model in directions with the basis `free`, (r, free)."""
+        """Return the model restricted to the span of the columns of `free`, shape (r, free)."""
         sizes, axes = principal(free.T @ H @ free)
         decrease = 0.5 * float(((axes.T @ (free.T @ g)) ** 2 / sizes).sum())
         axes = free @ axes
         return cls(H, g, sizes, axes, axes.T @ g, decrease)
 
     def step(self, radius: float) -> tuple[Array, float]:
-        """Return the step to the minimum within a ball, and the shift of the Hessian for it."""
+        """Return the minimiser within a ball, and the shift of the Hessian that gives it."""
         shift = _shift(self.sizes, self.along, radius)
         return self.shifted(self.along, shift), shift
 
     def shifted(self, along: Array, shift: float) -> Array:
-        """Return the solution with a shifted Hessian, for a right side along the axes."""
+        """Solve with the shifted Hessian, for a right-hand side in components along the axes."""
         return np.asarray(self.axes @ (along / (self.sizes + shift)))
 
     def gain(self, step: Array) -> float:
-        """Return by how much the model falls with a step."""
+        """Return the decrease of the model for a step."""
         return float(self.g @ step - 0.5 * step @ self.H @ step)
 
 
 def _trusted(delta: float, length: float, ratio: float) -> float:
-    """Return the trust region after a step, from the ratio of actual and predicted decrease."""
+    """Return the trust radius after a step, from the ratio of actual and predicted decrease."""
     if ratio < POOR:
         return length * (SHORTER if ratio > 0.0 else SHORTER**2)
     return max(delta, 2.0 * length) if ratio > GOOD else delta
 
 
 def _shift(sizes: Array, g: Array, delta: float) -> float:
-    """Return the shift of the Hessian with which the minimum of the model is within a ball."""
+    """Return the shift of the Hessian that puts the minimum of the model inside a ball."""
     if np.linalg.norm(g / sizes) <= delta:
         return 0.0
-    # The length falls with the shift; the bracket holds since |g|/(shift + 1) bounds the length.
+    # The length decreases with the shift. |g|/(shift + 1) bounds it, which gives the bracket.
     low, high = 0.0, float(np.linalg.norm(g)) / delta
     for _ in range(60):
         shift = 0.5 * (low + high)
@@ -456,7 +453,7 @@ def _shift(sizes: Array, g: Array, delta: float) -> float:
 
 
 def _normal(count: int, size: int) -> Array:
-    """Return a Latin hypercube of points of N(0, I), shape (count, size)."""
+    """Return a Latin hypercube sample of N(0, I), shape (count, size)."""
     ranks = np.random.default_rng(0).random((count, size)).argsort(axis=0)
     return np.asarray(scipy.special.ndtri((ranks + 0.5) / count))
 
@@ -464,14 +461,13 @@ def _normal(count: int, size: int) -> Array:
 def _misfit(residuals: Array, readings: Array, used: Mask) -> float:
     """Return a high quantile of mean squares of residuals, over sensors and blocks of samples.
 
-    In units of the noise that is stated, or that second differences show if that is larger.
+    The unit is the stated noise variance, or its estimate from second differences if larger.
     """
     shown = np.where(used, readings, np.nan)
     squares = []
     for k in range(readings.shape[1]):
-        seen = shown[np.isfinite(shown[:, k]), k]
-        bends = np.diff(seen, n=2)
-        noise = max(1.0, float((bends**2).mean()) / 6.0) if len(bends) else 1.0
+        differences = np.diff(shown[np.isfinite(shown[:, k]), k], n=2)
+        noise = max(1.0, float((differences**2).mean()) / 6.0) if len(differences) else 1.0
         for block in np.array_split(residuals[used[:, k], k], BLOCKS):
             if len(block):
                 squares.append(float((block**2).mean()) / noise)
@@ -481,9 +477,9 @@ def _misfit(residuals: Array, readings: Array, used: Mask) -> float:
 def refit_due(
     work: SensitivityWork, state: SensitivityState
 ) -> tuple[SensitivityState, Diagnostics[Array] | None]:
-    """Return all members after the refits that are due, and diagnostics if there was one."""
+    """Return all members after the refits due, and the diagnostics of an iterated start or None."""
     due, rows = state.assimilated >= state.due, state.log.shape[1]
-    if work.fits and 0 < work.window < rows:  # samples without a reading need room
+    if work.fits and 0 < work.window < rows:  # samples without readings fill the log, too
         due = due | (rows - state.window > work.window)
     if not np.count_nonzero(due):
         return state, None
@@ -500,11 +496,11 @@ def refit_due(
 def _after_due(
     work: SensitivityWork, options: Refit, state: SensitivityState, *, alone: bool
 ) -> SensitivityState:
-    """Return one member after a refit that is due; `alone`: not of a fleet."""
+    """Return one member after a refit that is due; `alone`: not part of a fleet."""
     count = int(state.assimilated[0])
     if max(count, state.log.shape[1] - 1 - int(state.window[0])) >= options.window:
         return new_window(work, state.now, state)
-    # A window but the first begins with what is known: it has nothing to search for.
+    # A later window begins with the posterior of the one before, and requires no search.
     if count <= options.start and options.apart and alone and count > AT_ONCE:
         state = changed(state, fork=Fork.of(state))
     elif count <= options.start:
@@ -513,29 +509,29 @@ def _after_due(
     return changed(state, due=np.array([later]))
 
 
-@nonfinite_allowed()  # such a trajectory is refused
+@nonfinite_allowed()  # a nonfinite trajectory is refused
 def settle(
     work: SensitivityWork, state: SensitivityState
 ) -> tuple[SensitivityState, list[Mask | None]]:
-    """Return all members after a last refit, and the readings it has used or None, of each."""
+    """Return all members after a final refit, and for each the readings it used or None."""
     used: list[Mask | None] = [None] * len(state)
     each: dict[int, SensitivityState] = {}
     options = work.refit
     if options is None or not work.fits:
         return state, used
     for k in range(len(state)):
-        one = take(state, k)
-        if one.log.shape[1] and (one.assimilated[0] or one.opening[0]):
-            each[k], used[k] = _settled(work, options, one)
+        member = take(state, k)
+        if member.log.shape[1] and (member.assimilated[0] or member.opening[0]):
+            each[k], used[k] = _settled(work, options, member)
     return put_each(state, each), used
 
 
 def _settled(
     work: SensitivityWork, options: Refit, state: SensitivityState
 ) -> tuple[SensitivityState, Mask | None]:
-    """Return one member after a last refit, and the readings it has used or None."""
+    """Return one member after a final refit, and the readings that it used or None."""
     samples = StoredSamples.of(work, state)
-    state = changed(state, fork=Fork.none(state.now))  # this is a refit of more samples
+    state = changed(state, fork=Fork.none(state.now))  # replaced by this refit of more samples
     try:
         found = refitted(samples, options, last=True, screened=int(state.fit.screened[0]))
         after = _after(work, state, samples, found, last=True)
@@ -549,7 +545,7 @@ def _settled(
 def refitted_now(
     work: SensitivityWork, options: Refit, state: SensitivityState
 ) -> SensitivityState:
-    """Return one member after a refit that another one follows."""
+    """Return one member after an intermediate refit, which a later refit follows."""
     samples = StoredSamples.of(work, state)
     found = refitted(samples, options, last=False, screened=int(state.fit.screened[0]))
     return _after(work, state, samples, found, last=False)
@@ -580,20 +576,20 @@ def _after(
         xi=found.best.xi[None, :, None],
     )
     now = work.filter.relinearised(x)
-    # A filter to go back to that was set with this sample is that after the fit.
+    # If the newer point of return is this sample, it becomes the filter after the fit.
     newer = now if state.since_newer[0] == state.log.shape[1] - 1 else state.newer
     return changed(state, now=now, newer=newer, fit=fit)
 
 
 def _filter(samples: StoredSamples, found: Found, *, last: bool) -> FilterState | None:
-    """Return the filter that continues from the end of a search; None if a step fails."""
+    """Return the filter that continues from the result of a search; None if a step fails."""
     now = samples.state.now
     evidence = samples.start.evidence + samples.log_evidence(found.best, found.used)
     best = changed(samples.updated(found.best, found.used), evidence=evidence)
-    away = apart(samples.filter, best, now)
-    # Sums of the verdict and errors of the discretisation stay with the filter until then: a later
-    # refit of the same samples may compute them again.
-    if (away <= HOLDS and usual(now)) or (away <= NEAR and not last):
+    distance = apart(samples.filter, best, now)
+    # Close to the present filter, its ledger and discretisation errors remain valid. An
+    # intermediate refit tolerates more, because a later one computes both again.
+    if (distance <= HOLDS and usual(now)) or (distance <= NEAR and not last):
         return _within(samples.filter, best) if last else best
     x = samples.judged(found.best, found.used)
     if x is None:
@@ -603,10 +599,10 @@ def _filter(samples: StoredSamples, found: Found, *, last: bool) -> FilterState 
 
 
 def _within(filter_: Filter, x: FilterState) -> FilterState:
-    """Return a filter about a best fit, at that fit if the linear one is beyond a bound.
+    """Return a filter about a fit, without its last linear step if that step leaves the bounds.
 
-    Estimates are clipped to their bounds one by one. An unknown at its bound keeps the linear step,
-    so that it is clipped there; the others keep the values of the fit, without that step.
+    Estimates are clipped to their bounds one by one. An unknown at its bound keeps the linear step
+    and is clipped there. The other unknowns keep the values of the fit, without the step.
     """
     reduction, estimate = filter_.reduction, filter_.estimate(x)
     within = reduction.bounded(estimate)
@@ -619,7 +615,7 @@ def _within(filter_: Filter, x: FilterState) -> FilterState:
 
 
 def go_on(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
-    """Return one member after a sample, with the refit under way taken a step further."""
+    """Return one member after a sample, with its refit in progress advanced."""
     fork, options = state.fork, work.refit
     if options is None:
         return state
@@ -633,11 +629,11 @@ def go_on(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
         except Exception as error:
             if numerical(error) is None:
                 raise
-            # Of the same samples it would fail again: the filter goes on, and the fit is none.
+            # Repeating it on the same samples would fail again: the filter continues without it.
             failed = changed(state.fit, samples=fork.samples, converged=np.zeros(1))
             return _without(changed(state, fit=failed), fork.filter)
         state = changed(state, fit=found.fit)
-        if found.now is fork.filter:  # no better trajectory was found
+        if found.now is fork.filter:  # the refit found no trajectory
             return _without(state, fork.filter)
         fork = changed(fork, filter=found.now, fitted=np.ones(1, dtype=bool))
     return _caught_up(work, state, fork)
@@ -654,28 +650,28 @@ def _under_way(
     log = state.log[:, : int(fork.row[0]) + 1]
     begun = changed(state, now=fork.filter, log=log, assimilated=fork.samples)
     begun = _without(begun, fork.filter)
-    # A daemon: a program that ends does not wait for it.
+    # The program must not wait for a daemon thread at its end.
     threading.Thread(target=_run, args=(future, work, options, begun), daemon=True).start()
     return future
 
 
-@nonfinite_allowed()  # such a trajectory is refused
+@nonfinite_allowed()  # a nonfinite trajectory is refused
 def _run(
     future: Future[SensitivityState], work: SensitivityWork, options: Refit, state: SensitivityState
 ) -> None:
     try:
         future.set_result(refitted_now(work, options, state))
-    except Exception as error:  # noqa: BLE001, raised where the result is asked for
+    except Exception as error:  # noqa: BLE001, raised by `Future.result`
         future.set_exception(error)
 
 
 def _caught_up(work: SensitivityWork, state: SensitivityState, fork: Fork) -> SensitivityState:
-    """Return one member after the next samples since a refit, which has ended."""
+    """Return one member whose finished refit assimilates the next samples since its start."""
     row, last, x = int(fork.row[0]), state.log.shape[1] - 1, fork.filter
     rows = state.log[:, row : row + 1 + AT_A_TIME]
     for interval in intervals_since(rows, work.filter.problem.channels):
-        x, told = assimilate(work.filter, x, work.filter.span(interval), work.options)
-        if not told.good:
+        x, outcome = assimilate(work.filter, x, work.filter.span(interval), work.options)
+        if not outcome.good:
             return _without(state, x)
         x, row = work.filter.relinearised(x), row + 1
     if row < last:

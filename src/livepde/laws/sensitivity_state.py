@@ -1,4 +1,4 @@
-"""State of the sensitivity law: filter, log of samples, refits and guards of each member."""
+"""State of the sensitivity law: filter, stored samples, refits and safeguards of each member."""
 
 from __future__ import annotations
 
@@ -24,22 +24,21 @@ from livepde.linalg.member_arrays import changed, join_fields, take, where, zero
 from livepde.records import refusal
 from livepde.stepping import Span
 
-MOST_TRIED = 600  # samples that are kept for trials of columns
-EARLY = 100  # samples after which a disturbance is no column that was wrong from the start
-SMOOTHED = 64  # samples that are smoothed again where unknowns move, at most
-LEAST = 32  # rows that a log is shortened by: a copy for each sample would cost more
-FEW = 20_000  # numbers of a square root up to which several samples are read together
-NEVER = np.iinfo(np.int64).max  # number of samples at which nothing is due any more
+MOST_TRIED = 600  # largest number of samples stored for trials of columns
+EARLY = 100  # samples: a column that is wrong from the start causes a disturbance before this
+SMOOTHED = 64  # largest number of samples that the iterated smoother uses
+LEAST = 32  # least number of rows by which a log is shortened: a copy for each sample costs more
+FEW = 20_000  # largest square root, in numbers, for which several samples are read together
+NEVER = np.iinfo(np.int64).max  # value of `due` if no refit is due any more
 
 
 @dataclass(frozen=True, eq=False)
 class SensitivityWork:
     """Parts that the law computes once, and its options."""
 
-    # The filter, and how it takes a sample.
     filter: Filter
     options: UpdateOptions
-    # Those of the law.
+    # Attributes of the law with the same names.
     refit: Refit | None
     guards: Guards | None
     jumps: Jumps | None
@@ -49,7 +48,7 @@ class SensitivityWork:
     def made_of(
         self, readings: Mapping[str, InitialReading], errors: Array, initial: Any
     ) -> SensitivityWork:
-        """Return the same for a member whose initial state was given so, and made of readings."""
+        """Return the work for a member with its own initial state, readings and their errors."""
         problem = replace(
             self.filter.problem, initial_readings=readings, initial_errors=errors, initial=initial
         )
@@ -61,16 +60,16 @@ class SensitivityWork:
 
     @cached_property
     def unaccompanied(self) -> SensitivityWork:
-        """The same for a search: it keeps no ledger and follows no discretisation error."""
+        """The work for a search, without ledger and discretisation errors."""
         return replace(self, filter=replace(self.filter, shadows=None, judge=None))
 
     @cached_property
     def keeps_log(self) -> bool:
-        """True if the law ever goes back to earlier samples."""
+        """True if the law may go back to earlier samples."""
         return bool(self.back or self.window)
 
     def kept_start(self, x: FilterState) -> FilterState:
-        """Return the filter where a window begins; zeros for a law that never goes back there."""
+        """Return the filter at the start of a window; zeros for a law without windows."""
         return x if self.window else zeros(x)
 
     @cached_property
@@ -78,9 +77,9 @@ class SensitivityWork:
         return rows_of_sensors(self.filter.problem, self.filter.reduction)
 
     def evidence_of_refused(self, log: Array, kept: Array, level: Array) -> Array:
-        """Return the log densities at the limit of the gate of the readings that `kept` lacks.
+        """Return the log density of the readings missing from `kept`, as if at the gate's limit.
 
-        `level`: variance of the noise over the stated one, shape (members,).
+        `level`: noise variance over its stated value, shape (members,).
         """
         sensors = len(self.filter.noise)
         readings, stds = slice(1, 1 + sensors), slice(1 + sensors, 1 + 2 * sensors)
@@ -91,9 +90,9 @@ class SensitivityWork:
         return np.asarray(-np.where(lost, each, 0.0).sum(axis=(1, 2)))
 
     def at_level(self, start: FilterState, now: FilterState) -> FilterState:
-        """Return the filter at the start, where the noise has the level that was found since.
+        """Return the filter at the start of a window, scaled to the noise level of `now`.
 
-        A u0 that is made of readings is as uncertain as they are.
+        An initial state made of readings is as uncertain as these readings.
         """
         rows = self._of_sensors
         if not (self.options.adaptive and len(rows)) or start.age.any() or not start.U.any():
@@ -110,11 +109,11 @@ class SensitivityWork:
 
     @cached_property
     def fits(self) -> bool:
-        """True if the stored samples determine constant unknowns alone, so that they are fitted."""
+        """True if the stored samples depend on constant unknowns alone, so that a fit applies."""
         return not (self.fades or self.filter.moves or self.filter.problem.input_noise)
 
     def tried_samples(self, state: SensitivityState) -> SensitivityState:
-        """Return one member with its samples for trials of columns as those to be fitted."""
+        """Return one member whose samples for trials of columns are the samples to be fitted."""
         start = state.trial_start
         first = np.array([not start.ledger.seen[0]])
         return changed(
@@ -137,21 +136,21 @@ class SensitivityWork:
 
     @cached_property
     def window(self) -> int:
-        """Largest number of samples that are taken again together; 0: none are."""
+        """Largest number of samples in a refit or an iterated start; 0 without either."""
         if self.refit is None:
             return 0
         return self.refit.window if self.fits else min(self.refit.start, SMOOTHED)
 
     @cached_property
     def tried(self) -> int:
-        """Number of samples that are kept for trials of columns beside those of a fit; 0: none."""
+        """Number of samples stored for trials of columns, in addition to the fit's; may be 0."""
         if self.refit is None or self.filter.judge is None or self.fades or not self.window:
             return 0
         return min(self.refit.window, MOST_TRIED)
 
     @cached_property
     def back(self) -> int:
-        """Least number of samples by which the law can go back; 0: it never does."""
+        """Least number of samples by which the law can go back; 0 if it never goes back."""
         guards, jumps = self.guards, self.jumps
         return max(guards.past if guards else 0, jumps.window if jumps else 0)
 
@@ -160,43 +159,43 @@ class SensitivityWork:
 class SensitivityState:
     """State of the law for each member; the leading axis of every array is the members."""
 
-    now: FilterState  # the filter now
-    # Where the window of a refit, or of an iterated start, begins: the filter, the row of the log,
-    # whether that row holds a sample that the filter has not seen, and whether it is the initial
-    # state of the model (`Model.initial`).
+    now: FilterState  # the present filter
+    # Start of the window of a refit or of an iterated start: the filter, its row of the log, True
+    # if that row has a sample that the filter has not assimilated, and True if the state is the
+    # initial state of the model (`Model.initial`).
     start: FilterState
     window: IntArray
     opening: Mask
     initial: Mask
-    # Samples used since, and at how many they are taken again; `NEVER`: they never are.
+    # Number of samples in the window, and their number at the next refit; `NEVER`: no refit.
     assimilated: IntArray
     due: IntArray
     fit: FitState  # the last refit
-    fork: Fork  # a refit under way while samples continue
-    # Two filters of before, to which `Guards` and `Jumps` go back, and their rows of the log.
+    fork: Fork  # a refit in progress while samples continue
+    # Two earlier filters, to which `Guards` and `Jumps` go back, and their rows of the log.
     older: FilterState
     newer: FilterState
     since_older: IntArray
     since_newer: IntArray
-    # Samples since the earliest of them, see `livepde.laws.history`.
+    # Samples since the earliest of these filters, see `livepde.laws.history`.
     log: Array = field(metadata={"grows": 1})
-    # Samples for trials of columns, see `SensitivityWork.tried`, and the filter before them.
+    # Samples for trials of columns (`SensitivityWork.tried`), and the filter before them.
     trial: Array = field(metadata={"grows": 1})
     trial_start: FilterState
     watch: Watch  # innovations of the last samples, for `Jumps`
-    scale: Scale  # ranges of the readings of each sensor so far, for `Guards`
+    scale: Scale  # range of the readings of each sensor so far, for `Guards`
 
     def __len__(self) -> int:
         return len(self.now)
 
     def counted(self, evidence: Array) -> SensitivityState:
-        """Return the state at the start with the evidence of readings that change nothing else."""
+        """Return the state with new evidence, for readings that change no estimate."""
         names = ("start", "now", "older", "newer")
         return changed(self, **{n: changed(getattr(self, n), evidence=evidence) for n in names})
 
     @property
     def unaccompanied(self) -> SensitivityState:
-        """The same without ledger and discretisation errors, as the filter of a search has it."""
+        """The state for a search, without ledger and discretisation errors."""
         return changed(self, start=unaccompanied(self.start), now=unaccompanied(self.now))
 
 
@@ -204,24 +203,25 @@ class SensitivityState:
 class FitState:
     """The last refit of each member."""
 
-    samples: IntArray  # how many samples it took, 0 before the first one, shape (members,)
-    # Half the sum of squares of residuals in use and of the unknowns, in standard deviations, shape
-    # (members,).
+    samples: IntArray  # number of samples, 0 before the first refit, shape (members,)
+    # Half the sum of squares of the residuals in use and of the unknowns, in standard deviations,
+    # shape (members,).
     cost: Array
-    # Readings of these samples, and those of them that were not used, shape (members,).
+    # Number of readings in these samples, and number of readings not used, shapes (members,).
     readings: Array
     refused: Array
-    work: Array  # samples that all refits of the window have taken, one with derivatives counting 1
+    # Cost of all refits of the window, in samples propagated with derivatives, shape (members,).
+    work: Array
     # 1 if the search ended in a minimum that explains the samples, else 0, shape (members,).
     converged: Array
-    # How many samples the last search had that began again in vain, 0 before, shape (members,).
+    # Number of samples in the last search that screened points in vain, else 0, shape (members,).
     screened: IntArray
-    # Coordinates where it ended, on the rows of the start, shape (members, r, 1).
+    # Solution in coordinates on the rows of the start, shape (members, r, 1).
     xi: Array = field(metadata={"grows": 1})
 
     @classmethod
     def none(cls, start: FilterState) -> FitState:
-        """Return the value before any refit of windows with a start."""
+        """Return the value before any refit, for windows that begin at `start`."""
         members, rows = start.C.shape[:2]
         zero, nothing = np.zeros(members), np.zeros(members, dtype=np.int64)
         return cls(
@@ -236,7 +236,7 @@ class FitState:
         )
 
     def member(self, k: int) -> Fit | None:
-        """Return the last refit of one member, None before it."""
+        """Return the last refit of member `k`; None before the first refit."""
         if not self.samples[k]:
             return None
         return Fit(
@@ -251,23 +251,23 @@ class FitState:
 
 @dataclass(frozen=True, eq=False)
 class Fork:
-    """A refit under way while samples continue; arrays without members where there is none."""
+    """A refit in progress while samples continue; the arrays are empty without one."""
 
-    # The filter where the refit began; once the refit has ended, the filter of its result.
+    # Filter at the start of the refit; after its end, the filter that continues from its result.
     filter: FilterState
-    samples: IntArray  # how many samples are fitted, shape (1,)
+    samples: IntArray  # number of samples that are fitted, shape (1,)
     row: IntArray  # row of the log that the filter has assimilated last, shape (1,)
-    fitted: Mask  # True once the refit has ended, shape (1,)
+    fitted: Mask  # True after the end of the refit, shape (1,)
 
     @classmethod
     def none(cls, x: FilterState) -> Fork:
-        """Return the value while no refit is under way."""
+        """Return the value without a refit in progress."""
         nothing = np.zeros(0, dtype=np.int64)
         return cls(take(x, nothing), samples=nothing, row=nothing, fitted=nothing.astype(bool))
 
     @classmethod
     def of(cls, state: SensitivityState) -> Fork:
-        """Return the value where a refit of all stored samples of one member begins."""
+        """Return the value at the start of a refit of all stored samples of one member."""
         row = np.array([state.log.shape[1] - 1])
         no = np.zeros(1, dtype=bool)
         return cls(state.now, samples=state.assimilated, row=row, fitted=no)
@@ -278,10 +278,10 @@ class Fork:
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """Range of the values of each sensor so far, and its first innovation."""
+    """Range of the readings of each sensor so far, and its first innovation."""
 
-    # Least and largest value, and size of the first innovation, shapes (members, sensors); NaN
-    # before.
+    # Smallest and largest reading, and size of the first innovation, shapes (members, sensors); NaN
+    # before any reading.
     low: Array
     high: Array
     first: Array
@@ -293,21 +293,21 @@ class Scale:
 
     @property
     def ranges(self) -> Array:
-        """Ranges of the readings so far, (members, sensors); zero before any."""
+        """Ranges of the readings so far, (members, sensors); zero before any reading."""
         return np.nan_to_num(self.high - self.low)
 
     def add(self, z: Array, d: Array) -> Scale:
-        """Return the value after a sample z with innovations d, NaN where missing."""
+        """Return the ranges after a sample z with innovations d, NaN where missing."""
         first, unseen = self.first, np.isnan(self.first)
         if np.count_nonzero(unseen):
             first = np.where(unseen, np.abs(d), first)
-        # A missing reading, NaN, must leave the range as it is: fmin and fmax ignore it.
+        # fmin and fmax ignore NaN: a missing reading does not change the range.
         return Scale(np.fmin(self.low, z), np.fmax(self.high, z), first)
 
     def without_refused(self, before: Scale, refused: IntArray) -> Scale:
-        """Return the value after a sample, that before it for sensors whose reading was refused.
+        """Return the ranges after a sample, unchanged from `before` for refused readings.
 
-        A wild reading would let any later prediction pass for one within the range.
+        An outlier in the range would hide any later runaway.
         """
         if not np.count_nonzero(refused):
             return self
@@ -315,19 +315,18 @@ class Scale:
         return Scale(*(np.where(refused, earlier, now) for earlier, now in pairs))
 
     def beyond(self, d: Array, noise: Array) -> Array:
-        """Return the largest innovation as a multiple of the largest range so far, or of the noise.
+        """Return the largest innovation over the largest range so far, shape (members,).
 
-        All ranges and innovations are in units of the noise of their sensor. The range is that of
-        the sensor that has varied most: the range of a sensor that a wave has not reached yet says
-        nothing about the size of the wave. Shape (members,).
+        Both are in units of the noise of their sensor, and the range is at least 1. It is the range
+        of the sensor that varied most, because a wave may not have reached the other sensors yet.
         """
-        # A sensor that has shown one value has no range yet: its first innovation stands in for it.
+        # The first innovation replaces the range of a sensor with a single reading.
         ranges = np.fmax(np.fmax(self.high - self.low, self.first), noise) / noise
         unseen = np.isnan(self.first) | np.isnan(self.low)
-        missed = np.fmax.reduce(np.where(unseen, np.nan, np.abs(d) / noise), axis=1)
+        worst = np.fmax.reduce(np.where(unseen, np.nan, np.abs(d) / noise), axis=1)
         largest = np.where(unseen, 0.0, ranges).max(axis=1)
-        # Without any reading there is nothing to miss, and a runaway must not be claimed.
-        return np.where(np.isnan(missed), 0.0, missed / np.where(largest > 0.0, largest, np.inf))
+        # Without readings there is no innovation, hence no runaway.
+        return np.where(np.isnan(worst), 0.0, worst / np.where(largest > 0.0, largest, np.inf))
 
 
 def stored(
@@ -339,7 +338,7 @@ def stored(
     anchored: Mask | None = None,
     **parts: Any,
 ) -> SensitivityState:
-    """Return a state with the filter after a sample, which the members `taken` took."""
+    """Return a state with the filter after a sample, stored for the members in `taken`."""
     if not work.keeps_log:
         return changed(state, now=now, **parts)
     log = added(state.log, span, taken, now.parts)
@@ -348,7 +347,7 @@ def stored(
         parts |= _set_aside(work, state, now, log, taken)
     if work.window:
         parts["assimilated"] = state.assimilated + (taken & span.present)
-    # After a pause the state is another one, too.
+    # A window ends at a pause, which changes the state as a disturbance does.
     pause = now.driven.pause
     begun = taken & (pause if anchored is None else pause | anchored)
     if work.tried and len(state) == 1:
@@ -362,15 +361,16 @@ def stored(
 def _set_aside(
     work: SensitivityWork, state: SensitivityState, now: FilterState, log: Array, taken: Mask
 ) -> dict[str, Any]:
-    """Return the fields that change with sensors set aside, which bring no measurements.
+    """Return the fields that change if the gate excludes sensors.
 
-    From the first one that misfitted on. A refit under way that has used one of them is dropped.
+    Their readings since the first refusal are removed from the log, and a refit in progress that
+    uses one of these readings is dropped.
     """
     kept = withdrawn(log, now.screened.aside & taken[:, None], now.screened.since)
     if kept is log:
         return {"log": log}
-    # A refit knows them no longer, but counts them, as refused ones: else a case would gain or lose
-    # evidence, by the unit of the sensor, where it uses fewer readings.
+    # A refit counts the removed readings as refused. Otherwise evidence would depend on the number
+    # of readings in use, and on the unit of the sensor.
     evidence = state.start.evidence + work.evidence_of_refused(log, kept, now.level)
     parts = {"log": kept, "start": changed(state.start, evidence=evidence)}
     row = int(state.fork.row[0]) + 1 if len(state.fork) else 0
@@ -383,8 +383,8 @@ def _points_of_return(
     work: SensitivityWork, state: SensitivityState, now: FilterState, taken: Mask, last: int
 ) -> dict[str, Any]:
     """Return the fields of the earlier filters after a sample in the `last` row of the log."""
-    # Two earlier filters suffice: every `back` samples the newer one becomes the older one, and the
-    # law can go back by at least `back` samples and less than twice as many.
+    # Two earlier filters suffice. Every `back` samples the newer filter becomes the older one, so
+    # that the law can go back by at least `back` and less than 2 `back` samples.
     if not work.back or last - state.since_newer.min() < work.back:
         return {}
     due = taken & (last - state.since_newer >= work.back)
@@ -401,11 +401,11 @@ def _points_of_return(
 def _trial(
     work: SensitivityWork, state: SensitivityState, now: FilterState, span: Span, *, disturbed: bool
 ) -> dict[str, Any]:
-    """Return the fields of the samples for trials of columns of one member, after one more.
+    """Return the fields of one member's samples for trials of columns, after another sample.
 
-    Where constant unknowns are fitted, the samples of the fit serve as well, unless a disturbance
-    comes that may be a wrong column: then the state after it is wrong, too. It is one if it comes
-    early, or where an input switches, which shows that it is late at its switches alone.
+    For constant unknowns, the samples of the fit also serve the trials. After a disturbance that a
+    wrong column may have caused, the state is wrong too, and separate samples are stored. That
+    cause is possible early in a run, and later if an input is held: its clock shows at switches.
     """
     before, start = state.trial, state.trial_start
     if not before.shape[1]:
@@ -417,7 +417,7 @@ def _trial(
             before, start = before[:, : work.tried], state.start
             if before.shape[1] == work.tried:
                 return {"trial": before, "trial_start": start}
-    if before.shape[1] >= work.tried or _reaches(before, span.t1):  # or it is taken again
+    if before.shape[1] >= work.tried or _reaches(before, span.t1):  # full, or a repeated sample
         return {}
     trial = added(before, span, np.ones(1, dtype=bool), now.parts)
     if not now.driven.pause[0]:
@@ -428,16 +428,16 @@ def _trial(
 
 
 def _reaches(log: Array, t: float) -> bool:
-    """Whether a log of one member has a row at a time, or later."""
+    """Return True if a log of one member has a row at time `t` or later."""
     return bool(log.shape[1]) and not log[0, -1, 0] < t
 
 
 def _windows_from(
     state: SensitivityState, now: FilterState, row: int, begun: Mask
 ) -> dict[str, Any]:
-    """Return the fields of windows that begin with a filter at a row, of some members.
+    """Return the fields if new windows begin with the filter at a row, for the members `begun`.
 
-    No trajectory of constant unknowns passes through a disturbance or a pause.
+    A trajectory of constant unknowns cannot follow a disturbance or a pause.
     """
     zero = np.zeros(len(begun), dtype=np.int64)
     return {
@@ -453,11 +453,11 @@ def _windows_from(
 
 
 def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
-    """Return a state without the rows of the log that nobody goes back to."""
+    """Return a state without the rows of the log that are no longer needed."""
     rows, least = state.log.shape[1], max(work.back, LEAST)
     if rows <= least:
         return state
-    # The first row that any member may still go back to; the numbers of rows move with it.
+    # The first row that any member may still go back to; row numbers are shifted by it.
     older = state.since_older if work.back else np.full(len(state), rows - 1)
     if older.min() < least:
         return state
@@ -475,18 +475,18 @@ def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityStat
     )
 
 
-def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> MemberReports:
+def reports_of(work: SensitivityWork, now: FilterState, outcome: Assimilation) -> MemberReports:
     """Return the reports of the members after a sample."""
     members = len(now)
-    diagnose = read_later(_diagnosed, work, kept_for_estimates(now), told.refused)
-    steps = np.full(members, told.steps)
-    return MemberReports((OK,) * members, told.predicted, steps, diagnose, now.parts)
+    diagnose = read_later(_diagnosed, work, kept_for_estimates(now), outcome.refused)
+    steps = np.full(members, outcome.steps)
+    return MemberReports((OK,) * members, outcome.predicted, steps, diagnose, now.parts)
 
 
 def _diagnosed(
     samples: Sequence[tuple[SensitivityWork, FilterState, Mask]],
 ) -> list[Diagnostics[Array]]:
-    """Return the diagnostics of each sample, from the filter after it and the readings refused."""
+    """Return the diagnostics of each sample, from the filter after it and the refused readings."""
     (work, *_), now = samples[0], joined([x for _, x, _ in samples])
     reduction, shadows = work.filter.reduction, work.filter.shadows
     found = replace(now.innovations.diagnostics, log_evidence=now.evidence)
@@ -511,28 +511,28 @@ def _diagnosed(
 def _with_refused(
     found: Diagnostics[Array], refused: Mask, sensors: Sequence[str]
 ) -> Diagnostics[Array]:
-    """Return diagnostics with the number of readings refused, and those sensors."""
-    some = np.flatnonzero(refused.any(axis=0)).tolist()
-    each = {refusal(sensors[i]): np.where(refused[:, i], 1.0, np.nan) for i in some}
+    """Return diagnostics with the number of refused readings, and a number for each sensor."""
+    which = np.flatnonzero(refused.any(axis=0)).tolist()
+    each = {refusal(sensors[i]): np.where(refused[:, i], 1.0, np.nan) for i in which}
     return replace(found, refused=refused.sum(axis=1).astype(float), extra={**found.extra, **each})
 
 
 def joined(states: Sequence[FilterState]) -> FilterState:
-    """Return the filters after several samples as members of one, as far as estimates need it."""
+    """Join filters after several samples as members of one, with the fields that estimates use."""
     names = ("member", "u", "q", "du", "da", "U", "C", "age", "level", "evidence", "innovations")
     shadows = join_fields([x.shadows for x in states], ("u", "a", "fine", "failed"))
     return changed(join_fields(states, names), shadows=shadows)
 
 
 def read_later(of: Any, work: SensitivityWork, x: FilterState, *more: Any) -> Later[Any]:
-    """Return a function of a filter after a sample, as `kept_for_estimates` returns it."""
-    # Large arrays gain nothing, and must not be in memory twice.
+    """Return a deferred call of `of` with a filter from `kept_for_estimates`."""
+    # Joining large arrays saves no time and would copy them.
     few = len(x) == 1 and x.U.size <= FEW
     return Later(of, (work, x, *more), (of, id(work), x.U.shape) if few else None)
 
 
 def kept_for_estimates(x: FilterState) -> FilterState:
-    """Return a filter state without the data that only its next steps and its verdict need."""
+    """Return a filter state without the data for its next steps and its verdict."""
     shadows = x.shadows.without_stages() if x.shadows.u.shape[1] else x.shadows
     none = x.causes[:, :, :0]
     return changed(x, kept=x.kept.forgotten(), shadows=shadows, causes=none, ledger=NO_LEDGER)
@@ -541,9 +541,9 @@ def kept_for_estimates(x: FilterState) -> FilterState:
 def new_window(
     work: SensitivityWork, start: FilterState, state: SensitivityState, row: int | None = None
 ) -> SensitivityState:
-    """Return one member whose window begins at a filter, with no samples yet.
+    """Return one member with a new window that begins at a filter and has no samples yet.
 
-    `row`: of the log, to which the filter belongs; later ones are forgotten. Default the last.
+    `row`: row of the log of this filter; later rows are dropped. Default the last row.
     """
     log = state.log if row is None else state.log[:, : row + 1]
     kept = work.kept_start(start)
@@ -567,12 +567,12 @@ def new_window(
 def restarted(
     work: SensitivityWork, start: FilterState, state: SensitivityState, row: int | None = None
 ) -> SensitivityState:
-    """Return one member that restarts at a filter, as `new_window`, and never goes back."""
+    """Return one member with a `new_window` that cannot go back beyond its start."""
     return without_past(new_window(work, start, state, row))
 
 
 def without_past(state: SensitivityState) -> SensitivityState:
-    """Return one member that goes back to now at most."""
+    """Return one member that cannot go back beyond the present."""
     last = np.array([state.log.shape[1] - 1])
     now = state.now
     return changed(state, older=now, newer=now, since_older=last, since_newer=last)
