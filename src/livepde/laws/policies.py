@@ -1,4 +1,4 @@
-"""Policies by which a filter goes back to earlier samples: refit, safeguards and jumps."""
+"""Policies that return a filter to earlier samples: refit, safeguards and jumps."""
 
 from __future__ import annotations
 
@@ -14,41 +14,42 @@ from livepde.laws.innovations import Innovations
 from livepde.linalg import Array, IntArray, Mask
 from livepde.linalg.member_arrays import where
 
-LARGEST = 3.0  # Huber's bound: of Gaussian innovations it cuts off 0.3 %, and 1 % of their variance
-CHANCE = 1e-2  # of so many repetitions in a row, below which a sensor seems stuck
+LARGEST = 3.0  # Huber's bound: it clips 0.3 % of Gaussian innovations, and 1 % of their variance
+CHANCE = 1e-2  # a sensor seems stuck if its repetitions in a row are less probable than this
 
 
 @dataclass(frozen=True)
 class Refit:
     """Fit the stored samples again: at the start of a run, at its end, and on demand.
 
-    An update leaves a second-order error that a state with long memory never forgets, and far from
-    the truth it may end anywhere. The refit is a search for the most probable constant unknowns
-    given all stored samples: Levenberg-Marquardt steps in a trust region, new starts where the end
-    does not explain the samples, and a second look at refused readings. See `livepde.laws.refit`.
+    Each update leaves a linearisation error, which a state with long memory never forgets. Far from
+    the truth, it may lead to a wrong estimate. The refit finds the most probable constant unknowns
+    given all stored samples. It takes Levenberg-Marquardt steps in a trust region, starts again
+    where the solution does not explain the samples, and reconsiders refused readings. See
+    `livepde.laws.refit`.
 
-    The samples are fitted each time their number has doubled, so that most of the search is over
-    while they are few. Such a call of `step` takes longer than others. Where it must not, as in a
-    control loop or a live run, `apart` fits them in a thread of its own.
+    The samples are fitted each time their number has doubled, so that most of the search uses few
+    samples. Such a call of `step` takes longer than others. If a delay is not acceptable, for
+    example in a control loop or a live run, `apart` runs the fit in a separate thread.
 
-    Unknowns that move, noisy inputs and a fading memory have no such fit: there the samples of the
-    start are smoothed again, as `livepde.laws.iterated_smoother` does.
+    This fit is not possible with moving unknowns, noisy inputs or a fading memory. The first
+    samples are then smoothed repeatedly (`livepde.laws.iterated_smoother`).
 
     Parameters
     ----------
     start
-        Up to this many samples are taken again at each doubling; 64 at most of unknowns that move.
+        Up to this many samples are fitted at each doubling; at most 64 if unknowns move.
     window
-        At most this many samples are stored. When it is full, the estimate of that moment becomes
+        At most this many samples are stored. When the window is full, the present estimate becomes
         the prior of the next window.
     passes
-        A search that takes more passes over the samples has not converged.
+        Largest number of passes over the samples for a search; beyond it, there is no convergence.
     apart
-        True: a fit of more than 64 samples runs in a thread, while samples continue. An eighth more
-        samples later the filter goes over to it; then each call of `step` takes three of the
-        samples in between, until all are taken. The numbers do not depend on the time that the fit
-        takes: a call waits for it where it is due and not there yet. Members of a fleet are fitted
-        at once. None: in runs of a case that wait for their source.
+        True: a fit of more than 64 samples runs in a thread, while samples continue. After an
+        eighth more samples the filter switches to its result. Each call of `step` then assimilates
+        three of the samples since, until the filter has caught up. Results do not depend on the
+        computing time: a call waits for an unfinished fit that is due. Members of a fleet are
+        fitted at once. None: True in runs of a case that wait for their source.
 
     Examples
     --------
@@ -60,7 +61,7 @@ class Refit:
     start: int = 4096
     window: int = 4096
     passes: int = 40
-    # It moves when a fit is used, not what the run is of.
+    # A run may resume with another value, which only changes when a fit is used.
     apart: bool | None = field(default=None, metadata={"begins_anew": True})
 
     def __post_init__(self) -> None:
@@ -72,35 +73,34 @@ class Refit:
 
 @dataclass(frozen=True)
 class Guards:
-    """Safeguards of `SensitivityLaw` against failure of its assumptions; inert while they hold.
+    """Safeguards of `SensitivityLaw` against failure of its assumptions; inactive while they hold.
 
-    *Overconfident linearisation.* A sample that moves an unknown by more than `reach` prior
-    standard deviations, and by more than half a posterior standard deviation, is assimilated by
-    Gauss-Newton steps over its interval, each at most one prior standard deviation long, until
-    reference and estimate agree within half a posterior standard deviation. Where the steps do not
-    converge, the sample is taken again with ten times its noise, and so on; after `temperings` such
-    attempts it is not used. Notes: "iterated", "tempered", "held".
+    *Overconfident linearisation.* Some samples move an unknown by more than `reach` prior standard
+    deviations, and by more than half a posterior standard deviation. Such a sample is assimilated
+    by Gauss-Newton steps over its interval, each at most one prior standard deviation long, until
+    reference and estimate agree within half a posterior standard deviation. If the steps do not
+    converge, the sample is tried again up to `temperings` times, each time with ten times the
+    noise, and then not used. Notes: "iterated", "tempered", "held".
 
-    *Runaway.* A step fails, or a prediction misses the data by more than `runaway` times the
-    largest range that any sensor has ever shown (each in units of its noise). The law then goes
-    back to before the last samples, inflates the covariance there by one prior standard deviation,
-    and propagates the state without those samples; if that fails as well, it starts again from the
-    prior. Note: "restarted". If nothing helps, a failed step is reported as such and changes
-    nothing; "runaway" notes a prediction that still misses the data.
+    *Runaway.* A step fails, or an innovation exceeds `runaway` times the largest range of any
+    sensor so far (both in units of the noise). The law then returns to a state before the last
+    samples, inflates its covariance by one prior standard deviation, and propagates it without
+    those samples. If that fails too, it starts from the prior. Note: "restarted". If both fail, a
+    failed step is reported and changes nothing, and "runaway" notes a large innovation.
 
     Parameters
     ----------
     reach
         Largest move of an unknown by one sample without iteration, in prior standard deviations.
     iterations
-        At most this many Gauss-Newton steps for a sample.
+        Largest number of Gauss-Newton steps for a sample.
     temperings
-        How often a sample whose steps do not converge is taken again with ten times its noise.
+        Number of further attempts, each with ten times the noise, if the steps do not converge.
     runaway
         Smallest innovation of a runaway, as a multiple of the largest range of the sensors.
     past
-        A restart goes back by this many samples at least, if there are so many, and by less than
-        twice as many.
+        A restart goes back by at least this many samples, if available, and less than twice as
+        many.
     """
 
     reach: float = 1.0
@@ -122,7 +122,7 @@ class Guards:
     def within_reach(self, change: Array) -> Mask:
         """Return which members a sample moves by at most `reach`, shape (members,).
 
-        `change` is that of the reduced unknowns, in prior standard deviations, (members, k).
+        `change`: change of the reduced unknowns, in prior standard deviations, (members, k).
         """
         return np.asarray(np.abs(change).max(axis=1, initial=0.0) <= self.reach)
 
@@ -131,34 +131,34 @@ class Guards:
 class Watch:
     """Innovations of the last samples of each member."""
 
-    # Sum of e^2 and number of innovations e of each of the last samples, newest first, shapes
+    # Sum of e^2 and number of innovations e in each of the last samples, newest first, shapes
     # (members, samples).
     squares: Array
     counts: Array
-    # Samples since the start, and samples that are not looked at yet, shape (members,).
+    # Samples since the start, and samples until the test resumes, shape (members,).
     seen: IntArray
     resting: IntArray
-    # Statistics of the innovations, with which new ones are compared: none counts for more than
-    # `LARGEST` times the usual size, so that a jump hardly changes its own yardstick.
+    # Reference statistics of the innovations. An innovation is clipped to `LARGEST` times the usual
+    # size, so that a jump barely changes its own reference.
     usual: Innovations
     # Usual scatter before each of the last samples, newest first, shape (members, samples).
     scatters: Array
-    # Readings that repeated the one before, of sensors that did not seem stuck; and which sensors
-    # seemed stuck at the last sample, (members, sensors).
+    # Number of repeated readings of a sensor while it did not seem stuck, and whether it seemed
+    # stuck at the last sample, shapes (members, sensors).
     repeats: IntArray
     stuck: Mask
 
     def repeating(self, run: IntArray) -> Mask:
-        """Return which sensors seem stuck; their readings are not evidence of a jump.
+        """Return which sensors seem stuck, so that their readings are no evidence of a jump.
 
-        `run`: how often in a row each reading has been repeated, (members, sensors). A sensor of a
-        coarse resolution repeats its readings often.
+        `run`: number of repetitions of each reading in a row, (members, sensors). The test allows
+        for sensors of coarse resolution, which often repeat their readings.
         """
         usual = (self.repeats + 1.0) / (self.seen[:, None] + 2.0)
         return np.asarray(run * np.log(usual) < np.log(CHANCE))
 
     def interrupted(self, which: Mask, rest: int) -> Watch:
-        """Return the value in which some members forget their sums, and rest for some samples."""
+        """Return the watch with cleared sums and at least `rest` samples of rest for members."""
         rows = which[:, None]
         return replace(
             self,
@@ -168,12 +168,12 @@ class Watch:
         )
 
     def add(self, e: Array, opening: Mask, refused: IntArray | None = None) -> Watch:
-        """Return the value after normalised innovations (members, sensors), NaN where missing.
+        """Return the watch after normalised innovations (members, sensors), NaN where missing.
 
-        `opening`: members that still have to find the usual size, shape (members,): there any
-        innovation counts, while those after an alarm, which learn anew, are left out. `refused`:
-        how many values in a row of each sensor a gate has refused, (members, sensors); None: it
-        refuses none. They may be wild, and do not count for the usual size before it is found.
+        `opening`: members whose usual size is not established yet, shape (members,). All their
+        innovations count for it, except refused ones, which may be outliers. For other members, it
+        ignores the samples of rest after an alarm. `refused`: number of refusals in a row by a
+        gate, (members, sensors); None: no refusals.
         """
         seen = np.isfinite(e)
         square = (np.where(seen, e, 0.0) ** 2).sum(axis=1)
@@ -198,33 +198,33 @@ class Watch:
 
 @dataclass(frozen=True)
 class Jumps:
-    """Watch for sudden changes of the unknowns, and let them move when there is one.
+    """Test for sudden changes of the unknowns, and allow the unknowns to change after an alarm.
 
-    The innovations of the last 1, 2, 4, ... samples, normalised by their expected standard
-    deviation and by their usual size and correlation, are compared with the chi-square
-    distribution. After an alarm the law goes back to where the innovations most likely became too
-    large, adds `size` prior standard deviations to the uncertainty of the unknowns that may jump,
-    and takes the samples since again: so it learns anew without a restart, and keeps the estimates
-    of the state and of the other unknowns from before the jump.
+    A chi-square test is applied to the innovations of the last 1, 2, 4, ... samples, normalised by
+    their expected standard deviation and by their usual size and correlation. After an alarm the
+    law returns to the most likely time of the change, adds `size` prior standard deviations to the
+    uncertainty of the unknowns that may jump, and assimilates the samples since. The state and the
+    other unknowns keep their estimates from before the jump.
 
-    The usual size and correlation are those of the last 500 samples that were looked at, with the
-    first `settle`; after these none counts for more than three times the usual size. So a jump
-    hardly changes the yardstick of the next one. Samples are compared with the usual size before
-    them, so that a jump that shows slowly is not compared with itself.
+    The usual size and correlation are averages over about 500 samples, including the first `settle`
+    samples but not the samples of rest after an alarm. After the first `settle` samples,
+    innovations are clipped to three times the usual size, so that a jump barely changes the
+    reference. A sample is compared with the usual size before it, so that a slow jump is not
+    compared with itself.
 
     Parameters
     ----------
     probability
-        Of a false alarm, in each sample.
+        Probability of a false alarm in each sample.
     window
-        Longest number of samples, a power of two.
+        Largest number of samples in a test, a power of two.
     size
-        Standard deviation that an alarm adds to the unknowns, as a multiple of that of the prior.
+        Standard deviation that an alarm adds to the unknowns, in prior standard deviations.
     settle
-        So many samples after the start, and after an alarm, are not looked at.
+        Number of samples without a test after the start and after an alarm.
     unknowns
-        Names of the unknowns that may jump; default all. A material constant that is not among them
-        keeps its estimate and its covariance.
+        Names of the unknowns that may jump; default all. Other unknowns, such as material
+        constants, keep their estimate and covariance.
 
     Examples
     --------
@@ -259,7 +259,7 @@ class Jumps:
 
     @cached_property
     def _lengths(self) -> IntArray:
-        """Numbers of samples that are looked at, less one."""
+        """Numbers of samples in the tests, minus 1."""
         return 2 ** np.arange(int(np.log2(self.window)) + 1) - 1
 
     def start(self, sensors: int, members: int = 1) -> Watch:
@@ -276,23 +276,23 @@ class Jumps:
         run: IntArray | None = None,
         unread: Mask | None = None,
     ) -> tuple[Watch, Mask]:
-        """Return the value after a sample, and for which members there is an alarm.
+        """Return the watch after a sample, and the members with an alarm.
 
         `e`: normalised innovations, shape (members, sensors), NaN where missing. `refused`, `run`:
         as for `Watch.add` and `Watch.repeating`. `unread`: members with an input that was not read,
-        (members,): what it did is no jump of an unknown, and moves the state for some time.
+        (members,). Its effect on the state lasts, and is not a jump of an unknown.
         """
         if unread is not None:
             watch, e = watch.interrupted(unread, self.settle), np.where(unread[:, None], np.nan, e)
         if run is not None and np.count_nonzero(run) + np.count_nonzero(watch.stuck):
             stuck = watch.repeating(run)
-            # The sums contain the first reading of the repeated value, and are cleared.
+            # Clear the sums, which contain the first reading of the repeated value.
             begins = np.asarray((stuck & ~watch.stuck).any(axis=1))
             repeats = watch.repeats + ((run > 0) & ~stuck)
             watch = replace(watch.interrupted(begins, 0), repeats=repeats, stuck=stuck)
             e = np.where(stuck, np.nan, e)
         new = watch.add(e, watch.seen < self.settle, refused)
-        early = watch.resting > 0  # the first linearisations are poor: what they miss is no jump
+        early = watch.resting > 0  # large innovations may be due to a poor first linearisation
         if early.any():
             kept = early[:, None]
             squares = np.where(kept, watch.squares, new.squares)
@@ -305,16 +305,15 @@ class Jumps:
         freedom = np.cumsum(new.counts, axis=1)[:, lengths]
 
         def unlikely(sums: Array) -> Mask:
-            # Survival function of the chi-square distribution: the chance of so large a sum.
-            with np.errstate(invalid="ignore"):  # no freedom, no chance
+            # Survival function of the chi-square distribution at the sums.
+            with np.errstate(invalid="ignore"):  # NaN without degrees of freedom
                 chance = scipy.special.gammaincc(0.5 * freedom, 0.5 * sums)
             chance = np.where(freedom > 0.0, chance, 1.0).min(axis=1)
-            # The least chance of several tests: by Bonferroni's factor all of them together raise
-            # false alarms at the stated rate.
+            # With Bonferroni's factor, all tests together raise false alarms at the stated rate.
             return np.asarray(chance * len(lengths) < self.probability)
 
-        # The usual scatter, which takes longer to find, is at least 1: what is likely without it is
-        # with it, too.
+        # The usual scatter is at least 1, so that it cannot add alarms. It takes longer to compute,
+        # and is only needed after an alarm without it.
         alarm = unlikely(sums)
         if alarm.any():
             alarm = unlikely(sums / new.scatters[:, lengths] ** 2)
@@ -324,14 +323,14 @@ class Jumps:
         return new, alarm
 
     def onset(self, watch: Watch, e: Array) -> int:
-        """Return of how many samples, up to this one, innovations are most likely too large.
+        """Return the most likely number of samples since a jump, including this sample.
 
-        The number n that maximises the likelihood ratio n (r - 1 - log r)/2 of innovations of mean
-        square r > 1 since n samples against 1. Parameters as for `add`, of one member.
+        It is the number n that maximises the log-likelihood ratio n (r - 1 - log r)/2 of
+        innovations with mean square r > 1 against 1. Parameters as for `add`, for one member.
         """
         new = watch.add(e, watch.seen < self.settle)
         freedom = np.cumsum(new.counts[0])
-        # One yardstick for all n, from before all of them: ratios by several are not comparable.
+        # Ratios are comparable only with one reference size for all n, from before all samples.
         size = new.scatters[0, -1] ** 2 * np.maximum(freedom, 1.0)
         ratio = np.maximum(np.cumsum(new.squares[0]) / size, 1.0)
         return 1 + int(np.argmax(freedom * (ratio - 1.0 - np.log(ratio))))
