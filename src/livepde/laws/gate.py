@@ -1,9 +1,9 @@
-"""The gate: which readings are used, which sensors are excluded, and when they return.
+"""The gate: selection of readings, exclusion of sensors, and their return.
 
-Laws without a covariance cannot weigh an innovation: `ReadingRange` leaves out wild values, such as
-9999, far outside all that has been measured. If the readings of the sensor stay there, the process
-has moved. A fit of stored samples, which knows the readings before and after each, leaves out those
-that are far from their neighbours.
+Laws without a covariance cannot test an innovation. For them, `ReadingRange` removes outliers such
+as 9999, far outside the range of all earlier readings, unless the readings of the sensor stay
+there. A fit of stored samples has the readings before and after each reading, and removes readings
+far from their neighbours in time.
 """
 
 from __future__ import annotations
@@ -19,42 +19,40 @@ from livepde.linalg import Array, IntArray, Mask
 from livepde.linalg.member_arrays import changed
 from livepde.stepping import Interval
 
-MOVED = 20.0  # standard deviations of the noise: a smaller range does not show the process's size
-LASTING = 100  # readings that misfit, after which constants have to explain them as well
-CALM = 50  # samples without a correction of the state, after which a disturbance is over
-SETTLED = 20  # readings used, before which a lasting misfit may come from a poor start
-ABSURD = 10.0  # ranges outside of the past, as the runaway of `Guards`
-PATIENCE = 3  # wild readings in a row, after which the process has moved
-NEIGHBOURS = 3  # in time, to each side of a value
-FEW = 2 * NEIGHBOURS  # values of a sensor up to which all count as near
-NORMAL = 1.4826  # standard deviation of normal values over the median of their sizes
+MOVED = 20.0  # standard deviations of the noise: least range that shows the scale of the process
+LASTING = 100  # misfitting readings after which a disturbance must be explained by the constants
+CALM = 50  # samples without a correction of the state alone, after which a disturbance is over
+SETTLED = 20  # used readings after which a lasting misfit is not due to a poor start
+ABSURD = 10.0  # ranges outside the range so far, as for the runaway of `Guards`
+PATIENCE = 3  # outliers in a row, after which they count as a change of the process
+NEIGHBOURS = 3  # neighbours in time on each side of a value
+FEW = 2 * NEIGHBOURS  # largest number of values of a sensor for which all count as near
+NORMAL = 1.4826  # standard deviation of a normal variable over the median of its absolute value
 
 
 @dataclass(frozen=True, eq=False)
 class Screened:
     """Memory of the gate, by sensor; arrays have the shape (members, sensors)."""
 
-    # Refusals in a row, and how many of these readings differed from the one before.
+    # Misfitting readings in a row, and how many of them differed from the reading before.
     refused: IntArray
     changes: IntArray
-    fits: IntArray  # readings in a row that fit, of a sensor of which too many did not
-    taken: IntArray  # readings that were used, at most `SETTLED`
-    aside: Mask  # sensors that are set aside
-    apart: Mask  # sensors that are believed, and correct the state but not the unknowns
-    # Time of the first refusal in a row, and the last innovation; NaN without a refusal.
+    fits: IntArray  # fitting readings in a row of a sensor that is `aside` or `apart`
+    taken: IntArray  # number of readings used, at most `SETTLED`
+    aside: Mask  # excluded sensors
+    apart: Mask  # sensors that correct the state but not the unknowns
+    # Time of the first misfit in a row, and last misfitting innovation; NaN without a misfit.
     since: Array
     off: Array
-    # Range of the readings that were used; NaN before.
+    # Range of the readings used; NaN before the first.
     low: Array
     high: Array
-    # The last reading, how often it has been repeated, and the longest repetition of a reading that
-    # was used.
+    # Last reading, number of its repetitions, and largest number of repetitions of a reading used.
     last: Array
     run: IntArray
     longest: IntArray
-    # Readings that misfit while they corrected the state, since a disturbance began.
-    strain: IntArray
-    # Samples of a disturbance since a sensor was `apart`, at most `CALM`, shape (members,).
+    strain: IntArray  # misfitting readings of sensors `apart` since the start of a disturbance
+    # Samples of a disturbance since a sensor was last `apart`, at most `CALM`, shape (members,).
     calm: IntArray
 
     @classmethod
@@ -67,12 +65,12 @@ class Screened:
         return cls(calm=np.full(members, CALM), **same)
 
     def fitted(self, z: Array, present: Mask) -> Screened:
-        """Return the value after a sample that all fit, of members that refuse nothing."""
+        """Return the memory after a sample without misfit, for members without refusals."""
         last, run, _ = self.shown(z, present)
         return changed(self, last=last, run=run, **self._used(z, run, present, present))
 
     def shown(self, z: Array, present: Mask) -> tuple[Array, IntArray, Mask]:
-        """Return the last reading and its repetitions after a sample, and which ones it repeats."""
+        """Return the last reading, its repetitions, and a mask of repetitions, after a sample."""
         same: Mask = present & (z == self.last)
         repeats = np.count_nonzero(same) or np.count_nonzero(self.run)
         run = np.where(same, self.run + 1, 0) if repeats else self.run
@@ -81,15 +79,15 @@ class Screened:
         return np.where(present, z, self.last), np.where(present, run, self.run), same
 
     def used(self, z: Array, kept: Mask, learned: Mask) -> Screened:
-        """Return the value with the readings that are used in the past of their sensors."""
+        """Return the memory with `kept` readings in the ranges and `learned` ones in the count."""
         return changed(self, **self._used(z, self.run, kept, learned))
 
     def _used(self, z: Array, run: IntArray, kept: Mask, learned: Mask) -> dict[str, Any]:
-        """Return the fields that readings change which are used; `run` is that after them."""
+        """Return the fields that used readings change; `run`: repetitions after the sample."""
         if np.count_nonzero(kept) < kept.size:
             z = np.where(kept, z, np.nan)
         parts: dict[str, Any] = {"low": np.fmin(self.low, z), "high": np.fmax(self.high, z)}
-        # Most samples repeat nothing, come after the first ones, and in no disturbance.
+        # The conditions save time: most samples repeat nothing and are not part of a disturbance.
         if np.count_nonzero(run):
             parts["longest"] = np.maximum(self.longest, np.where(kept, run, 0))
         if self.taken.min() < SETTLED:
@@ -103,7 +101,7 @@ class Screened:
 class Gated(NamedTuple):
     """Outcome of the gate for a sample, each of shape (members, sensors)."""
 
-    kept: Mask  # readings that are used
+    kept: Mask  # readings that correct state and unknowns
     anchored: Mask  # readings that correct the state alone
     counted: Mask  # readings that count in the test for jumps
     state: Screened  # memory of the gate
@@ -111,20 +109,20 @@ class Gated(NamedTuple):
 
 @dataclass(frozen=True)
 class Gate:
-    """Refuses readings that do not fit, and interprets a lasting misfit.
+    """Refuse readings that do not fit, and interpret a lasting misfit.
 
     A reading fits if its innovation is at most `beyond` expected standard deviations. After
-    `patience` refusals in a row the sensor is believed if its readings are plausible and most of
-    the sensors that can be believed misfit as well: then the process has changed. Else the sensor
-    is set aside, until `patience` readings in a row fit again.
+    `patience` refusals in a row, the readings of a sensor are accepted if they are plausible and
+    most sensors with plausible readings misfit too: then the process has changed. Otherwise the
+    sensor is excluded, until `patience` readings in a row fit.
 
-    If `anchors`, believed readings correct the state alone until `patience` of them in a row fit,
-    or `LASTING` did not: a disturbance that passes says nothing on constants of the model. Sensors
-    that were never used much are believed at once, because a poor start misfits as well.
+    With `anchors`, accepted readings correct the state alone, until `patience` of them in a row fit
+    or more than `LASTING` do not: a passing disturbance has no information about constants. Sensors
+    with fewer than `SETTLED` used readings also correct the unknowns: their start may be poor.
 
-    Readings are implausible if they repeat a value more often than the sensor ever did, if they
-    repeat a value outside its past range by more than the largest range of all sensors, or if they
-    lie outside by ten times that. The range counts once it shows how far the process moves.
+    Readings are implausible if they repeat a value more often than any earlier reading, if they
+    repeat a value outside the earlier range by more than the largest range of all sensors, or if
+    they exceed it by ten times that range. Ranges below `MOVED` times the noise are ignored.
     """
 
     beyond: float = math.inf
@@ -142,17 +140,17 @@ class Gate:
         t: float,
         pause: Mask,
     ) -> Gated:
-        """Return the used part of a sample at time t.
+        """Return the decision on a sample at time t, and the memory after it.
 
         `z`, `d`, `noise`: readings, innovations and their noise, shapes (members, sensors). `far`,
-        `used`: readings that do not fit, and those that are present. `pause`: members for which the
+        `used`: masks of misfitting readings and of present readings. `pause`: members for which the
         sample follows a pause, shape (members,).
         """
         last, run, same = x.shown(z, used)
         outside, absurd = self._out_of_range(x, z, noise)
         stuck = run > x.longest
         implausible = absurd | (outside & (run > 0)) | stuck
-        # A constant that the prediction crosses fits by chance.
+        # A stuck sensor fits by chance while the prediction crosses its value.
         misfit = far | (used & same & stuck & (x.refused > 0))
         waiting = x.aside | x.apart
         over = used & ~misfit & ~waiting
@@ -162,7 +160,7 @@ class Gate:
         voters = used & ~implausible
         most = 2 * (voters & misfit).sum(axis=1) > voters.sum(axis=1)
         together = most[:, None] & voters
-        # What misfits after a pause shows that the state is wrong.
+        # A misfit after a pause shows that the state is wrong.
         sudden = misfit & together & pause[:, None] & (x.taken >= SETTLED) & self.anchors
         refused = np.where(sudden, np.maximum(refused, self.patience + 1), refused)
         late, first = misfit & (refused > self.patience), x.refused == self.patience
@@ -179,7 +177,7 @@ class Gate:
         apart = apart & ~lasting
         state = changed(
             x,
-            # Constants that have to explain what lasts begin again with a poor fit.
+            # Constants that must explain a lasting misfit start again with a poor fit.
             taken=np.where(lasting, -LASTING, x.taken),
             refused=refused,
             changes=changes,
@@ -192,16 +190,16 @@ class Gate:
             last=last,
             run=run,
         )
-        # One value alone is no change of the process; a second one in a row may be.
+        # A single misfit does not count as a change of the process; a second in a row may.
         anchored = kept & apart.any(axis=1)[:, None]
         learned = kept & ~anchored
         return Gated(learned, anchored, learned | again, state.used(z, kept, learned))
 
     @staticmethod
     def _out_of_range(x: Screened, z: Array, noise: Array) -> tuple[Mask, Mask]:
-        """Return which readings lie outside their past by more than one range, and by ten."""
+        """Return which readings are outside the earlier range by more than 1 and 10 ranges."""
         ranges, beyond = (x.high - x.low) / noise, np.fmax(x.low - z, z - x.high) / noise
-        # That of the sensor that has varied most: others may lie where little has happened yet.
+        # The sensor that varied most sets the scale: others may not have been affected yet.
         span = np.fmax.reduce(ranges, axis=1, initial=0.0)[:, None]
         moved = span > MOVED
         return moved & (beyond > span), moved & (beyond > ABSURD * span)
@@ -211,11 +209,11 @@ class Gate:
 class ReadingRange:
     """Range of the readings of each sensor, shapes (sensors,)."""
 
-    # Range of the readings that were used; NaN before any.
+    # Range of the readings used; NaN before the first.
     low: Array
     high: Array
-    count: IntArray  # number of readings that were used, at most `SETTLED`
-    wild: IntArray  # wild readings in a row; of a sensor whose last reading was used 0
+    count: IntArray  # number of readings used, at most `SETTLED`
+    wild: IntArray  # outliers in a row; 0 if the last reading was used
 
     @classmethod
     def start(cls, sensors: int) -> ReadingRange:
@@ -223,7 +221,7 @@ class ReadingRange:
         return cls(low=never, high=never, count=none, wild=none)
 
     def screened(self, interval: Interval, noise: Array | None) -> tuple[Interval, ReadingRange]:
-        """Return an interval without wild readings at both ends, and the value after it."""
+        """Return an interval without outliers at both ends, and the ranges after it."""
         z = interval.z1
         wild = self._wild(z, 0.0 if noise is None else MOVED * noise)
         before = self.wild > 0
@@ -243,12 +241,12 @@ class ReadingRange:
         return replace(interval, z0=z0, z1=used), after
 
     def _wild(self, z: Array, least: float | Array) -> Mask:
-        """Return which readings are far outside their past and that of the other sensors."""
+        """Return which readings are far outside the earlier range, on the scale of all sensors."""
         known = self.count >= SETTLED
         none: Mask = np.zeros(len(z), dtype=bool)
         if not known.any():
             return none
-        # A process that begins to move is seen by one sensor first: the scale is that of all.
+        # A change of the process reaches one sensor first, so that all sensors set the scale.
         scale = np.maximum(np.nanmax(self.high) - np.nanmin(self.low), least)
         with np.errstate(invalid="ignore"):
             far: Mask = (z > self.high + ABSURD * scale) | (z < self.low - ABSURD * scale)
@@ -256,15 +254,15 @@ class ReadingRange:
 
 
 def usual_size(values: Array) -> float:
-    """Return the standard deviation by the median of the sizes of values, at least 1."""
+    """Return a robust standard deviation from the median of absolute values, at least 1."""
     return max(1.0, NORMAL * float(np.median(np.abs(values)))) if len(values) else 1.0
 
 
 def near_neighbours(values: Array, limit: float) -> Mask:
-    """Return which values lie within `limit` usual distances from the median of their neighbours.
+    """Return which values are within `limit` usual distances from the median of their neighbours.
 
-    A model error, which changes slowly, stays. Values that are near tell about the others: among
-    several wild ones in a row the neighbours of one are no measure.
+    Slow changes, such as a model error, pass. Values that fail a first test are compared with
+    neighbours that pass it, because the neighbours of an outlier may be outliers too.
     """
     first = _near(values, limit, _of_neighbours)
     near = first.copy()
@@ -284,15 +282,15 @@ def near_neighbours(values: Array, limit: float) -> Mask:
 
 
 def near_most(values: Array, limit: float) -> Mask:
-    """Return which values lie within `limit` usual distances from the median of all of a sensor.
+    """Return which values are within `limit` usual distances from the median of their sensor.
 
-    A sensor that shows a wrong constant for some time has neighbours that agree with it.
+    This detects a constant wrong value, whose neighbours in time agree with it.
     """
     return _near(values, limit, np.median)
 
 
 def _near(values: Array, limit: float, centre: Callable[[Array], Array]) -> Mask:
-    """Return which values lie within `limit` usual distances from the centre of their sensor."""
+    """Return which values are within `limit` usual distances from the centre of their sensor."""
     near = np.isfinite(values)
     for k, column in enumerate(values.T):
         (places,) = near[:, k].nonzero()
@@ -303,7 +301,7 @@ def _near(values: Array, limit: float, centre: Callable[[Array], Array]) -> Mask
 
 
 def _of_neighbours(values: Array) -> Array:
-    """Return the median of the neighbours of each value, itself left out, shape (count,)."""
+    """Return the median of the neighbours of each value, without the value, shape (count,)."""
     count, reach = len(values), NEIGHBOURS
     windows = np.lib.stride_tricks.sliding_window_view(values, 2 * reach + 1)
     inner = np.median(np.delete(windows, reach, axis=1), axis=1)

@@ -1,9 +1,9 @@
-"""The samples since a law may have to begin again, of all members: a log that only grows.
+"""Log of the samples of all members to which a law may return; rows are only appended.
 
-A log has the shape (members, rows, 2 + 2 sensors + 2 channels): time, measurements, their noise
-(NaN: that of the sensor), inputs, for how long each input has been held without a reading, and in
-how many parts the substeps since the row before were divided.
-LogRows of a member that did not take a sample have the time NaN.
+A log has the shape (members, rows, 2 + 2 sensors + 2 channels). Its columns are: time; readings;
+their noise (NaN: noise of the sensor); inputs; time for which each input has been held without a
+reading; number of parts into which the substeps since the row before were divided. The time is NaN
+in a row of a member that did not assimilate the sample.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from livepde.fem import Inputs
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import End, Interval, Span, gaps_of, own_noise
 
-SPARE = np.inf  # time of rows that are not in use
-ROWS = 64  # least room of a log
+SPARE = np.inf  # time of unused rows of a buffer
+ROWS = 64  # least number of rows of a buffer
 
 
 def empty_log(sensors: int, channels: int) -> Array:
@@ -28,14 +28,14 @@ def empty_log(sensors: int, channels: int) -> Array:
 
 
 def _inputs(log: Array, sensors: int) -> tuple[slice, slice]:
-    """Return the columns of the inputs of a log, and of how long they have been held."""
+    """Return the columns of the inputs of a log, and of the times for which they were held."""
     first = 1 + 2 * sensors
     middle = first + (log.shape[2] - 1 - first) // 2
     return slice(first, middle), slice(middle, -1)
 
 
 def opened(log: Array, span: Span) -> Array:
-    """Return a log that begins at the start of a span, unless it has begun."""
+    """Return a log with a row for the start of a span, unless it has rows."""
     if log.shape[1]:
         return log
     begun = _extended(log)
@@ -43,14 +43,14 @@ def opened(log: Array, span: Span) -> Array:
     row[:] = np.nan
     row[:, 0] = span.t0
     inputs, held = _inputs(log, sensors)
-    # Validation sensors of a fleet may read more channels, which come last.
+    # Validation sensors of a fleet may use additional channels, which come last.
     row[:, inputs] = span.inputs0[:, : inputs.stop - inputs.start]
     row[:, held], row[:, -1] = 0.0, 1.0
     return begun
 
 
 def added(log: Array, span: Span, taken: Mask, parts: IntArray) -> Array:
-    """Return a log with the sample at the end of a span, of those members that took it."""
+    """Return a log with a row for the sample at the end of a span, for the members `taken`."""
     longer = _extended(log)
     row, sensors = longer[:, -1], span.z1.shape[1]
     row[:, 0] = span.t1
@@ -69,15 +69,15 @@ def added(log: Array, span: Span, taken: Mask, parts: IntArray) -> Array:
 
 
 def skipped(log: Array) -> Array:
-    """Return a log with a sample that nobody took."""
+    """Return a log with an empty row, for a sample that no member assimilated."""
     longer = _extended(log)
     longer[:, -1] = np.nan
     return longer
 
 
 def _extended(log: Array) -> Array:
-    """Return a log with one more row, to be written at once: in a shared buffer, or a copy."""
-    # A time that is not SPARE shows that another log with the same first rows has written here.
+    """Return a log with an additional row in a shared buffer or a copy; write the row at once."""
+    # A time other than SPARE shows that another log with the same first rows uses the next row.
     rows, buffer = log.shape[1], log.base
     if (
         not isinstance(buffer, np.ndarray)
@@ -92,29 +92,29 @@ def _extended(log: Array) -> Array:
 
 
 def withdrawn(log: Array, sensors: Mask, since: Array) -> Array:
-    """Return a log without the readings of some sensors since a time."""
-    gone = sensors[:, None] & (log[:, :, :1] >= since[:, None])
+    """Return a log without the readings of given sensors since given times."""
+    removed = sensors[:, None] & (log[:, :, :1] >= since[:, None])
     readings = log[:, :, 1 : 1 + sensors.shape[1]]
-    if np.isnan(readings[gone]).all():
+    if np.isnan(readings[removed]).all():
         return log
-    found = log.copy()
-    found[:, :, 1 : 1 + sensors.shape[1]][gone] = np.nan
-    return found
+    copy = log.copy()
+    copy[:, :, 1 : 1 + sensors.shape[1]][removed] = np.nan
+    return copy
 
 
 def trimmed(log: Array, first: int) -> Array:
-    """Return a log from a row on."""
+    """Return a copy of a log that begins at row `first`."""
     return log[:, first:].copy()
 
 
 class LogRows(NamedTuple):
-    """The rows of one member that have a time, as arrays with the rows as first axis."""
+    """Rows of one member that have a time, as arrays whose first axis is the rows."""
 
     times: Array
     readings: Array
-    noise: Array  # NaN: that of the sensor
+    noise: Array  # NaN: noise of the sensor
     inputs: Array
-    held: Array  # for how long each input has been held without a reading
+    held: Array  # time for which each input has been held without a reading
     parts: IntArray
 
     @classmethod
@@ -133,21 +133,21 @@ class LogRows(NamedTuple):
 
 def _rows(log: Array, channels: tuple[str, ...]) -> list[End]:
     rows = LogRows.of(log, (log.shape[2] - 2 - 2 * len(channels)) // 2)
-    found, before = list[End](), [0.0] * len(channels)
+    ends, before = list[End](), [0.0] * len(channels)
     for t, z, noise, inputs, held, parts in zip(*rows, strict=True):
         named = Inputs(dict(zip(channels, inputs.tolist(), strict=True)))
         gaps, now = {}, held.tolist()
-        if any(before) or (any(now) and found):
+        if any(before) or (any(now) and ends):
             gaps = gaps_of(channels, before, now)
         before = now
         own = own_noise(noise)
         end = End(t=float(t), inputs=named, z=z, noise=own, gaps=gaps, parts=int(parts))
-        found.append(end)
-    return found
+        ends.append(end)
+    return ends
 
 
 def first_interval(log: Array, channels: tuple[str, ...]) -> Interval:
-    """Return the first row of one member as an interval without length."""
+    """Return the first row of one member as an interval of length zero."""
     (row,) = _rows(log[:, :1], channels)
     return Interval.between(row, row)
 
@@ -158,6 +158,6 @@ def intervals_since(log: Array, channels: tuple[str, ...]) -> list[Interval]:
 
 
 def reaching(shown: Sequence[bool] | Mask, readings: int) -> int:
-    """Return how many samples, from the last one back, hold so many with a reading, or all."""
+    """Return the number of last samples among which `readings` have a reading, or of all."""
     places = np.flatnonzero(shown)
     return len(shown) - int(places[max(len(places) - readings, 0)])

@@ -1,4 +1,4 @@
-"""Statistics of the normalised innovations: white and of unit variance for a right model."""
+"""Statistics of normalised innovations, which are white with unit variance for a right model."""
 
 from __future__ import annotations
 
@@ -10,54 +10,52 @@ from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, Mask
 from livepde.linalg.member_arrays import product
 
-WINDOW = 500  # samples: older innovations fade, so that a poor start is forgotten
-SLOW = 50  # samples over which innovations are averaged to find errors that hide below the noise
+WINDOW = 500  # samples: memory of the statistics, so that a poor start is forgotten
+SLOW = 50  # samples over which innovations are averaged to detect errors smaller than the noise
 LARGEST_CORRELATION = 0.999
-SIGNIFICANT = 1.645  # standard errors above 1 that a statistic has by chance in 5 of 100 cases
+SIGNIFICANT = 1.645  # standard errors: one-sided 5 % level of the normal distribution
 
-TINY = 1e-200  # no sum of squares of anything, but no zero
+TINY = 1e-200  # avoids division by zero; smaller than any sum of squares
 FADE = 1.0 - 1.0 / WINDOW
-FADES = np.array([FADE, FADE**2, FADE, FADE, FADE, FADE, FADE])  # of the sums
-# A sensor that brings e has D x + s e + c after x = (seen, last, slow, slow_variance).
+FADES = np.array([FADE, FADE**2, FADE, FADE, FADE, FADE, FADE])  # decay factors of the sums
+# An innovation e changes x = (seen, last, slow, slow_variance) of its sensor to D x + s e + c.
 DECAY = np.array([[0.0], [0.0], [1.0 - 1.0 / SLOW], [(1.0 - 1.0 / SLOW) ** 2]])
 SHARE = np.array([[0.0], [1.0], [1.0 / SLOW], [0.0]])
 GAINED = np.array([[1.0], [0.0], [0.0], [1.0 / SLOW**2]])
-# Where in products of rows of x after a sample with those of x after it, and before it, the terms
-# of the sums stand.
+# Positions of the terms of `sums` among the products of x after a sample with x after and before.
 TERMS = np.ravel_multi_index(([0, 0, 1, 0, 1, 0, 2], [0, 0, 1, 4, 5, 3, 2]), (4, 8))
 
 
 @dataclass(frozen=True, eq=False)
 class Innovations:
-    """Fading moments of the normalised innovations e_k = d_k / sqrt(expected variance)."""
+    """Exponentially weighted moments of the normalised innovations e_k = d_k / sqrt(variance)."""
 
-    # Shape (members, 7), fading over `WINDOW` samples: number of e; of squared weights; e^2; number
-    # of pairs (e_k, e_(k-1)); their product; `slow_variance`; square of `slow`.
+    # Weighted sums over about `WINDOW` samples, shape (members, 7): number of e; squared weights;
+    # e^2; number of pairs (e_k, e_(k-1)); their product; `slow_variance`; square of `slow`.
     sums: Array
-    # Shape (members, 4, sensors), of each sensor: 1 once it has brought an e, else 0; its last e;
-    # the exponential average of e over `SLOW` samples (`slow`); the variance of that for white
-    # noise of size 1 (`slow_variance`).
+    # For each sensor, shape (members, 4, sensors): 1 after its first e, else 0; its last e; the
+    # exponential average of e over `SLOW` samples (`slow`); the variance of this average for white
+    # noise of unit variance (`slow_variance`).
     sensors: Array
-    # e of the last sample, shape (members, sensors), NaN where missing; also of values that a gate
-    # has refused twice in a row.
+    # e of the last sample, shape (members, sensors), NaN where missing; includes innovations that
+    # a gate refused, from the second in a row on.
     newest: Array
 
     @classmethod
     def start(cls, sensors: int, members: int = 1) -> Innovations:
-        """Return the value before any innovation."""
+        """Return the statistics before any innovation."""
         never = np.full((members, sensors), np.nan)
         return cls(np.zeros((members, len(FADES))), np.zeros((members, 4, sensors)), never)
 
     def add(
         self, e: Array, measured: Mask | None = None, newest: Array | None = None
     ) -> Innovations:
-        """Return the value after innovations of shape (members, sensors), NaN where missing.
+        """Return the statistics after innovations e (members, sensors), NaN where missing.
 
-        Members that were not `measured`, shape (members,), stay as they are; default all were.
-        `newest` are those with some that were not used; default e.
+        `measured`: members with a reading, shape (members,); others do not change. Default all.
+        `newest`: innovations including refused ones that count in the test for jumps; default e.
         """
-        # Every sum is a product of two rows of the statistics, so that one matrix product serves
-        # all of them.
+        # Each sum is a product of two rows of the statistics: one matrix product gives all sums.
         seen, before = np.isfinite(e), self.sensors
         newest = e if newest is None else newest
         if np.count_nonzero(seen) == seen.size:
@@ -77,7 +75,7 @@ class Innovations:
     @property
     def ratio(self) -> Array:
         """Mean of e^2 of each member, shape (members,); 1 if the noise level is right."""
-        # `TINY` on both sides makes the ratio 1, that of a right model, before any innovation.
+        # `TINY` makes the ratio 1 before any innovation.
         return (self.sums[:, 2] + TINY) / (self.sums[:, 0] + TINY)
 
     @property
@@ -95,10 +93,10 @@ class Innovations:
 
     @property
     def persistence(self) -> Array:
-        """Variance of the averaged innovations over that of an average of white noise of size 1.
+        """Variance of averaged innovations over its value for unit white noise, (members,).
 
-        Model errors smaller than the noise hardly correlate one innovation with the next, and yet
-        do not average out. Shape (members,).
+        Model errors smaller than the noise barely correlate successive innovations, but they do not
+        average out.
         """
         return (self.sums[:, 6] + TINY) / (self.sums[:, 5] + TINY)
 
@@ -106,15 +104,14 @@ class Innovations:
     def inflation(self) -> Array:
         """Factor on standard deviations, at least 1, shape (members,).
 
-        Ratio of the standard deviation of a mean of the innovations to that of a mean of white
-        noise of the stated size: the square root of the larger of two variances, `persistence`, and
-        ratio (1 + rho)/(1 - rho), of errors that follow a first-order autoregression.
+        Ratio of the standard deviation of a mean of the innovations to its value for white noise of
+        the stated size. It is the square root of the larger of two variances: `persistence`, and
+        ratio (1 + rho)/(1 - rho) for errors that follow a first-order autoregression.
 
-        Both scatter about 1 where the model is right, and the larger one lies above 1 more often
-        than not. So only the excess of each beyond chance counts: see `_beyond_chance`. Their
-        standard errors are those for white noise: of N values the mean square has the variance 2/N,
-        the correlation 1/N; and `SLOW` values make one independent value of `slow`, of which each
-        sensor has one from the start.
+        If the model is right, both scatter about 1, and the larger one usually exceeds 1. Only the
+        significant excess of each is used, see `_beyond_chance`. The standard errors are those for
+        white noise: with N values, the mean square has the variance 2/N, and the correlation 1/N.
+        `SLOW` values give one independent value of `slow`, and each sensor starts with one.
         """
         count, weight = self.sums[:, 0], self.sums[:, 1]
         sensors = self.sensors[:, 0].sum(axis=1)
@@ -124,13 +121,13 @@ class Innovations:
 
     @property
     def unbiased_correlation(self) -> Array:
-        """`correlation` of the process behind N samples of each sensor, at least 0, (members,).
+        """`correlation` corrected for the bias of N samples of each sensor, at least 0, (members,).
 
-        The correlation r of N values about a mean that is fitted is too small by (1 + 3 r)/N
-        (Kendall 1954), 4/N for large r. Innovations of a right model are white and fit no mean, so
-        the correction is 4/N times the part of r beyond chance, as in `_beyond_chance`. At most
-        (N - 1)/(N + 1): then (1 + r)/(1 - r) is N, and a mean of the innovations is as uncertain
-        as each of them.
+        The bias of the correlation r of N values about a fitted mean is -(1 + 3 r)/N (Kendall
+        1954), -4/N for large r. Innovations of a right model are white and fit no mean. Therefore
+        the correction is 4/N times the significant part of r, as in `_beyond_chance`. The upper
+        limit (N - 1)/(N + 1) makes (1 + r)/(1 - r) equal to N: then a mean of the innovations is as
+        uncertain as each innovation.
         """
         count, weight = self.sums[:, 0], self.sums[:, 1]
         sensors = np.maximum(self.sensors[:, 0].sum(axis=1), 1.0)
@@ -143,24 +140,24 @@ class Innovations:
 
     @property
     def scatter(self) -> Array:
-        """The part of `inflation` that comes from the size of innovations and their correlation.
+        """The part of `inflation` due to the size and correlation of innovations, (members,).
 
-        Errors that hide below the noise are not: they hardly make the innovations larger.
+        Errors smaller than the noise are not included: they barely increase the innovations.
         """
         count, weight = self.sums[:, 0], self.sums[:, 1]
         rho = self.unbiased_correlation
         following = self.ratio * (1.0 + rho) / (1.0 - rho)
-        # For white noise the mean square has the variance 2/N, and (1 + rho)/(1 - rho), about
-        # 1 + 2 rho, the variance 4/N: together 6/N.
+        # For white noise the variances are 2/N for the mean square and 4/N for (1 + rho)/(1 - rho),
+        # which is about 1 + 2 rho. Their sum is 6/N.
         error = np.sqrt(6.0 * weight + TINY) / (count + TINY)
         return np.sqrt(_beyond_chance(following, error))
 
 
 def _beyond_chance(variance: Array, error: Array) -> Array:
-    """Return variances, shrunk towards 1 as far as their standard error explains the excess.
+    """Return variances with their excess over 1 reduced to its significant part.
 
-    1 + x (1 - (c/x)^2) where the excess x is larger than c = `SIGNIFICANT` standard errors, else 1:
-    an excess far beyond chance is kept in full.
+    The result is 1 + x (1 - (c/x)^2) if the excess x is larger than c = `SIGNIFICANT` standard
+    errors, else 1. A highly significant excess is almost unchanged.
     """
     excess, chance = variance - 1.0, SIGNIFICANT * error
     beyond = excess > chance
