@@ -20,7 +20,7 @@ from livepde.observation import Observed
 from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme, StepFailed
 from livepde.verdict import Verdict
 
-LARGEST = 1e150  # of a sum of squares: the product of two of them is finite
+LARGEST = 1e150  # largest sum of squares: the product of two such sums is finite
 REMEDIES = {
     "ok": "",
     "not_converged": "Reduce `dt_max`, the gain or the damping.",
@@ -48,12 +48,12 @@ class Status:
 
     @property
     def ok(self) -> bool:
-        """True if the step was taken and nothing is wrong."""
+        """True if the step succeeded."""
         return self.code == "ok"
 
     @property
     def taken(self) -> bool:
-        """True if the sample was taken: unknowns that would have departed are held meanwhile."""
+        """True if the sample was used; with "departed", the unknowns are held meanwhile."""
         return self.code in ("ok", "departed")
 
     @property
@@ -70,14 +70,14 @@ class Status:
 
 
 class InitialReading(NamedTuple):
-    """A reading that the initial state was made of.
+    """A reading that was used for the initial state.
 
     Attributes
     ----------
     weight
-        How the initial state changes with it, shape (n,).
+        Derivative of the initial state with respect to the reading, shape (n,).
     noise
-        Its standard deviation; NaN: that of the sensor or channel.
+        Standard deviation of the reading; NaN: noise of the sensor or channel.
     """
 
     weight: Array
@@ -91,16 +91,15 @@ class Problem:
     Attributes
     ----------
     model, observed, control
-        The process, its sensors, and how steps are taken.
+        The process, its sensors, and the control of the time steps.
     input_noise
         Channel of the model -> standard deviation of its noise.
     initial_readings
-        Channel -> its reading at the initial time, if the initial state was made of it.
+        Channel -> its reading at the initial time, if the initial state was computed from it.
     initial_errors
-        Independent errors of the initial state itself, each one standard deviation, shape (errors,
-        n).
+        Independent errors of the initial state, of one standard deviation each, shape (errors, n).
     initial
-        The initial state as it was given: a number, a function of x, coefficients, or a mapping.
+        The initial state from the user: a number, a function of x, coefficients, or a mapping.
     """
 
     model: Model
@@ -113,17 +112,17 @@ class Problem:
 
     @property
     def initial_rank(self) -> int:
-        """Number of independent errors of the initial state that are no errors of unknowns."""
+        """Number of independent errors of the initial state, not including the unknowns."""
         return len(self.initial_readings) + len(self.initial_errors)
 
     @cached_property
     def channels(self) -> tuple[str, ...]:
-        """Names of all input channels: those of the model, then those the sensors read."""
+        """Names of all input channels: first of the model, then of the sensors."""
         return tuple(dict.fromkeys([*self.model.channels, *self.observed.observation.inputs]))
 
     def unread(self, interval: Interval) -> Interval:
-        """Return an interval without the readings that the initial state was made of."""
-        # The initial state holds these readings already: a second time they would count twice.
+        """Return an interval without the readings that were used for the initial state."""
+        # Such readings must not count twice.
         used = [name in self.initial_readings for name in self.observed.names]
         return replace(interval, z1=np.where(used, np.nan, interval.z1)) if any(used) else interval
 
@@ -132,14 +131,14 @@ class Problem:
         return self.observed.predict(u, self.model.latent.value(q), moment)
 
     def linear_readings(self, interval: Interval, u: Array) -> Interval:
-        """Return an interval with its inputs as they are taken, and readings as linear sensors'."""
+        """Return an interval with inputs as the model uses them and linearised readings."""
         interval = interval.driven(self.control.held)
         z0 = self.observed.linearised(interval.z0, u)
         z1 = self.observed.linearised(interval.z1, u)
         return interval if z1 is interval.z1 else replace(interval, z0=z0, z1=z1)
 
     def physical(self, belief: Belief) -> Belief:
-        """Return a belief of latent coefficients as one of the physical parameter."""
+        """Return the belief about the physical parameter for one about latent coefficients."""
         latent = self.model.latent
         if latent.plain:
             return belief
@@ -160,17 +159,17 @@ class Fit:
     Attributes
     ----------
     samples
-        Samples with a reading that it used.
+        Number of samples with a reading.
     cost
         Half the sum of squares of the residuals in use, in units of their noise, and of the
         unknowns, in prior standard deviations about the prior.
     passes
-        Passes over these samples that all fits of the run so far have taken; a pass of the state
-        alone counts as its share.
+        Passes over these samples in all fits of the run so far. A pass without derivatives counts
+        as a fraction.
     readings, refused
-        Readings of these samples, and those of them that were left out.
+        Number of readings in these samples, and number of readings left out.
     converged
-        False if the search did not end in a minimum, or in one that explains the samples.
+        True if the search ended in a minimum that explains the samples.
     """
 
     samples: int
@@ -182,7 +181,7 @@ class Fit:
 
 
 class Deferred(NamedTuple):
-    """Functions that compute belief and verdict when they are read; the numbers never change."""
+    """Functions that compute belief and verdict on demand; their results never change."""
 
     belief: Callable[[], Belief]
     verdict: Callable[[], Verdict]
@@ -198,13 +197,13 @@ class Belief:
         Coefficients of parameter and state, shapes (m,) and (n,).
     q_factor, u_factor
         Square roots of the covariances, q_factor @ q_factor.T, shapes (m, k) and (n, k); None for
-        a law that has no covariance.
+        a law without covariance.
     prior_factor
-        Square root of the covariance of q before the first sample, shape (m, k), its columns
+        Square root of the covariance of q before the first sample, shape (m, k), with columns
         orthonormal in Q.
     rest
-        Standard deviation of each coefficient of q in the modes that the law leaves out, which keep
-        their prior: independent of q_factor, shape (m,). None: 0.
+        Prior standard deviation of each coefficient of q in the modes that the law omits,
+        independent of q_factor, shape (m,). None: 0.
     """
 
     q: Array
@@ -228,9 +227,9 @@ class Belief:
         return None if self.u_factor is None else _deviation(self.u_factor)
 
     def deviation(self, rows: Any, part: slice) -> Array | None:
-        """Return the standard deviation of rows @ q[part] for a matrix, such as of point values.
+        """Return the standard deviation of rows @ q[part] for a matrix, such as point values.
 
-        Where a row has several entries the rest counts as if it were fully correlated.
+        For a row with several entries, `rest` is treated as fully correlated.
         """
         if self.q_factor is None:
             return None
@@ -238,9 +237,9 @@ class Belief:
         return std if self.rest is None else np.hypot(std, abs(rows) @ self.rest[part])
 
     def left_out(self, rows: Any, part: slice) -> float:
-        """Return the share of the modes that the law leaves out in the variance of rows @ q[part].
+        """Return the share of omitted modes in the mean variance of rows @ q[part] over the rows.
 
-        Of the mean over the rows; 0 without a law that leaves out modes, or without variance.
+        It is 0 if the law omits no modes or has no covariance.
         """
         std = self.deviation(rows, part)
         if std is None or self.rest is None:
@@ -250,7 +249,7 @@ class Belief:
         return float(rest @ rest) / variance if variance > 0.0 else 0.0
 
     def left(self, rows: Any) -> Array:
-        """Return the remaining share of the prior standard deviation of some coefficients of q.
+        """Return the posterior over prior standard deviation of the coefficients q[rows].
 
         NaN without covariance.
         """
@@ -261,15 +260,15 @@ class Belief:
         return np.asarray(after / np.where(before > 0.0, before, np.nan))
 
     def modes_left(self, part: Any) -> Array:
-        """Return the remaining share of the prior standard deviation of modes of a part of q.
+        """Return the posterior over prior standard deviation of the modes of a part of q.
 
-        The modes are those of the posterior relative to the prior, so that their shares do not
-        depend on units: as many as the part has reduced coordinates, the least known first. None
-        at all without covariance.
+        The modes are the principal axes of the posterior relative to the prior, so that the ratios
+        do not depend on units. There is one mode for each reduced coordinate of the part, the most
+        uncertain first. The result is empty without covariance.
         """
         if self.q_factor is None or self.prior_factor is None:
             return np.zeros(0)
-        # In coordinates in which the prior is N(0, I) the singular values are the remaining shares.
+        # In coordinates with the prior N(0, I), the singular values are these ratios.
         axes, sizes, _ = np.linalg.svd(self.prior_factor[part], full_matrices=False)
         seen = sizes > 1e-12 * sizes.max(initial=0.0)
         reduced = (axes[:, seen].T @ self.q_factor[part]) / sizes[seen, None]
@@ -282,21 +281,21 @@ def _deviation(factor: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """Report of a step, in addition to the new state.
+    """Report of a step, which accompanies the new state.
 
     Attributes
     ----------
     status
-        Status of the step; unless ok, the state is the one before.
+        Status of the step. After a failure, the state is the state before the step.
     predicted
         Value of each sensor as predicted before the sample was used, shape (sensors,); for a law
         without such a prediction, the output of its estimate.
     steps
-        Substeps taken.
+        Number of substeps.
     diagnose
-        Function that returns the diagnostics; it is called when they are first read.
+        Function that returns the diagnostics; called when they are first read.
     parts
-        In how many parts the substeps were divided.
+        Number of parts into which the substeps were divided.
     """
 
     status: Status
@@ -307,37 +306,37 @@ class Report:
 
     @cached_property
     def diagnostics(self) -> Diagnostics[float]:
-        """Innovation statistics, safeguards, and other numbers of the law."""
+        """Innovation statistics, actions of safeguards, and other numbers of the law."""
         return self.diagnose()
 
     def updated(self, more: Diagnostics[float]) -> Report:
-        """Return the report with all that other diagnostics know among its own."""
+        """Return the report with the known values of `more` in its diagnostics."""
         return replace(self, diagnose=lambda: self.diagnostics.updated(more))
 
 
 def finite(*arrays: Array | None) -> bool:
-    """Return whether products of the squares of some arrays are finite; None counts as empty."""
-    total = 0.0  # NaN with any of its terms, which a maximum need not be
+    """Return True if products of the squares of arrays are finite; None counts as empty."""
+    total = 0.0  # a sum propagates NaN, a maximum may not
     for a in arrays:
         total += 0.0 if a is None else float(np.vdot(a, a))
     return bool(total <= LARGEST)
 
 
 def numerical(error: Exception) -> Status | None:
-    """Return the status of a step that an operation on numbers has ended, None for other errors.
+    """Return the status of a step that failed with a numerical error; None for other errors.
 
-    Such operations raise `ArithmeticError` (overflow, a singular matrix), NumPy's `LinAlgError`,
-    the `ValueError` of SciPy for arrays that are not finite, or the `RuntimeError` of SuperLU.
+    Numerical errors are `ArithmeticError` (overflow, a singular matrix), NumPy's `LinAlgError`,
+    the `ValueError` of SciPy for nonfinite arrays, and the `RuntimeError` of SuperLU.
     """
     text = str(error).rstrip(".") or type(error).__name__
     if isinstance(error, StepFailed):
         return Status.of(error)
     if isinstance(error, LinearAlgebraError | np.linalg.LinAlgError | ZeroDivisionError):
-        # A status has its remedy, which a solver words as "check the model's forms".
+        # The remedy of the status replaces the solver's: "check the model's forms".
         return Status("singular", re.split(r"[:.] check", text, flags=re.IGNORECASE)[0])
     if isinstance(error, RuntimeError) and "singular" in text:
         return Status("singular", text)
-    # SciPy says "array must not contain infs or NaNs".
+    # SciPy's message is "array must not contain infs or NaNs".
     if isinstance(error, ArithmeticError) or (isinstance(error, ValueError) and "infs" in text):
         return Status("not_finite", text)
     return None
@@ -350,15 +349,15 @@ class FixedInterval:
     Attributes
     ----------
     opening
-        The sample at the initial time as an interval without length, NaN where there is none.
+        The sample at the initial time as an interval of length zero; NaN where missing.
     intervals
-        From the initial time to the first sample that was taken later, and so on to the last.
+        The intervals between samples that were used, beginning at the initial time.
     q
         Latent parameters estimated at the initial time and after each interval.
     jumps
-        Numbers of the intervals in which unknowns may have jumped.
+        Indices of the intervals in which unknowns may have jumped.
     fields
-        Where the state is asked for: 0 at the initial time, k after the k-th interval.
+        Times at which the state is requested: 0 is the initial time, k the end of interval k.
     """
 
     opening: Interval
@@ -373,18 +372,18 @@ State = TypeVar("State")
 
 
 class Law(ABC, Generic[Work, State]):
-    """An update law: a frozen configuration; the evolving part is an explicit state value.
+    """An update law (estimator): a frozen configuration with an explicit state.
 
-    A law of your own is one class with these four methods. The state is a frozen dataclass of
-    arrays and numbers: saving it is checkpointing. Identifiers share a law, and copies of an
-    identifier share its work, maybe in threads: neither may change once it is made.
+    To define your own law, implement the four abstract methods in a subclass. The state is a frozen
+    dataclass of arrays and numbers: a checkpoint stores it. Identifiers share a law, and copies of
+    an identifier share its work, possibly in threads. Both must be immutable.
 
     Attributes
     ----------
     scheme
-        Time scheme of an identifier that states none: the paper's, implicit Euler.
+        Default time scheme of an identifier: implicit Euler, as in the paper.
     graded_start
-        True if steps at the start of a run are graded, as `Advance.start` says.
+        True if steps at the start of a run are graded, see `Advance.start`.
     """
 
     scheme: ClassVar[Scheme] = ImplicitEuler()
@@ -392,54 +391,55 @@ class Law(ABC, Generic[Work, State]):
 
     @abstractmethod
     def prepare(self, problem: Problem) -> Work:
-        """Return matrices, modes and stages, computed once. Raises `LawError`."""
+        """Return matrices, modes and stages, which are computed once. Raises `LawError`."""
 
     @abstractmethod
     def init(self, work: Work, q0: Array, u0: Array) -> State:
         """Return the state at the start, from coefficients q0 (m,) and u0 (n,)."""
 
     def start(self, work: Work, q0: Array, u0: Array, moment: Moment) -> State:
-        """Return the state at the start of a run, at a moment; here that of `init`.
+        """Return the state at the start of a run; default: the result of `init`.
 
-        For a law that knows how the initial state depends on the parameter (`Model.initial`).
+        Override this if the law uses how the initial state depends on the parameter
+        (`Model.initial`).
         """
         return self.init(work, q0, u0)
 
     def begin(self, work: Work, state: State, interval: Interval) -> State:
-        """Return the state after a sample at the initial time; here the same.
+        """Return the state after a sample at the initial time; default: the state unchanged.
 
-        `interval` has no length: it holds the sample and the inputs.
+        `interval` has the length zero and contains the sample and the inputs.
         """
         return state
 
     @abstractmethod
     def step(self, work: Work, state: State, interval: Interval) -> tuple[State, Report]:
-        """Return the state at the end of the interval; the old one if the step failed."""
+        """Return the state at the end of the interval, or the old state if the step failed."""
 
     def settled(self, work: Work, state: State) -> State:
-        """Return the state after a fit of all stored samples; here the same state."""
+        """Return the state after a fit of all stored samples; default: the state unchanged."""
         return state
 
     def final(self, work: Work, state: State, *, columns: bool = True) -> Deferred:
-        """Return belief and verdict as `deferred`, for the end of a run; here the same.
+        """Return belief and verdict at the end of a run; default: the result of `deferred`.
 
         Parameters
         ----------
         columns
-            Whether the verdict looks for errors of single columns of the data, which may take
+            True if the verdict tests for errors of single columns of the data, which may take
             several times as long as the run.
         """
         return self.deferred(work, state)
 
     def live(self) -> Law[Work, State]:
-        """Return the law for a run that waits for its source; here the same.
+        """Return the law for a run that waits for its source; default: this law.
 
-        If some steps of a law take long, the law returned moves that work into a thread.
+        A law with some slow steps returns a law that moves this work into a thread.
         """
         return self
 
     def fit(self, work: Work, state: State) -> Fit | None:
-        """Return the last fit of all stored samples, None for a law without."""
+        """Return the last fit of all stored samples; None if there is no fit."""
         return None
 
     def diagnosed(self, work: Work, state: State) -> Diagnostics[float]:
@@ -447,23 +447,23 @@ class Law(ABC, Generic[Work, State]):
         return Diagnostics()
 
     def weighs_readings(self) -> bool:
-        """Return whether a reading may have its own noise (`Interval.noise`); here not."""
+        """Return True if a reading may have its own noise (`Interval.noise`); default: False."""
         return False
 
     def reading_noise(self, work: Work, state: State) -> Array | None:
-        """Return the standard deviation of the noise of each sensor; None if none is known."""
+        """Return the standard deviation of the noise of each sensor, or None if unknown."""
         return None
 
     def unsmoothed(self, work: Work) -> str:
-        """Return why the law smooths nothing, empty if it has `smoothed`."""
+        """Return the reason why the law has no smoother; empty if it implements `smoothed`."""
         return f"{type(self).__name__} has no covariance that a smoother could follow"
 
     def smoothed(
         self, work: Work, before: State, after: State, data: FixedInterval
     ) -> Iterator[Belief]:
-        """Iterate over beliefs given all samples of a run, from the last one to the initial time.
+        """Iterate over beliefs given all samples of a run, backwards in time.
 
-        Where the state is not asked for the belief has no coefficients of it.
+        The belief includes the state only at the times in `data.fields`.
 
         Parameters
         ----------
@@ -473,36 +473,36 @@ class Law(ABC, Generic[Work, State]):
         raise LawError(f"smoothed: {self.unsmoothed(work)}.")
 
     def stepped_alone(self, work: Work) -> str:
-        """Return why the members of a fleet are stepped one by one; empty if as arrays.
+        """Return the reason why members of a fleet are stepped separately; empty if as arrays.
 
-        A law that steps them as arrays has `step_members` and `member_belief`.
+        A law that steps members as arrays implements `step_members` and `member_belief`.
         """
         return f"{type(self).__name__} steps one at a time"
 
     def finite(self, work: Work, state: State) -> bool:
-        """Return whether the belief and its squares are finite; here the belief is computed.
+        """Return True if the belief and its squares are finite.
 
-        A law whose belief is not cheap overrides this by a test of the arrays behind it.
+        The default computes the belief. A law with an expensive belief should override this.
         """
         belief = self.belief(work, state)
         return finite(belief.q, belief.u, belief.q_factor, belief.u_factor)
 
     @abstractmethod
     def belief(self, work: Work, state: State) -> Belief:
-        """Return estimates and, if the law has them, covariances."""
+        """Return estimates and, if available, covariances."""
 
     def deferred(self, work: Work, state: State) -> Deferred:
         """Return belief and verdict, to be computed when an estimate is read.
 
-        Here the belief is found at once, and innovations are not judged. Estimates are kept, and
-        with them the data that such functions hold: a law overrides this where these data are not
-        much larger than the belief itself and never change afterwards.
+        The default computes the belief at once, and its verdict tests no innovations. Stored
+        estimates keep the data that these functions use. Override this if the data are not much
+        larger than the belief and never change.
         """
         belief = self.belief(work, state)
         return Deferred(lambda: belief, self.unjudged)
 
     def unjudged(self) -> Verdict:
-        """Return the verdict where no innovation is judged."""
+        """Return the verdict of a law that tests no innovations."""
         why = f"innovations: {type(self).__name__} does not test their size"
         return Verdict.of((), (why,), judged=False)
 
@@ -510,14 +510,14 @@ class Law(ABC, Generic[Work, State]):
 AnyLaw = Law[Any, Any]
 
 
-@nonfinite_allowed()  # seen in the result
+@nonfinite_allowed()  # the result is checked
 def stepped(
     law: Law[Work, State], work: Work, problem: Problem, before: State, interval: Interval
 ) -> tuple[State, Report]:
-    """Return state and report after a sample; the state before it after a numerical failure.
+    """Return state and report after a sample; after a numerical failure, the state before it.
 
-    A numerical failure is an operation that raises, or a belief of the law that is not finite, be
-    it only the squares of its numbers. A sample at the initial time is an interval without length.
+    A numerical failure is an operation that raises an error, or a belief that is not finite or has
+    nonfinite squares. A sample at the initial time is an interval of length zero.
     """
     try:
         if interval.t1 > interval.t0:
@@ -529,8 +529,8 @@ def stepped(
             return state, report
         failure = Status("not_finite", "what the law believes after it is not finite")
     except Exception as error:
-        found = numerical(error)
-        if found is None:
+        status = numerical(error)
+        if status is None:
             raise
-        failure = found
+        failure = status
     return before, Report(failure, np.full(problem.observed.size, np.nan))

@@ -1,9 +1,9 @@
-"""Predicted readings of several members, their Jacobians, and corrections by readings alone.
+"""Predicted readings of several members, their Jacobians, and corrections of the state alone.
 
-Readings that misfit after a pause, a leap or a disturbance show first that the state is wrong. With
-the Riesz representers R of the sensors H the correction u += K d, K = R (H R)^-1, is the smoothest
-one that meets the readings. The unknowns and their covariance stay as they are. The square root of
-the state becomes U - (H U + D C) K: what the readings determine depends no longer on the unknowns.
+A misfit after a pause or a disturbance is most likely due to a wrong state. With the Riesz
+representers R of the sensors H, u += K d with K = R (H R)^-1 is the smoothest correction that
+matches the readings. The unknowns and their covariance do not change. The square root of the state
+becomes U - (H U + D C) K, so that the observed part no longer depends on the unknowns.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from livepde.stepping import Moments
 
 @dataclass(frozen=True, eq=False)
 class MemberSensors:
-    """Predicted readings of each member and their derivatives, linear about its point."""
+    """Predicted readings of each member and their derivatives at its linearisation point."""
 
     problem: Problem
     reduction: Reduction
 
     @cached_property
     def fixed(self) -> bool:
-        """False if sensors may read the unknowns, inputs or the time, or bend at the state."""
+        """True if readings are a fixed linear function of the state alone."""
         observed, observation = self.problem.observed, self.problem.observed.observation
         return type(observed) is Observed and not (observation.directs or observation.inputs)
 
@@ -44,12 +44,12 @@ class MemberSensors:
         return row_product(sp.csr_array(self.problem.observed.steady_matrix))
 
     def _seen(self, columns: Array) -> Array:
-        """Return G times columns of states, (..., sensors) for (..., n)."""
-        found = self._read(columns.reshape(-1, columns.shape[-1]))
-        return found.reshape(*columns.shape[:-1], found.shape[1])
+        """Return G times states, (..., sensors) for (..., n)."""
+        readings = self._read(columns.reshape(-1, columns.shape[-1]))
+        return readings.reshape(*columns.shape[:-1], readings.shape[1])
 
     def _direct(self, at: Moments) -> Array | None:
-        """Return D of sensors z = G u + D q that are the same at all times; None for others."""
+        """Return D of time-independent sensors z = G u + D q; None for other sensors."""
         return None if self.fixed else self.problem.observed.steady_direct(at.member(0))
 
     def _of_unknowns(self, x: FilterState, D: Array) -> Array:
@@ -60,11 +60,11 @@ class MemberSensors:
         """Return predictions, (members, sensors), and Y = [U C] H^T, (members, r, sensors)."""
         D = self._direct(at)
         if self.fixed or D is not None:
-            found = self._seen(x.u + x.du)
+            seen = self._seen(x.u + x.du)
             if D is not None:
                 shift = self.reduction.directions(x.q, x.da[:, None])[:, 0]
-                found = found + self._of_unknowns(x, D) + shift @ D.T
-            return found, self.rows(x, x.U, x.C, at)
+                seen = seen + self._of_unknowns(x, D) + shift @ D.T
+            return seen, self.rows(x, x.U, x.C, at)
         predicted, rows = [], []
         for k in range(len(x)):
             deviates = bool(x.du[k].any() or x.da[k].any())
@@ -73,8 +73,7 @@ class MemberSensors:
                 predicted.append(self._predicted(x.u[k], x.q[k], at, k))
                 rows.append(np.zeros((0, self.problem.observed.size)))
                 continue
-            # The offset of the estimate is one more row: so predictions stay linear about the
-            # point.
+            # The deviation of the estimate is one more row, which keeps predictions linear.
             if deviates:
                 U, C = np.vstack([U, x.du[k]]), np.vstack([C, x.da[k]])
             z, Y = self._of_one(x.u[k], x.q[k], U, C, at, k)
@@ -85,33 +84,33 @@ class MemberSensors:
     def observe_each(
         self, x: FilterState, columns: Array, end: Callable[[int], Moments]
     ) -> tuple[Array, Array]:
-        """Return the same for states and rows U of `columns` at moments `end(0), ...`.
+        """Return predictions and observed rows at moments `end(0)`, ..., for states and rows U.
 
-        `columns`: (moments, 1 + r, members, n), about states without a deviation. Results have the
-        shapes (moments, members, sensors) and (moments, members, r, sensors).
+        `columns`: states followed by rows U, (moments, 1 + r, members, n); `x.du` and `x.da` must
+        be zero. Shapes: (moments, members, sensors) and (moments, members, r, sensors).
         """
         D = self._direct(end(0)) if len(columns) else None
         if self.fixed or D is not None:
             seen = self._seen(columns)
-            found, Y = seen[:, 0], seen[:, 1:].swapaxes(1, 2)
+            predicted, Y = seen[:, 0], seen[:, 1:].swapaxes(1, 2)
             if D is None:
-                return found, Y
+                return predicted, Y
             slopes = self.reduction.directions(x.q, x.C[:, : Y.shape[2]]) @ D.T
-            return found + self._of_unknowns(x, D), Y + slopes
+            return predicted + self._of_unknowns(x, D), Y + slopes
         shape, sensors = columns.shape, self.problem.observed.size
         predicted = np.empty((shape[0], shape[2], sensors))
         Y = np.empty((shape[0], shape[2], shape[1] - 1, sensors))
-        for k, one in enumerate(columns):
-            now = changed(x, u=one[0], U=one[1:].swapaxes(0, 1))
+        for k, column in enumerate(columns):
+            now = changed(x, u=column[0], U=column[1:].swapaxes(0, 1))
             predicted[k], Y[k] = self.observe(now, end(k))
         return predicted, Y
 
     def rows(self, x: FilterState, U: Array, C: Array, at: Moments) -> Array:
-        """Return [U C] H^T for rows of each member, (members, rows, sensors), about its point."""
+        """Return [U C] H^T for rows of each member, (members, rows, sensors)."""
         D = self._direct(at)
         if self.fixed or D is not None:
-            found = self._seen(U)
-            return found if D is None else found + self.reduction.directions(x.q, C) @ D.T
+            seen = self._seen(U)
+            return seen if D is None else seen + self.reduction.directions(x.q, C) @ D.T
         each = (self._of_one(x.u[k], x.q[k], U[k], C[k], at, k)[1] for k in range(len(x)))
         return np.array(list(each))
 
@@ -122,7 +121,7 @@ class MemberSensors:
     def _of_one(
         self, u: Array, q: Array, U: Array, C: Array, at: Moments, k: int
     ) -> tuple[Array, Array]:
-        """Return the readings of one member, and those of rows [U C]."""
+        """Return the predicted readings of member `k`, and [U C] H^T for its rows."""
         observed, latent, moment = self.problem.observed, self.problem.model.latent, at.member(k)
         physical = latent.value(q)
         H_u, H_q = observed.jacobian(u, physical, moment)
@@ -134,35 +133,35 @@ class MemberSensors:
 
 @dataclass(frozen=True, eq=False)
 class Anchor:
-    """Corrects the state of members by their readings alone."""
+    """Correct the state of members, but not their unknowns, by readings."""
 
     problem: Problem
     sensors: MemberSensors
 
     @cached_property
     def _space(self) -> HilbertSpace:
-        """The state with the inner product u v + L^2 grad u . grad v, L the size of the domain."""
+        """State space with the inner product u v + L^2 grad u . grad v, L the domain size."""
         model: Model = self.problem.model
         points = next(iter(model.state_space.fields.values())).field.mesh.p
         size = float(np.ptp(points, axis=1).max())
-        # The length makes the product independent of the unit of length.
+        # With L, the smoothness of the representers does not depend on the unit of length.
         stiffness = model.bilinear(h1_form) - model.bilinear(mass_form)
         gram = sp.csr_array(model.state_mass + size**2 * stiffness)
         return HilbertSpace(gram, "X", model.state_space.fixed)
 
     def corrected(self, x: FilterState, d: Array, used: Mask, at: Moments) -> FilterState:
-        """Return the state of members after readings that correct u only."""
+        """Return the filter after the readings `used`, (members, sensors), have corrected u."""
         problem, du, U = self.problem, x.du.copy(), x.U.copy()
-        errors = x.shadows.u.copy()  # of the discretisation, which the correction removes, too
+        errors = x.shadows.u.copy()  # discretisation errors, which the correction also reduces
         _, Y = self.sensors.observe(x, at)
         for k in np.flatnonzero(used.any(axis=1)).tolist():
-            some = np.flatnonzero(used[k])
+            read = np.flatnonzero(used[k])
             q = problem.model.latent.value(x.q[k])
-            H = problem.observed.jacobian(x.u[k], q, at.member(k))[0][some].toarray()
+            H = problem.observed.jacobian(x.u[k], q, at.member(k))[0][read].toarray()
             R = self._space.riesz(H.T)
-            # Two sensors at one place have the same representer: the pseudoinverse averages them.
+            # Sensors at the same place have one representer: the pseudoinverse averages them.
             K = R @ np.linalg.pinv(H @ R, rcond=1e-9, hermitian=True)
-            du[k] += K @ d[k, some]
-            U[k] -= Y[k][:, some] @ K.T
+            du[k] += K @ d[k, read]
+            U[k] -= Y[k][:, read] @ K.T
             errors[k] -= (errors[k] @ H.T) @ K.T
         return changed(x, du=du, U=U, shadows=changed(x.shadows, u=errors))
