@@ -1,22 +1,22 @@
-"""Noise of unknowns, of inputs and of an initial state, as rows of [U; C].
+"""Noise of unknowns, of inputs and of an initial state, as rows of the square root [U C].
 
-An unknown that moves has two independent rows of process noise in each step.
+A moving unknown has two independent rows of process noise in each step. In a step of length h, the
+noise of a coordinate with relaxation rate lambda is a path n with n(0) = 0. Given its end value,
+the path is a bridge. Given both its end value and its integral, its expectation is
 
-In a step of length h a coordinate of variance rate lambda gains a path n with n(0) = 0. Given its
-end value the path is a bridge, and given both its end value and its integral it has the expectation
+    n(tau) = sqrt(g) [ramp(tau) xi_0 + arch(tau) xi_1],    xi ~ N(0, I),    g = var n(h).
 
-    n(tau) = sqrt(g) [ramp(tau) xi_0 + arch(tau) xi_1],    xi ~ N(0, I),    g = var n(h),
-
-ramp being the expectation given n(h), and arch, zero at both ends, that given the integral of the
-bridge. So the joint law of end value and integral is exact. For a random walk they are the line and
-the parabola of Foster, Lyons and Oberhauser (2020):
+Here ramp is the expectation given n(h), and arch, zero at both ends, is the expectation given the
+integral of the bridge. The joint distribution of end value and integral is exact. For a random
+walk, ramp and arch are the line and the parabola of Foster, Lyons and Oberhauser (2020):
 
     ramp = tau/h,    arch = sqrt(3) (tau/h) (1 - tau/h)
 
-A time scheme sees the path at its stages alone. The inner stage gets the value with which its
-quadrature has the mean of the path over the substep; so a state that integrates the unknown has its
-exact covariance, whatever the step. A state that forgets faster than a step sees the end of the
-path: the end of the step is then halved, until its last part is short against the memory.
+A time scheme evaluates the path at its stages only. The inner stage uses the value with which the
+quadrature of the scheme gives the mean of the path over the substep. A state that integrates the
+unknown then has its exact covariance for any step. A state whose memory is shorter than a step
+depends on the end of the path: the last part of the step is halved until it is short against the
+memory.
 """
 
 from __future__ import annotations
@@ -38,25 +38,25 @@ from livepde.linalg import Array, IntArray, Mask
 from livepde.linalg.member_arrays import changed
 from livepde.stepping import Advance, Span, StepFailed
 
-SHORT = 1e-3  # steps over relaxation times below which a path is that of a random walk
-LONGEST = 0.35  # of the last part of a step over the memory of the readings: standard deviations
-# are within 1 % of those of the exact filter then (tests/test_sparse_samples.py)
-COUNTS = 0.01  # variances of the noise of a reading by which the path has to matter for it
-HARDLY = COUNTS / 64.0  # by which it would not matter in a part of twice the length either
-MOST = 20  # parts of a step at most: the last one is 2e-6 of it then
+SHORT = 1e-3  # step over relaxation time below which a path is treated as a random walk
+LONGEST = 0.35  # largest last part of a step over the memory of the readings: gives standard
+# deviations within 1 % of the exact filter (tests/test_sparse_samples.py)
+COUNTS = 0.01  # noise variances of a reading: a smaller effect of the path is negligible
+HARDLY = COUNTS / 64.0  # effect that remains negligible in a part of twice the length
+MOST = 20  # largest number of parts of a step: the last part is 2e-6 of the step
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(16)
 Propagate: TypeAlias = Callable[[FilterState, Span], tuple[FilterState, Any, StepFailed | None]]
 
-# Rows of the square root for each noisy channel: with 10 the standard deviation of a state near the
-# boundary is that of all rows to 1 %: tests/test_input_noise.py.
+# Rows of the square root for each noisy channel: with 10 rows, the standard deviation of a state
+# near the boundary is exact to 1 % (tests/test_input_noise.py).
 ROWS = 10
 PAUSE_ROWS = 4  # rows of the square root for the state after a pause
-MODES = 3  # shapes in time of the deviation of an input from its line in a pause
-PIECES = 6  # of a pause, in each of which an input is a line
+MODES = 3  # number of modes in time of the deviation of an input from a straight line in a pause
+PIECES = 6  # number of linear pieces of an input in a pause
 
 
 def grades(rate: Array, length: float) -> IntArray:
-    """Return in how many parts a step is taken whose readings forget at a rate, (members,)."""
+    """Return the number of parts of a step, for the rate at which readings forget, (members,)."""
     if not np.count_nonzero(rate):
         return np.ones(len(rate), dtype=np.int64)
     ratio = np.maximum(np.minimum(rate * length / LONGEST, 2.0**MOST), 1.0)
@@ -64,10 +64,10 @@ def grades(rate: Array, length: float) -> IntArray:
 
 
 def pieces(control: Advance, start: float, stop: float, parts: int) -> list[float]:
-    """Return the times between which process noise is independent, the last one `stop`.
+    """Return the ends of the intervals with independent process noise; the last one is `stop`.
 
-    The steps of `dt_max`, the last one of them in parts of a half, a quarter, ..., the last two
-    alike.
+    The intervals are the steps of `dt_max`. The last step is divided into a half, a quarter, and so
+    on; its last two parts have the same length.
     """
     count = control.count(stop - start) // control.parts
     shares = [k / count for k in range(1, count)]
@@ -79,16 +79,15 @@ def pieces(control: Advance, start: float, stop: float, parts: int) -> list[floa
 class NoiseRows:
     """Rows of the square root for the process noise of one step: all ramps, then all arches."""
 
-    # Of the step.
-    start: float
-    length: float
-    # Standard deviation gained by each coordinate that moves in it, shape (members, moving).
+    start: float  # start of the step
+    length: float  # length of the step
+    # Standard deviation gained by each moving coordinate in the step, shape (members, moving).
     scale: Array
-    # The step over the relaxation time of each of them, zero for a random walk.
+    # Length of the step over the relaxation time of each moving coordinate; 0 for a random walk.
     lengths: tuple[float, ...]
-    columns: IntArray  # their numbers among all k coordinates, shape (moving,)
+    columns: IntArray  # indices of the moving coordinates, shape (moving,)
     k: int  # number of coordinates
-    weight: float  # of the last stage in the quadrature of the time scheme (`Scheme.weight`)
+    weight: float  # weight of the last stage of the time scheme (`Scheme.weight`)
 
     def __len__(self) -> int:
         return 2 * len(self.columns)
@@ -98,10 +97,10 @@ class NoiseRows:
         return self._rows(np.array([[1.0], [0.0]]) * np.ones(len(self.columns)))
 
     def at_stage(self, t: float, begun: float, length: float) -> Array:
-        """Return the rows that the stage at t of a substep sees, shape (members, rows, k)."""
+        """Return the rows of C for the stage at t of a substep, shape (members, rows, k)."""
         first = (begun - self.start) / self.length
         last = min(first + length / self.length, 1.0)
-        # Whatever rounding does to the times: an inner stage is far from the end.
+        # The tolerance allows for rounding of the times: an inner stage is far from the end.
         inner = t < begun + 0.99 * length
         return self._rows(_seen(self.lengths, first, last, self.weight, inner))
 
@@ -116,28 +115,27 @@ class NoiseRows:
     def rate(self, before: Array, Y: Array) -> Array:
         """Return the rate at which readings forget the process noise, shape (members,).
 
-        Readings that forget slower than the step see an arch as well as a ramp, those that forget
-        faster the ramp alone, those that are late more of the arch: the ratio of both tells the
-        rate. It rises at once where a part of the step is too long for it, and falls to a half of
-        it at most.
+        The ratio of arch to ramp in the readings determines the rate: it is largest for delayed
+        readings, and zero for readings whose memory is much shorter than the step. The rate
+        increases at once if a part of the step is too long, and decreases at most to its half.
 
-        `before`: the rate so far, by which the step was divided, shape (members,). `Y`: what the
-        sensors see of the rows in the state, in units of the noise, shape (members, rows, sensors).
+        `before`: the rate by which the step was divided, shape (members,). `Y`: observed rows of
+        the state, in units of the noise, shape (members, rows, sensors).
         """
-        if self.weight == 1.0:  # one stage sees the mean of both alike
+        if self.weight == 1.0:  # with one stage, both have the same effect
             return before
         moving = len(self.columns)
-        # What each sensor sees, and all of them together: (members, moving, sensors + 1).
+        # Effect on each sensor, and norm over all sensors: (members, moving, sensors + 1).
         whole = np.linalg.norm(Y, axis=2, keepdims=True)
         seen = np.abs(np.concatenate([Y, whole], axis=2))
         ramp, arch = seen[:, :moving], seen[:, moving:]
         means = _mean(self.lengths, 0.0, 1.0)
-        # A state that forgets at a rate lambda is divided by 1 + w lambda h in each of two stages.
+        # Each of two stages divides a state with the decay rate lambda by 1 + w lambda h.
         rest, w = (means[0] - self.weight)[:, None], self.weight
-        with np.errstate(all="ignore"):  # what no sensor sees gives no finite number
-            found = (means[1][:, None] * ramp / arch - rest) / w
-            # Negative where readings are late: a delay asks for short parts as a memory does.
-            parts = np.abs(found - 1.0) / w
+        with np.errstate(all="ignore"):  # rows without an effect give nonfinite numbers
+            factor = (means[1][:, None] * ramp / arch - rest) / w
+            # factor < 1 for delayed readings, which require short parts as a short memory does.
+            parts = np.abs(factor - 1.0) / w
             counts = ramp * ramp / (3.0 + 2.0 * parts)
 
         def fastest(chosen: Mask) -> Array:
@@ -150,7 +148,7 @@ class NoiseRows:
 
 
 def _paths(lengths: tuple[float, ...], s: Array) -> Array:
-    """Return ramp and arch at shares s of a step, shape (2, moving, len(s)); `s` lies in [0, 1]."""
+    """Return ramp and arch at fractions s of a step, in [0, 1], shape (2, moving, len(s))."""
     y = np.array(lengths)[:, None]
     walks, x = y < SHORT, np.maximum(y, SHORT)
     ramp = np.exp(-x * (1.0 - s)) * np.expm1(-2.0 * x * s) / np.expm1(-2.0 * x)
@@ -163,7 +161,7 @@ def _paths(lengths: tuple[float, ...], s: Array) -> Array:
 
 @lru_cache(maxsize=256)
 def _mean(lengths: tuple[float, ...], first: float, last: float) -> Array:
-    """Return the means of ramp and arch between two shares of a step, shape (2, moving)."""
+    """Return the means of ramp and arch between two fractions of a step, shape (2, moving)."""
     s = first + 0.5 * (last - first) * (1.0 + NODES)
     return np.asarray(_paths(lengths, s) @ (0.5 * WEIGHTS))
 
@@ -172,7 +170,7 @@ def _mean(lengths: tuple[float, ...], first: float, last: float) -> Array:
 def _seen(
     lengths: tuple[float, ...], first: float, last: float, weight: float, inner: bool
 ) -> Array:
-    """Return ramp and arch as a stage of a substep sees them, shape (2, moving)."""
+    """Return the values of ramp and arch for a stage of a substep, shape (2, moving)."""
     mean = _mean(lengths, first, last)
     if weight == 1.0:
         return mean
@@ -181,7 +179,7 @@ def _seen(
 
 
 def input_rank(problem: Problem) -> int:
-    """Return how many rows of the square root the noise of inputs and an initial state need."""
+    """Return the number of rows of the square root for the noise of inputs and initial state."""
     return ROWS * len(problem.input_noise) + problem.initial_rank
 
 
@@ -192,21 +190,20 @@ def with_input_errors(
     span: Span,
     sizes: Mapping[str, float | Array],
 ) -> tuple[FilterState, StepFailed | None]:
-    """Return the state after a span with one more row for each channel that may be off.
+    """Return the state after a span with an additional row for each channel with an error.
 
-    `sizes`: standard deviation of each such channel, one number or (members, 1). The error of a
-    channel is taken as constant in a span and as independent from one to the next: its integral
-    over many spans has the variance of the straight lines between readings. Where a state follows
-    its boundary within a span, the variance is larger than that of the lines by up to a quarter.
-    The row is the difference to the state whose input is one standard deviation off, exact where
-    the model is affine in it.
+    `sizes`: standard deviation of each such channel, a number or shape (members, 1). The error is
+    constant in a span and independent between spans. Over many spans, its integral has the same
+    variance as for errors interpolated linearly between readings. If a state follows its boundary
+    within a span, the variance is too large by up to a quarter. A row is the change of the state if
+    the input changes by one standard deviation, which is exact for a model affine in the input.
     """
     bare, rows = _bare(x), []
     for name, size in sizes.items():
-        off, _, failure = propagate(bare, _moved(span, name, size))
+        shifted, _, failure = propagate(bare, _moved(span, name, size))
         if failure is not None:
             return end, failure
-        rows.append(off.u - end.u)
+        rows.append(shifted.u - end.u)
     if not rows:
         return end, None
     U = np.stack(rows, axis=1)
@@ -214,9 +211,9 @@ def with_input_errors(
 
 
 def unread_inputs(problem: Problem, x: FilterState, span: Span) -> dict[str, Array]:
-    """Return by how much each channel that is held in a gap may be off, shapes (members, 1).
+    """Return the standard deviation of each channel that is held in a gap, shapes (members, 1).
 
-    As far as inputs have moved before in such a time (`InputHistory.deviation`).
+    It follows from earlier changes of the input in a similar time (`InputHistory.deviation`).
     """
     sizes: dict[str, Array] = {}
     if span.gaps is None:
@@ -231,7 +228,7 @@ def unread_inputs(problem: Problem, x: FilterState, span: Span) -> dict[str, Arr
 
 
 def _bare(x: FilterState) -> FilterState:
-    """Return the mean alone, to be propagated once more: no tangents, no offset."""
+    """Return a filter state with the linearisation point alone, without tangents or deviation."""
     members, _, n = x.U.shape
     return changed(
         x,
@@ -252,7 +249,7 @@ def _moved(span: Span, name: str, change: float | Array) -> Span:
 
 
 def lines(problem: Problem) -> list[str]:
-    """Return the channels that drive the model as straight lines between their readings."""
+    """Return the channels of the model that are interpolated linearly between readings."""
     held = problem.control.held
     return [
         name
@@ -264,11 +261,11 @@ def lines(problem: Problem) -> list[str]:
 def after_pause(
     propagate: Propagate, problem: Problem, x: FilterState, end: FilterState, span: Span
 ) -> tuple[FilterState, StepFailed | None]:
-    """Return the state after a span with more rows where the span was a pause.
+    """Return the state after a span, with additional rows for members for which it was a pause.
 
-    The deviation of an input from its line is a bridge: a sum of MODES sines over the pause with
-    independent amplitudes. Each row is the response to one of them, and one row is the change of
-    the state in the pause.
+    The deviation of an input from a straight line is a bridge: a sum of MODES sines over the pause
+    with independent amplitudes. Each sine gives a row with its response. Another row is the change
+    of the state in the pause.
     """
     pause = end.driven.pause
     length = span.t1 - span.t0
@@ -277,7 +274,7 @@ def after_pause(
     knots = np.linspace(0.0, 1.0, PIECES + 1)
 
     def after(name: str, mode: int) -> tuple[Array, StepFailed | None]:
-        """Return u after the pause, with a deviation of an input unless its mode is zero."""
+        """Return u after the pause; the input deviates by a mode, unless `mode` is zero."""
         at, column, size = bare, span.channels.index(name), sizes[:, problem.channels.index(name)]
         last = _mixed(span, 0.0)
         for a, b in pairwise(knots.tolist()):
@@ -301,18 +298,18 @@ def after_pause(
                 return at.u, failure
         return at.u, None
 
-    # How long the pause was is not sure either: the clock may have been set in it.
+    # The length of the pause is uncertain too: the clock may have been adjusted in it.
     rows = [(end.u - x.u) * pause[:, None]]
     for name in lines(problem):
         if not sizes[:, problem.channels.index(name)].any():
             continue
-        found = []
+        states = []
         for mode in range(MODES + 1):
             u, failure = after(name, mode)
             if failure is not None:
                 return end, failure
-            found.append(u)
-        rows += [u - found[0] for u in found[1:]]
+            states.append(u)
+        rows += [u - states[0] for u in states[1:]]
     U = np.stack(rows, axis=1)
     return with_rows(end, U, np.zeros((*U.shape[:2], x.C.shape[2]))), None
 
@@ -322,7 +319,7 @@ def _mixed(span: Span, s: float) -> Array:
 
 
 def rows_of_sensors(problem: Problem, reduction: Reduction) -> IntArray:
-    """Return which of the initial rows are the noise of a reading, as its sensor states it."""
+    """Return the indices of initial rows for readings with the stated noise of their sensor."""
     readings = problem.initial_readings.items()
     of_sensor = [name in problem.observed.names and np.isnan(one.noise) for name, one in readings]
     return reduction.size + np.flatnonzero(of_sensor)
@@ -331,12 +328,12 @@ def rows_of_sensors(problem: Problem, reduction: Reduction) -> IntArray:
 def with_initial_rows(
     x: FilterState, problem: Problem, reduction: Reduction, noise: Array, moment: Moment
 ) -> FilterState:
-    """Return the state of one member at the start with the uncertainty of its u0.
+    """Return the state of one member at the start, with the uncertainty of its initial state u0.
 
-    The errors of u0 itself (`Problem.initial_errors`) are rows of their own. For a u0 made of
-    readings, with u0 = sum_i w_i z_i the error of u0 is -sum_i w_i (noise_i + H_q Phi a): the noise
-    of each reading is a row of its own, and the effect of the unknowns on the sensors, an offset
-    say, stands in the rows of those unknowns. So the readings tell nothing more of them.
+    Errors of u0 (`Problem.initial_errors`) are separate rows. If u0 is made of readings,
+    u0 = sum_i w_i z_i, its error is -sum_i w_i (noise_i + H_q Phi a). The noise of each reading is
+    a separate row. The effect of unknowns on the sensors, such as an offset, is part of the rows of
+    these unknowns, so that these readings give no further information about them.
 
     `noise`: standard deviation of each sensor, shape (sensors,).
     """

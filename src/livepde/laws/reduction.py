@@ -1,4 +1,4 @@
-"""Reduced coordinates a of the unknowns, q = prior + Phi a, and how they move by themselves."""
+"""Reduced coordinates a of the unknowns, q = prior + Phi a, and their evolution in time."""
 
 from __future__ import annotations
 
@@ -14,41 +14,41 @@ from livepde.fem import Evolution, FieldBlock, base_name
 from livepde.laws.law import Problem
 from livepde.linalg import Array, Mask
 
-LEFT_OUT = 1e-4  # share of the prior variance of a field that modes="auto" leaves out
-MOST_MODES = 60  # of a field with modes="auto"
+LEFT_OUT = 1e-4  # share of the prior variance of a field that modes="auto" omits
+MOST_MODES = 60  # largest number of modes of a field with modes="auto"
 
 
 @dataclass(frozen=True, eq=False)
 class ReducedEvolution:
-    """How one unknown moves by itself, in reduced coordinates."""
+    """Evolution of one unknown in reduced coordinates."""
 
-    part: slice  # slice of its reduced coordinates: copies times modes
+    part: slice  # slice of the reduced coordinates of the unknown: copies times modes
     # Evolution model of the latent coefficients, and their prior standard deviation.
     model: Evolution
     std: float
 
     def transition(self, h: float) -> Array:
-        # Copies, as the harmonics of a periodic unknown, move by F; every mode of a copy moves
-        # alike.
+        # F is the transition of copies, such as the harmonics of a periodic unknown. It is the same
+        # for all modes.
         F = self.model.transition(h)
         modes = (self.part.stop - self.part.start) // len(F)
         return F if modes == 1 else np.asarray(np.kron(F, np.eye(modes)))
 
     def growth(self, h: float) -> Array:
-        """Return the variance its coordinates gain in a time h."""
+        """Return the variance that the coordinates gain in a time h."""
         gained = self.model.growth(h, self.std)
         return np.repeat(gained, (self.part.stop - self.part.start) // len(gained))
 
     @property
     def rates(self) -> Array:
-        """Rate at which each of its coordinates relaxes to the prior mean; zero for a walk."""
+        """Rate at which each coordinate relaxes to the prior mean; zero for a random walk."""
         rates = -np.diag(self.model.generator)
         return np.repeat(rates, (self.part.stop - self.part.start) // len(rates))
 
     def backward(self, h: float, drift: float) -> Array:
-        """Return the matrix of the backward prediction of the coordinates by a time h."""
+        """Return the matrix that predicts the coordinates backwards by a time h."""
         F, growth = self.transition(h), self.growth(h)
-        # Rauch's smoother gain P F^T (F P F^T + W)^-1 for the prior P = 1.
+        # Gain of Rauch's smoother, P F^T (F P F^T + W)^-1, for the prior P = I.
         growth = growth if self.model.moves else growth + drift * h
         return np.asarray(np.linalg.solve(F @ F.T + np.diag(growth), F).T)
 
@@ -64,7 +64,7 @@ class Reduction:
 
     @classmethod
     def of(cls, problem: Problem, modes: int | str | dict[str, int]) -> Reduction:
-        """Return the reduction with so many modes for each field; see `SensitivityLaw`."""
+        """Return the reduction of a problem; `modes` is defined in `SensitivityLaw`."""
         model = problem.model
         counts = _mode_counts(modes, model.parameter_space.fields)
         blocks, evolutions, start = [], [], 0
@@ -72,18 +72,18 @@ class Reduction:
             first = slice(item.part.start, item.part.start + item.size)
             if isinstance(item.block, FieldBlock):
                 part = model.parameter_space.part(name)
-                # Modes of N(0, G_Q^-1), the largest variance in the mean over the domain first.
+                # Modes of N(0, G_Q^-1), in decreasing order of their mean variance over the domain.
                 inner = model.Q.restricted(first, item.block.fixed)
                 count = min(counts[name], int(inner.free.sum()))
                 mass = model.parameter_mass[part, part]
                 phi, _ = inner.modes(count, mass)
-                if modes == "auto":  # as many as have all of the variance but `LEFT_OUT`
+                if modes == "auto":  # keep all of the variance except the share `LEFT_OUT`
                     weights = mass.diagonal()
                     enough = (1.0 - LEFT_OUT) * inner.spread(weights, phi)
                     phi = phi[:, : 1 + int((np.cumsum(weights @ phi**2) < enough).sum())]
             else:
                 phi = np.eye(item.size) * item.unknown.prior.latent_std
-            # One block of modes for each copy: of a periodic unknown the mean and the harmonics.
+            # One block of modes for each copy: mean and harmonics of a periodic unknown.
             blocks.append(np.kron(np.eye(item.evolution.copies), phi))
             stop = start + blocks[-1].shape[1]
             std = item.unknown.prior.latent_std
@@ -98,7 +98,7 @@ class Reduction:
 
     @cached_property
     def moves(self) -> bool:
-        """True if an unknown moves by itself."""
+        """True if an unknown has an evolution."""
         return any(evolution.model.moves for evolution in self.evolutions)
 
     @cached_property
@@ -108,7 +108,7 @@ class Reduction:
 
     @cached_property
     def still(self) -> Mask:
-        """Coordinates of unknowns that stay as they are, shape (k,)."""
+        """Mask of the coordinates of constant unknowns, shape (k,)."""
         still = np.ones(self.size, dtype=bool)
         for evolution in self.evolutions:
             still[evolution.part] = not evolution.model.moves
@@ -116,7 +116,7 @@ class Reduction:
 
     @property
     def stay(self) -> list[tuple[str, int]]:
-        """Labels and coordinates of the constant unknowns: numbers before modes of fields."""
+        """Labels and indices of the coordinates of constant unknowns, numbers before fields."""
         numbers, modes = [], []
         for (name, item), evolution in zip(
             self.problem.model.latent.parts.items(), self.evolutions, strict=True
@@ -133,7 +133,7 @@ class Reduction:
         return numbers + modes
 
     def named(self, names: Sequence[str] | None, who: str) -> Mask:
-        """Return the coordinates of some unknowns, shape (k,), None: all; raises `LawError`."""
+        """Return the mask of coordinates of named unknowns, (k,); None: all. Raises `LawError`."""
         parts, space = list(self.problem.model.latent.parts), self.problem.model.parameter_space
         missing = [name for name in names or () if name not in space.parts]
         if missing:
@@ -145,7 +145,7 @@ class Reduction:
         return chosen
 
     def moving(self, drift: float) -> int:
-        """Return how many coordinates gain variance."""
+        """Return the number of coordinates that gain variance."""
         return sum(
             evolution.part.stop - evolution.part.start
             for evolution in self.evolutions
@@ -153,14 +153,14 @@ class Reduction:
         )
 
     def transition(self, h: float) -> Array:
-        """Return the transition of all coordinates in a time h, shape (k, k)."""
+        """Return the transition matrix of all coordinates for a time h, shape (k, k)."""
         return _transition(self.evolutions, h)
 
     def gained(self, h: float, variance: Array, drift: Array) -> Array:
         """Return the variance that coordinates gain in a time h, shape (members, k).
 
-        A drifting unknown gains the less, the closer its variance is to that of the prior: without
-        data it is never less certain than at first.
+        The gain of a drifting unknown decreases as its variance approaches the prior variance,
+        which it never exceeds.
         """
         gained = _growth(self.evolutions, h)
         if not drift.any():
@@ -170,24 +170,23 @@ class Reduction:
         return np.where(self.still, more, gained)
 
     def in_prior_units(self, C: Array, age: Array) -> Array:
-        """Return rows of a, (members, r, k), in units of the prior at an age, (members,).
+        """Return rows of a, (members, r, k), in units of the prior at given ages, (members,).
 
-        The prior of unknowns that move widens or is forgotten with the time since the start.
+        The prior of moving unknowns changes with the time since the start.
         """
         if not self.moves:
             return C
         each = []
         for rows, h in zip(C, age.tolist(), strict=True):
             F = self.transition(h)
-            # Variance of the prior after that time: it has moved from N(0, 1) as the evolution
-            # says.
+            # Covariance of the prior after the time h, which began as N(0, I).
             variances, axes = np.linalg.eigh(F @ F.T + np.diag(_growth(self.evolutions, h)))
             least = np.finfo(float).eps * variances[-1]
             each.append(rows @ axes / np.sqrt(np.maximum(variances, least)))
         return np.array(each)
 
     def predict(self, q: Array, h: float) -> Array:
-        """Return the expected latent parameters a time h later, shape (members, m)."""
+        """Return the expected latent parameters after a time h, shape (members, m)."""
         latent = self.problem.model.latent
         if not latent.generator.nnz:
             return q
@@ -199,23 +198,23 @@ class Reduction:
 
     @cached_property
     def _dual(self) -> Array:
-        """Phi^T times the Gram matrix of Q, transposed, shape (m, k)."""
+        """Transpose of Phi^T times the Gram matrix of Q, shape (m, k)."""
         Q = self.problem.model.Q
         return np.stack([Q.dual(column) for column in self.Phi.T], axis=1)
 
     def reduced(self, dq: Array) -> Array:
-        """Return a with Phi a = dq, (..., k) for (..., m): columns of Phi are orthonormal in Q."""
+        """Return a with Phi a = dq, (..., k) for (..., m); columns of Phi are orthonormal in Q."""
         return dq @ self._dual
 
     @cached_property
     def ends(self) -> tuple[Array, Array]:
-        """Least and largest latent parameters, shapes (m,): bounds, and a range about the prior.
+        """Smallest and largest latent parameters, shapes (m,): bounds, and a range about the prior.
 
-        The range is `within` prior standard deviations to each side (of a field, those of each
-        coefficient in the modes; a coefficient that no mode moves is free).
+        The range is `within` prior standard deviations on each side. For a field, these are the
+        standard deviations of its coefficients in the modes; a coefficient without modes is free.
         """
         latent = self.problem.model.latent
-        # Prior standard deviation of each latent coefficient, as far as the modes move it.
+        # Prior standard deviation of each latent coefficient in the modes.
         deviation = np.linalg.norm(self.Phi, axis=1)
         reach = np.concatenate(
             [
@@ -233,25 +232,25 @@ class Reduction:
         )
 
     def bounded(self, q: Array) -> Array:
-        """Return latent parameters within their `ends`, shape (..., m): q itself if they are."""
+        """Return latent parameters clipped to `ends`, shape (..., m); q itself if inside."""
         lower, upper = self.ends
         inside = (q >= lower) & (q <= upper)
         return q if np.count_nonzero(inside) == q.size else np.minimum(np.maximum(q, lower), upper)
 
     def held(self, q: Array) -> Array:
-        """Return how many latent parameters are too far from the prior, (...) for (..., m)."""
+        """Return the number of latent parameters beyond `within`, (...) for (..., m)."""
         lower, upper = self.ends
-        bounds = self.problem.model.latent.bounds  # those that a user has set do not count
+        bounds = self.problem.model.latent.bounds  # bounds that the user has set do not count
         return np.asarray(
             (((q < lower) & (lower > bounds[0])) | ((q > upper) & (upper < bounds[1]))).sum(axis=-1)
         )
 
     def directions(self, q: Array, C: Array) -> Array:
-        """Return how the physical parameter changes along rows of a, (members, r, m)."""
+        """Return the changes of the physical parameter along rows of a, (members, r, m)."""
         latent, along = self.problem.model.latent, C @ self.Phi.T
         if latent.plain:
             return along
-        # Chain rule: derivative of the transform, of the exponential for logarithms say.
+        # Chain rule with the derivative of the transform, for example the exponential.
         along = latent.slopes(q.T).T[:, None, :] * along
         if latent.dim == latent.space.dim:
             return along
@@ -260,28 +259,28 @@ class Reduction:
         )
 
     def traced(self, q: Array, start: Array, h: float, drift: float) -> Array:
-        """Return the latent parameter that is expected to have become q in a time h, shape (m,)."""
+        """Return the expected latent parameter a time h before it became q, shape (m,)."""
         if not (self.moves or drift):
             return q
         prior = self.problem.model.latent.prior
-        # Expected values of a at the start given those at the end, evolution by evolution.
+        # Expected values of a at the start given its values at the end, for each evolution.
         back = block_diag(*(evolution.backward(h, drift) for evolution in self.evolutions))
         return start + self.Phi @ (back @ self.reduced(q - prior) - self.reduced(start - prior))
 
     @cached_property
     def _left_out(self) -> Array:
-        """Prior variance of each latent coefficient in the modes that are left out, shape (m,)."""
+        """Prior variance of each latent coefficient in the omitted modes, shape (m,)."""
         model = self.problem.model
-        left = np.zeros(len(self.Phi))
+        omitted = np.zeros(len(self.Phi))
         for item in model.latent.parts.values():
             if isinstance(item.block, FieldBlock):
                 first = slice(item.part.start, item.part.start + item.size)
                 space = model.Q.restricted(first, item.block.fixed)
-                left[item.part] = np.tile(space.beyond(self.Phi[first]), item.evolution.copies)
-        return left
+                omitted[item.part] = np.tile(space.beyond(self.Phi[first]), item.evolution.copies)
+        return omitted
 
     def rest(self, age: float, drift: float) -> Array:
-        """Return standard deviations of the prior in the omitted modes at an age, (m,)."""
+        """Return the prior standard deviations in the omitted modes at a given age, (m,)."""
         if age == 0.0 or not self._left_out.any():
             return np.asarray(np.sqrt(self._left_out))
         grown = []
