@@ -1,4 +1,4 @@
-"""Update laws and damping rules."""
+"""Update laws (estimators) and damping rules."""
 
 from __future__ import annotations
 

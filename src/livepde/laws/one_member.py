@@ -1,7 +1,7 @@
-"""One member of a sensitivity law whose sample is out of the ordinary.
+"""Step of one member of a sensitivity law, with safeguards and alarms.
 
-A sample moves an unknown too far, a step fails or runs away, or an alarm tells
-that the process has jumped. States have one member here.
+It is used if a sample moves an unknown too far, if a step fails or the estimate runs away, or if an
+alarm indicates a jump. All states in this module have one member.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from livepde.linalg import Mask
 from livepde.linalg.member_arrays import changed, where
 from livepde.stepping import Interval, Span
 
-NEAR_ONSETS = (-8, -6, -4, -3, -2, -1, 0, 1, 2, 3)  # of a first guess of when a jump was
+NEAR_ONSETS = (-8, -6, -4, -3, -2, -1, 0, 1, 2, 3)  # samples between trial onsets and first guess
 TEMPER = 10.0  # factor on the noise of a sample whose Gauss-Newton steps do not converge
 
 
@@ -57,34 +57,34 @@ def step_alone(
 def filtered(
     work: SensitivityWork, x: FilterState, interval: Interval
 ) -> tuple[FilterState, Report]:
-    """Return the filter after a sample, linear about its reference."""
+    """Return the filter after a sample, linear about the reference of `x`, and the report."""
     span = work.filter.span(interval)
-    new, told = assimilate(work.filter, x, span, work.options)
-    status = told.status
-    if status.ok and not told.finite[0]:
-        what = "prediction" if not np.isfinite(told.predicted).all() else "update"
+    new, outcome = assimilate(work.filter, x, span, work.options)
+    status = outcome.status
+    if status.ok and not outcome.finite[0]:
+        what = "prediction" if not np.isfinite(outcome.predicted).all() else "update"
         status = Status("not_finite", f"the {what} is not finite")
     if not status.ok:
         predicted, _ = work.filter.sensors.observe(x, span.end)
         return x, Report(status, predicted[0])
-    return new, reports_of(work, new, told).member(0)
+    return new, reports_of(work, new, outcome).member(0)
 
 
 def _assimilated(
     work: SensitivityWork, state: SensitivityState, interval: Interval
 ) -> tuple[SensitivityState, Report]:
-    """Return one member after a sample, iterated where that is due."""
+    """Return one member after a sample, with Gauss-Newton steps if it moves too far."""
     x, report = filtered(work, state.now, interval)
     if not report.status.ok:
         return state, report
     span = work.filter.span(interval)
-    one = np.ones(1, dtype=bool)
+    taken = np.ones(1, dtype=bool)
     if (guards := work.guards) is not None:
         x, done = _iterated(work, guards, state, interval, x)
         if done is not None:
             report = report.updated(x.innovations.diagnostics.member(0).updated(done))
     x = work.filter.relinearised(x) if work.relinearises else x
-    return stored(work, state, x, span, one), report
+    return stored(work, state, x, span, taken), report
 
 
 def _iterated(
@@ -94,23 +94,23 @@ def _iterated(
     interval: Interval,
     x: FilterState,
 ) -> tuple[FilterState, Diagnostics[float] | None]:
-    """Return the filter after a sample that may have moved it too far, and what was done, or None.
+    """Return the filter after a sample that may have moved it too far, and the safeguard or None.
 
-    The cure of an excessive move is to take this one sample again, from the start of its interval.
+    After an excessive move, the sample is assimilated again from the start of its interval.
     """
     before = state.now
-    if guards.within_reach(x.da - before.da)[0]:  # cheaper to see than how far it is
+    if guards.within_reach(x.da - before.da)[0]:  # a cheap test, before the exact distance
         return x, None
     filter_, kept = work.filter, x.kept
 
     def levelled(x: FilterState, tempered: int) -> FilterState:
-        if not tempered:  # a tempered sample tells nothing about the noise
+        if not tempered:  # a tempered sample has no information about the noise level
             return x
         return changed(x, level=before.level, samples=before.samples)
 
     for temper in range(guards.temperings + 1):
         tempered = Diagnostics(tempered=1.0) if temper else None
-        # The level is a variance, hence twice the exponent: noise TEMPER^temper times as large.
+        # The level is a variance: twice the exponent makes the noise TEMPER^temper times larger.
         begin = changed(before, level=before.level * TEMPER ** (2 * temper), kept=kept)
         if temper:
             x, _ = filtered(work, begin, interval)
@@ -123,30 +123,30 @@ def _iterated(
         far = missed_most(filter_, window) > guards.reach
         if not (far and distance(filter_, window) > AGREED):
             return levelled(x, temper), tempered
-        found = _converged(work, window, interval, guards.iterations)
-        if found is not None:
-            return levelled(found, temper), replace(tempered or Diagnostics(), iterated=1.0)
+        after = _converged(work, window, interval, guards.iterations)
+        if after is not None:
+            return levelled(after, temper), replace(tempered or Diagnostics(), iterated=1.0)
     return filtered(work, before, interval.silent)[0], Diagnostics(held=1.0)
 
 
 def _converged(
     work: SensitivityWork, window: Window, interval: Interval, most: int
 ) -> FilterState | None:
-    """Return the filter after a sample, about where Gauss-Newton steps end, or None."""
-    # The search follows neither ledger nor discretisation errors, which cost as much again.
+    """Return the filter after a sample about the limit of Gauss-Newton steps, or None."""
+    # The search omits ledger and discretisation errors, which double its cost.
     filter_, searching, start = work.filter, work.unaccompanied, unaccompanied(window.start)
     for _ in range(most):
         last, q = window, next_reference(filter_, window)
         x, report = filtered(searching, placed(filter_, replace(window, start=start), q), interval)
         if np.count_nonzero(x.screened.refused):
-            # The gate may use with the errors of the discretisation what it refuses without.
+            # Discretisation errors widen the gate, so that it may use the refused readings.
             searching, start = work, window.start
             x, report = filtered(work, placed(filter_, window, q), interval)
         if not report.status.ok:
             return None
         window = replace(window, now=x, reference=q)
         if distance(filter_, window) <= AGREED:
-            # Once more about the same reference, now with ledger and discretisation errors.
+            # Repeat the step about the same reference with ledger and discretisation errors.
             x, report = filtered(work, placed(filter_, last, q), interval)
             return x if report.status.ok else None
     return None
@@ -160,7 +160,7 @@ def _rescued(
     new: SensitivityState,
     report: Report,
 ) -> tuple[SensitivityState, Report]:
-    """Return one member and report after a sample that may have failed or be far off."""
+    """Return one member and report after a sample that may have failed or run away."""
     noise = work.filter.noise_of(state.now, interval)
     z = interval.z1[None]
     scale = state.scale.add(z, z - report.predicted)
@@ -175,14 +175,14 @@ def _rescued(
         ), report
     older = changed(work.filter.relinearised(state.older), kept=new.now.kept)
     row = int(state.since_older[0])
-    # The last samples are not used again: the older state is propagated without them.
+    # The older state is propagated without the readings of the samples since.
     silent = [item.silent for item in [*_since(work, state, row), interval]]
-    # The estimate of before with a wider covariance comes first, the prior is the last resort.
+    # Try the older estimate with a wider covariance first, and the prior last.
     for start in (work.filter.inflated(older, 1.0), work.filter.with_prior(older)):
-        again, found = _retaken(work, state, start, row, silent)
-        if not astray(found):
-            found = found.updated(Diagnostics(restarted=1.0))
-            return changed(without_past(again), scale=scale), found
+        restart, outcome = _retaken(work, state, start, row, silent)
+        if not astray(outcome):
+            outcome = outcome.updated(Diagnostics(restarted=1.0))
+            return changed(without_past(restart), scale=scale), outcome
     if not report.status.ok:
         return state, report
     return changed(new, scale=scale), report.updated(Diagnostics(runaway=1.0))
@@ -199,7 +199,7 @@ def _retaken(
     row: int,
     intervals: Sequence[Interval],
 ) -> tuple[SensitivityState, Report]:
-    """Return one member after some samples, taken again from a filter at a row of the log."""
+    """Return one member after assimilating samples again from a filter at a row of the log."""
     state = restarted(work, start, state, row)
     for interval in intervals:
         state, report = _assimilated(work, state, interval)
@@ -211,20 +211,20 @@ def _retaken(
 def _most_likely(
     work: SensitivityWork, jumps: Jumps, x: FilterState, known: Sequence[Interval], guess: int
 ) -> int:
-    """Return after how many samples a jump makes all of them most likely, near a first guess.
+    """Return the number of samples before a jump that maximises the likelihood, near a guess.
 
-    A state that has gone on without the jump, or with it too early, misfits for long, and constants
-    that do not jump would have to explain that.
+    A state propagated without the jump, or with the jump too early, misfits for a long time. The
+    constants that do not jump would have to explain this misfit.
     """
     tried = sorted({guess + shift for shift in NEAR_ONSETS} & set(range(len(known))))
-    # What was refused before the first of them stays refused; all of them explain the rest.
+    # Refusals before the first trial onset stay; after it, each trial must explain all readings.
     open_gate = UpdateOptions(adaptive=work.options.adaptive)
     searching = replace(work.unaccompanied, options=open_gate)
     x, score, best = work.filter.relinearised(unaccompanied(x)), -np.inf, guess
     for number, interval in enumerate(known):
         if number in tried:
-            found = _likelihood(searching, jumps, x, known[number:])
-            score, best = max((score, best), (found, number))
+            likelihood = _likelihood(searching, jumps, x, known[number:])
+            score, best = max((score, best), (likelihood, number))
         x, report = filtered(searching if number >= tried[0] else work.unaccompanied, x, interval)
         x = work.filter.relinearised(x)
         if not report.status.ok:
@@ -235,7 +235,7 @@ def _most_likely(
 def _likelihood(
     work: SensitivityWork, jumps: Jumps, x: FilterState, intervals: Sequence[Interval]
 ) -> float:
-    """Return the logarithm of the likelihood of all samples if the unknowns jump now."""
+    """Return the log-likelihood of all samples if the unknowns jump before `intervals`."""
     x, status = _after(work, work.filter.inflated(x, jumps.size, work.jumping), intervals)
     return float(x.evidence[0]) if status.ok else -np.inf
 
@@ -243,7 +243,7 @@ def _likelihood(
 def _after(
     work: SensitivityWork, x: FilterState, intervals: Sequence[Interval]
 ) -> tuple[FilterState, Status]:
-    """Return the filter after samples, up to the first that fails, and whether one does."""
+    """Return the filter after samples, up to the first failure, and the last status."""
     status = Status()
     for interval in intervals:
         x, report = filtered(work, x, interval)
@@ -256,11 +256,11 @@ def _after(
 def watched(
     work: SensitivityWork, jumps: Jumps, state: SensitivityState, x: FilterState, span: Span
 ) -> tuple[Watch, Mask]:
-    """Return the innovations watched for jumps after a sample, and members with an alarm."""
+    """Return the watch for jumps after a sample, and the mask of members with an alarm."""
     screened, present = x.screened, span.present
     gaps, newest = work.filter.input_gaps(span), x.innovations.newest
     seen, alarm = jumps.add(state.watch, newest, screened.refused, screened.run, gaps)
-    # Without a reading `newest` is that of an earlier sample, which has been counted.
+    # Without a reading, `newest` is from an earlier sample, which has been counted.
     return where(np.broadcast_to(present, alarm.shape), seen, state.watch), alarm & present
 
 
@@ -274,10 +274,10 @@ def _jumped(
 ) -> tuple[SensitivityState, Report]:
     """Return one member and report after the test for a jump.
 
-    After an alarm the samples since the jump are taken again, from before it: the state has gone
-    astray with them, and earlier measurements do not belong to the present values of the unknowns.
+    After an alarm, the samples since the jump are assimilated again, from a state before the jump:
+    they have led the state away, and earlier readings depend on other values of the unknowns.
     """
-    if not interval.present.any():  # there is no innovation, and `newest` is that of before
+    if not interval.present.any():  # there is no innovation; `newest` is from an earlier sample
         return new, report
     watch, alarm = watched(work, jumps, state, new.now, work.filter.span(interval))
     new = changed(new, watch=watch)
@@ -286,7 +286,7 @@ def _jumped(
     screened, e = new.now.screened, new.now.innovations.newest
     row = int(state.since_older[0])
     known = [*_since(work, state, row), interval]
-    # Values that the gate has refused in a row do not count in the onset, and belong to it.
+    # `onset` ignores readings that the gate refused in a row, but the jump may explain them.
     doubted = int(np.where(screened.aside, 0, screened.refused).max())
     moving = np.where(state.watch.repeating(screened.run), np.nan, e)
     onset = max(jumps.onset(state.watch, moving), doubted)
@@ -295,11 +295,11 @@ def _jumped(
     x = changed(work.filter.relinearised(state.older), kept=new.now.kept)
     x, status = _after(work, x, known[:before])
     start = work.filter.inflated(x, jumps.size, work.jumping)
-    # Rows of samples that this member did not take have no time: they are not counted.
+    # Rows without a time are samples that this member did not assimilate.
     taken = np.flatnonzero(np.isfinite(state.log[0, row:, 0]))
-    again, found = _retaken(work, new, start, row + int(taken[before]), known[before:])
-    if status.ok and found.status.ok:
-        new = again
+    restart, outcome = _retaken(work, new, start, row + int(taken[before]), known[before:])
+    if status.ok and outcome.status.ok:
+        new = restart
     else:
         now = work.filter.relinearised(new.now)
         new = new_window(work, work.filter.inflated(now, jumps.size, work.jumping), new)

@@ -1,4 +1,4 @@
-"""Diagnostics of a step: innovation statistics, safeguards, jumps, shifts, numbers of a law."""
+"""Diagnostics of a step: innovation statistics, safeguards, jumps, and other numbers of a law."""
 
 from __future__ import annotations
 
@@ -19,13 +19,12 @@ Other = TypeVar("Other")
 
 @dataclass(frozen=True, eq=False)
 class Diagnostics(Generic[Number]):
-    """Diagnostics of a step; NaN where a law has no such number.
+    """Diagnostics of a step; NaN if the law does not compute a number.
 
-    A number is a float, or an array over members. In tables and files it has the name of its
-    attribute.
+    A number is a float, or an array over members. Tables and files use the names of the attributes.
 
-    >>> found = Diagnostics(alpha=2.0, extra={"damping": 3.0})
-    >>> found.alpha, found.jump, found.named()
+    >>> diagnostics = Diagnostics(alpha=2.0, extra={"damping": 3.0})
+    >>> diagnostics.alpha, diagnostics.jump, diagnostics.named()
     (2.0, nan, {'alpha': 2.0, 'damping': 3.0})
 
     Attributes
@@ -38,32 +37,32 @@ class Diagnostics(Generic[Number]):
         Natural logarithm of the likelihood of all readings so far, with the unknowns integrated
         out; see `Result.log_evidence`.
     noise_level
-        Noise found, over that stated.
+        Estimated noise over its stated value.
     refused
-        Readings that the gate refused.
+        Number of readings that the gate refused.
     bounded
-        Coefficients that a bound holds.
+        Number of coefficients beyond their range about the prior (`within`).
     iterated, tempered, held, restarted, runaway
-        1 if a safeguard has done so with the sample: see `Guards`.
+        1 if the safeguard of this name acted on the sample: see `Guards`.
     smoother_moved
-        Distance by which the iterated smoother of the start has moved the unknowns, in standard
-        deviations.
+        Change of the unknowns by the iterated smoother at the start, in standard deviations.
     jump, jump_samples
-        1 if the test for sudden changes has raised an alarm, and samples since the change.
+        1 if the test for sudden changes raised an alarm, and number of samples since the change.
     residual
-        Norm of r in X for `GradientLaw` and its relatives.
+        Norm of r in X for `GradientLaw` and related laws.
     alpha, misfit
-        Smoothing of the observed part, and the distance of u_alpha from the sample.
+        Smoothing parameter of the observed part, and distance of u_alpha from the sample.
     gain, information, departure
-        Gain, information about q and departure from the prior for `gain="auto"`.
+        Gain, information about q and distance from the prior for `gain="auto"`.
     at_rest
-        1 if q was held because nothing excites it.
+        1 if q was held for lack of excitation.
     shadow_failed, mesh_unfollowed
-        Steps in which a discretisation error could not be followed; 1 if that of the mesh is not.
+        Number of steps without an estimate of a discretisation error; 1 if there is none for the
+        mesh.
     shifts
-        Shifts of the unknowns by errors of the discretisation.
+        Shifts of the unknowns due to discretisation errors.
     extra
-        Name -> number: diagnostics of a law of one's own.
+        Name -> number: further diagnostics, for example of a user-defined law.
     """
 
     innovation_ratio: Number = NOT_KNOWN
@@ -93,7 +92,7 @@ class Diagnostics(Generic[Number]):
     extra: Mapping[str, Number] = field(default_factory=dict)
 
     def named(self) -> dict[str, Number]:
-        """Return the numbers that are known, by their names in tables and files."""
+        """Return the known numbers, by their names in tables and files."""
         more = self.shifts.named() | dict(self.extra)
         return self._own() | {name: number for name, number in more.items() if known(number)}
 
@@ -103,34 +102,34 @@ class Diagnostics(Generic[Number]):
         return Diagnostics(**own, shifts=self.shifts.each(change), extra=extra)
 
     def updated(self, more: Diagnostics[Number]) -> Diagnostics[Number]:
-        """Return the diagnostics with all that others know instead."""
-        found: dict[str, Any] = more._own()
+        """Return the diagnostics with their values replaced by the known values of `more`."""
+        parts: dict[str, Any] = more._own()
         if more.shifts.sizes:
-            found["shifts"] = more.shifts
-        return replace(self, **found, extra={**self.extra, **more.extra})
+            parts["shifts"] = more.shifts
+        return replace(self, **parts, extra={**self.extra, **more.extra})
 
     def member(self: Diagnostics[Array], k: int) -> Diagnostics[float]:
         return self.each(lambda number: float(number[k]))
 
     def _own(self) -> dict[str, Any]:
         own = vars(self)
-        some = ((name, own[name]) for name in OWN if own[name] is not NOT_KNOWN)
-        return {name: number for name, number in some if known(number)}
+        pairs = ((name, own[name]) for name in OWN if own[name] is not NOT_KNOWN)
+        return {name: number for name, number in pairs if known(number)}
 
 
 OWN = tuple(item.name for item in fields(Diagnostics) if item.name not in ("shifts", "extra"))
 
 
 def stacked(members: Sequence[Diagnostics[float]]) -> Diagnostics[Array]:
-    """Return diagnostics of members as arrays, with NaN for members without."""
+    """Return the diagnostics of members as arrays, with NaN where a member has no value."""
 
     def column(numbers: Sequence[float]) -> Any:
         return NOT_KNOWN if all(map(math.isnan, numbers)) else np.array(numbers)
 
     def columns(tables: Sequence[Mapping[Any, float]]) -> dict[Any, Any]:
         names = dict.fromkeys(name for table in tables for name in table)
-        found = {name: column([table.get(name, math.nan) for table in tables]) for name in names}
-        return {name: numbers for name, numbers in found.items() if known(numbers)}
+        arrays = {name: column([table.get(name, math.nan) for table in tables]) for name in names}
+        return {name: numbers for name, numbers in arrays.items() if known(numbers)}
 
     shifts = [one.shifts for one in members]
     return Diagnostics(

@@ -1,4 +1,4 @@
-"""Causes that the verdict on a filter tests, its largest innovations, and how steps ended."""
+"""Verdict on a filter: judge, additional findings, errors of the model, and failed steps."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ from livepde.verdict import (
 )
 from livepde.verdict.sentences import FINDINGS, percent
 
-COARSE = 10.0  # times the error of a step that is allowed, from which the verdict is a caution
-LARGER = 1.5  # noise over its first guess from which the first samples had too much weight
-LARGE = 1.0  # misfit over noise that is looked into though no test has found it
-COUNTS = len(STATUS_CODES) + 1  # of a `StepLedger`
+COARSE = 10.0  # error of a step over its tolerance, above which the finding is a caution
+LARGER = 1.5  # noise over its initial guess, above which the first samples had too much weight
+LARGE = 1.0  # misfit over noise that a column must explain if no test has found a misfit
+COUNTS = len(STATUS_CODES) + 1  # number of counts of a `StepLedger`
 
-SOME = 0.02  # share of the samples from which failed steps are more than a mishap
-MOST = 0.5  # share from which little is left of the data
+SOME = 0.02  # share of failed steps above which the finding is a caution
+MOST = 0.5  # share of failed steps above which the result is not to be trusted
 PLACES = {code: place for place, code in enumerate(STATUS_CODES)}
-FAILURES = ("departed", "not_converged", "not_finite", "singular")  # codes with a finding each
+FAILURES = ("departed", "not_converged", "not_finite", "singular")  # each code has a finding
 
 
 def judge_of(
@@ -58,29 +58,29 @@ def judge_of(
     *,
     kept: bool,
 ) -> Judge | None:
-    """Return the judge of a filter; None if there is to be none."""
+    """Return the judge of a filter; None if `verdict` is False."""
     if not verdict:
         return None
     still = kept and not (reduction.moves or problem.input_noise)
     model = problem.model
     dictionary = Dictionary(model, problem.observed, noise, reduction.stay, dearer=verdict is True)
     sizes = problem.observed.size, reduction.size, model.X.dim
-    # Noise of inputs, and errors of the start, add rows before they are compressed.
+    # Noise of inputs and errors of the start add rows before a compression.
     rows = rank + input_rank(problem) + problem.initial_rank
     return Judge(dictionary, *sizes, rows, still=still)
 
 
 def judged(filter_: Filter, x: FilterState, kept: FilterState) -> Callable[[], Verdict]:
-    """Return a function that gives the verdict on one member, and holds no more than that needs.
+    """Return a function for the verdict on one member, which references only the data it uses.
 
-    `kept` is the filter state without what only its next steps and its verdict need.
+    `kept`: result of `kept_for_estimates` for the filter state.
     """
     judge, ledger, causes = filter_.judge, x.ledger, x.causes
     if judge is None:
         return lambda: Verdict.of((), ("innovations: verdict = False",), judged=False)
     if not ledger.seen[0]:
         return lambda: Verdict.of((), (too_few("innovations", 0),), judged=False)
-    # The answers of the process are states of the size of u, which no finding reads.
+    # Responses of the process have the size of u, and no finding uses them.
     if ledger.process.size:
         ledger = changed(ledger, process=ledger.process[:, :0, :0].copy())
 
@@ -94,10 +94,7 @@ def judged(filter_: Filter, x: FilterState, kept: FilterState) -> Callable[[], V
 
 
 def with_fit(verdict: Verdict, fit: Fit | None) -> Verdict:
-    """Return a verdict with findings on the last fit of the samples.
-
-    That it has not converged, or has left out more than 2 % of the readings.
-    """
+    """Return a verdict with findings if the last fit did not converge or refused many readings."""
     if fit is None:
         return verdict
     found = []
@@ -114,9 +111,9 @@ def with_fit(verdict: Verdict, fit: Fit | None) -> Verdict:
 
 
 def with_noise(verdict: Verdict, work: SensitivityWork, level: float) -> Verdict:
-    """Return a verdict that names a noise which was found after samples had used a smaller one.
+    """Return a verdict with a finding if the first samples used a noise much too small.
 
-    `level`: variance of the noise over that of the guess. A refit takes all samples again.
+    `level`: noise variance over its initial guess. With a refit, all samples use the same level.
     """
     ratio = math.sqrt(level)
     if work.refit is not None or not work.options.adaptive or not ratio > LARGER:
@@ -127,18 +124,18 @@ def with_noise(verdict: Verdict, work: SensitivityWork, level: float) -> Verdict
 
 
 def after_fit(verdict: Verdict, fit: Fit | None) -> Verdict:
-    """Return a verdict at the end of a run, where a fit of all its samples has converged.
+    """Return a verdict at the end of a run without refusals by the gate, if its fit converged.
 
-    The fit decides on all readings again: earlier refusals by the gate do not count.
+    A converged fit of all samples decides on all readings again.
     """
     if fit is None or not fit.converged:
         return verdict
-    kept = [one for one in verdict.findings if one.what != "refused"]
+    kept = [finding for finding in verdict.findings if finding.what != "refused"]
     return Verdict.of(kept, verdict.untested, verdict.unseen, judged=verdict.judged)
 
 
 def with_discretisation(verdict: Verdict, shadows: ShadowSet | None, s: ShadowState) -> Verdict:
-    """Return a verdict that names the errors of the discretisation which are not held."""
+    """Return a verdict with findings on discretisation errors that are large or not estimated."""
     missing = "the discretisation: shadows = None" if shadows is None else shadows.unfollowed
     if shadows is not None and s.coarse[0]:
         worst = float(s.coarsest[0])
@@ -149,10 +146,10 @@ def with_discretisation(verdict: Verdict, shadows: ShadowSet | None, s: ShadowSt
             allowed=ALLOWED,
             parts=shadows.most,
         )
-        # The shift by errors that are so large is estimated with few correct digits.
+        # For such large errors, the estimated shift has few correct digits.
         severity: Severity = "caution" if worst > COARSE else "note"
-        found = Finding("step", severity, text, "time step", worst, remedy=remedy)
-        verdict = verdict.with_findings([found])
+        finding = Finding("step", severity, text, "time step", worst, remedy=remedy)
+        verdict = verdict.with_findings([finding])
     if not missing or not verdict.judged:
         return verdict
     text, _ = FINDINGS["untested"].filled(what=missing)
@@ -161,7 +158,7 @@ def with_discretisation(verdict: Verdict, shadows: ShadowSet | None, s: ShadowSt
 
 
 def with_assumed_start(verdict: Verdict) -> Verdict:
-    """Return a verdict that names the initial state of zero, which nobody stated, as a suspect."""
+    """Return a verdict whose findings include the default initial state of zero as a suspect."""
     if verdict.level == "trusted" or not verdict.findings:
         return verdict
     text, remedy = FINDINGS["start, assumed"].filled()
@@ -169,19 +166,19 @@ def with_assumed_start(verdict: Verdict) -> Verdict:
 
 
 def with_columns(verdict: Verdict, columns: Columns | str) -> Verdict:
-    """Return a verdict that names the columns of the data which explain a misfit."""
+    """Return a verdict with the data columns that may explain a misfit."""
     doubted = any(finding.severity != "note" for finding in verdict.findings)
     if verdict.level == "trusted" or not (verdict.judged or doubted):
         return verdict
     if isinstance(columns, str):
         return verdict.with_untested(f"errors of single columns: {columns}")
-    # Slow noise is a misfit, too, of which a column may explain a part by chance.
+    # Slow noise is a misfit too, and a column may explain a part of it by chance.
     known = any(finding.what == "misfit" for finding in verdict.findings)
     return verdict.with_causes(likely_columns(columns, 0.0 if known else LARGE))
 
 
 def with_errors(verdict: Verdict, work: SensitivityWork, state: SensitivityState) -> Verdict:
-    """Return a verdict whose level follows from fit and effect, where these can be computed."""
+    """Return a verdict whose level follows from the misfit and its effects, if available."""
     if verdict.level == NOT_JUDGED:
         return verdict
     errors = _errors(work, state)
@@ -191,14 +188,14 @@ def with_errors(verdict: Verdict, work: SensitivityWork, state: SensitivityState
 
 
 def _errors(work: SensitivityWork, state: SensitivityState) -> ModelErrors | str:
-    """Return misfit and effects of one member, or why there are none."""
+    """Return misfit and effects for one member, or the reason why there are none."""
     filter_, x = work.filter, state.now
     Phi, (_, C) = filter_.reduction.Phi, reported_factors(filter_, x)
     shift = np.zeros(len(Phi))
     if filter_.shadows is not None:
         shift = Phi @ filter_.shadows.widening(x)[1][0, 0]
     std = np.linalg.norm(Phi @ C[0].T, axis=1)
-    # What samples before the window have told would be taken as exact.
+    # In a later window, the information of earlier samples would count as exact.
     if work.refit is None or work.unstored(state) or state.window[0]:
         return errors_of_innovations(filter_, x, state.scale.ranges[0], std, shift)
     return model_errors(StoredSamples.of(work, state), work.refit, std, shift)
@@ -210,17 +207,18 @@ def _position(filter_: Filter, x: FilterState) -> Position:
     _, C = reported_factors(filter_, x)
     std = np.linalg.norm(reduction.Phi @ C[0].T, axis=1)
     std = np.where(std > 0.0, std, np.inf)
-    # C^T w is truth less estimate for a cause of amplitude one: see `livepde.verdict.judge`.
+    # C^T w is truth minus estimate for a cause of amplitude 1: see `livepde.verdict.judge`.
     moved = (reduction.Phi @ (x.C[0].T @ x.causes[0])) / std[:, None]  # (m, columns)
     shape = (len(x.ledger.age[0]), -1)
-    found: dict[str, Array] = {}
+    by_label: dict[str, Array] = {}
     for name, item in latent.parts.items():
         rows = moved[item.part.start : item.part.start + item.size]
         labels = item.block.labels(name)
         if len(labels) == len(rows):
-            found |= {label: row.reshape(shape) for label, row in zip(labels, rows, strict=True)}
+            pairs = zip(labels, rows, strict=True)
+            by_label |= {label: row.reshape(shape) for label, row in pairs}
         else:
-            found[name] = np.sqrt((rows**2).mean(axis=0)).reshape(shape)
+            by_label[name] = np.sqrt((rows**2).mean(axis=0)).reshape(shape)
     a = reduction.reduced(filter_.estimate(x) - latent.prior)[0]
     names = [""] * reduction.size
     for label, place in reduction.stay:
@@ -229,7 +227,7 @@ def _position(filter_: Filter, x: FilterState) -> Position:
     since, off = screened.since[0].tolist(), screened.off[0].tolist()
     return Position(
         ledger=x.ledger.of_member(0),
-        moved=found,
+        moved=by_label,
         distance=_distance(reduction, x, a),
         sensors=sensors,
         noise=np.sqrt(x.level[0]) * filter_.noise,
@@ -247,33 +245,33 @@ def _position(filter_: Filter, x: FilterState) -> Position:
 def _distance(reduction: Reduction, x: FilterState, a: Array) -> tuple[float, int]:
     """Return the squared distance of an estimate from its prior, and its degrees of freedom.
 
-    The distance is over the directions where the data have halved the prior variance: there the
-    estimate is distributed as N(0, 1 - P), prior less posterior covariance.
+    Only directions in which the data have halved the prior variance count. There the estimate has
+    the distribution N(0, 1 - P), with the prior covariance 1 and the posterior covariance P.
     """
     if reduction.moves:
         return 0.0, 0
-    left, axes = np.linalg.eigh(x.C[0].T @ x.C[0])
-    told = left < 0.5
+    variances, axes = np.linalg.eigh(x.C[0].T @ x.C[0])
+    known = variances < 0.5
     along = axes.T @ a
-    squared = float((along[told] ** 2 / (1.0 - left[told])).sum())
-    return squared, int(told.sum())
+    squared = float((along[known] ** 2 / (1.0 - variances[known])).sum())
+    return squared, int(known.sum())
 
 
 class StepLedger(NamedTuple):
     """Numbers of samples by the status of their step, in the order of `STATUS_CODES`.
 
-    The last number counts the intervals whose substeps were longer than `dt_max`.
+    The last count is the number of intervals whose substeps were longer than `dt_max`.
     """
 
     counts: IntArray
-    lengths: Array  # of the first interval, from t0 on, and of all later ones, shape (2,)
+    lengths: Array  # length of the first interval, from t0 on, and sum of the others, shape (2,)
 
     @classmethod
     def start(cls) -> StepLedger:
         return cls(np.zeros(COUNTS, dtype=np.int64), np.zeros(2))
 
     def add(self, code: str, length: float, stretched: bool) -> StepLedger:
-        """Return the value after a sample whose step ended with a status."""
+        """Return the ledger after a step with the status `code`."""
         counts, lengths = self.counts.copy(), self.lengths.copy()
         lengths[int(counts[:-1].sum() > 0)] += length
         counts[PLACES[code]] += 1
@@ -282,19 +280,19 @@ class StepLedger(NamedTuple):
 
     @property
     def _late(self) -> float:
-        """Length of the first interval over the mean of the later ones; 0 for a few."""
+        """Length of the first interval over the mean of the others; 0 for few samples."""
         first, later = self.lengths.tolist()
         count = int(self.counts[:-1].sum()) - 1
         return first * count / later if count >= SETTLED and later > 0.0 else 0.0
 
     @property
     def irregular(self) -> bool:
-        """Whether any step was not ok, had too long substeps, or the first sample came late."""
+        """True if a step was not ok or had too long substeps, or if the first sample was late."""
         counts = self.counts.tolist()
         return bool(sum(counts) > counts[PLACES["ok"]]) or self._late > PAUSE
 
     def findings(self) -> Iterator[Finding]:
-        """Return a finding for each way in which steps have failed, and on long intervals."""
+        """Yield a finding for each kind of failed step, for a late start and for long substeps."""
         *counts, stretched = self.counts.tolist()
         yield from step_findings(dict(zip(STATUS_CODES, counts, strict=True)))
         if self._late > PAUSE:
@@ -306,7 +304,7 @@ class StepLedger(NamedTuple):
 
 
 def step_findings(counts: Mapping[str, int]) -> Iterator[Finding]:
-    """Return a finding for each way in which steps have failed."""
+    """Yield a finding for each kind of failed step, from the number of samples by status."""
     samples = sum(counts.values())
     for code in FAILURES:
         count = counts.get(code, 0)
@@ -314,7 +312,7 @@ def step_findings(counts: Mapping[str, int]) -> Iterator[Finding]:
             continue
         text, _ = FINDINGS[code].filled(count=count, samples=samples)
         share, departed = count / samples, code == "departed"
-        # A right model departs in one of a million cases: there is no mishap of that sort.
+        # With a right model, one in a million cases departs: any departure is significant.
         severity: Severity = "caution" if departed or share > SOME else "note"
         if share > (SOME if departed else MOST):
             severity = "do not trust"
