@@ -1,22 +1,22 @@
-"""Fixed-interval smoother: state and unknowns at each sample, given those before and after it.
+"""Fixed-interval smoother: state and unknowns at each sample, given all samples.
 
-The filter carries x = m + [U C]^T xi with xi ~ N(0, I). From one sample to the next xi' is made of
-xi and of the process noise in between by rotations, truncations and the contraction of the update,
-so that the two are jointly Gaussian:
+The filter represents x = m + [U C]^T xi with xi ~ N(0, I). Between two samples, rotations,
+truncations and the contraction of the update map xi and the process noise to xi'. Therefore xi and
+xi' are jointly Gaussian:
 
-    xi = g + T^T xi' + R^T zeta,    T = E[xi' xi^T | z'],  g = E[xi | z'],  R^T R = I - P^T P,
+    xi = g + T^T xi' + R^T zeta,    T = E[xi' xi^T | z'],  g = E[xi | z'],  R^T R = I - P^T P.
 
-P being T before the update and zeta ~ N(0, I) the part that the truncation drops.
-(`FilterState.past` and `dpast` follow xi through predict and update: T and g are the images of I
-and 0.) So given all samples xi ~ N(mu, B^T B) follows backward, in as many coordinates as the
-square root has rows, from mu = 0 and B = I at the end (Rauch, Tung and Striebel 1965):
+Here P is T before the update, and zeta ~ N(0, I) is the part that the truncation drops.
+`FilterState.past` and `dpast` propagate xi through predict and update: T and g are the images of I
+and 0. The distribution xi ~ N(mu, B^T B) given all samples follows backwards in time from mu = 0
+and B = I at the end (Rauch, Tung and Striebel 1965). It has one coordinate for each row:
 
     mu = g + T^T mu',    B = upper triangle of a QR factorisation of [B' T; R]
 
-The smoother is linear about one trajectory of the unknowns. This trajectory begins at the estimates
-of the run, for constant unknowns at their last one, and is moved to the smoothed one by damped
-Gauss-Newton steps that make samples and prior together more probable (Bell 1994), until these
-change it by less than a tenth of a standard deviation.
+The smoother is linear about one trajectory of the unknowns. The trajectory starts as the estimates
+of the run, or as the last estimate of constant unknowns. Damped Gauss-Newton steps, which increase
+the joint probability of samples and prior (Bell 1994), move it to the smoothed trajectory. They end
+when the change is less than a tenth of a standard deviation.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.linalg.member_arrays import changed
 from livepde.stepping import KeptFactors, Span
 
-ITERATIONS = 6  # Gauss-Newton steps at most
-HALVINGS = 2  # of a step that makes samples and prior less probable
-CONVERGED = 0.1  # standard deviations that a step moves the trajectory by, at the end of it
-STRIDE = 2.0  # prior standard deviations that a step moves an unknown at most
+ITERATIONS = 6  # largest number of Gauss-Newton steps
+HALVINGS = 2  # largest number of halvings of a step that makes samples and prior less probable
+CONVERGED = 0.1  # standard deviations: convergence at a step of this size
+STRIDE = 2.0  # largest step of an unknown, in prior standard deviations
 ROUNDING = 1e-12  # share of a variance
 
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """A filter after a sample, with g and T since the one before as `dpast` and `past`, and R."""
+    """A filter after a sample, with g and T as `dpast` and `past`, and R, since the last sample."""
 
     x: FilterState
     R: Array
@@ -53,10 +53,10 @@ class _Point:
 
 @dataclass(frozen=True, eq=False)
 class _SmootherPass:
-    """The samples, filtered about a trajectory of reduced unknowns, shape (1 + intervals, k).
+    """Filters about a trajectory of reduced unknowns, shape (1 + intervals, k).
 
-    `misfit` is minus twice the logarithm of the trajectory's probability, up to a constant, and
-    `decisions` are those of the gate, the first one on the sample at the start.
+    `misfit` is minus twice the log probability of the trajectory, up to a constant. `decisions` are
+    the gate's decisions on the samples, beginning with the sample at the start.
     """
 
     trajectory: Array
@@ -66,7 +66,7 @@ class _SmootherPass:
 
     @property
     def refuses(self) -> bool:
-        return any(np.count_nonzero(one.refused) for one in self.decisions)
+        return any(np.count_nonzero(decision.refused) for decision in self.decisions)
 
 
 def smoothed(
@@ -76,15 +76,15 @@ def smoothed(
     data: FixedInterval,
     used: Mask | None = None,
 ) -> Iterator[FilterState]:
-    """Iterate over the smoothed filters of one member, the last one first.
+    """Iterate over the smoothed filters of one member, backwards in time.
 
-    States that are not asked for have no coefficients.
+    States at times that are not in `data.fields` have no coefficients.
 
-    `before`, `after`: the member before the first sample, and its filter after the last one in the
-    run: its noise level and the statistics of its innovations are those of all samples. `used`:
-    readings of the last samples that a refit has used, (samples, sensors); None: there is none.
+    `before`: the member before the first sample. `after`: its filter after the last sample in the
+    run, whose noise level and innovation statistics are used. `used`: readings of the last samples
+    that a refit used, (samples, sensors); None without a refit.
     """
-    with nonfinite_allowed():  # not finite: not used
+    with nonfinite_allowed():  # passes with nonfinite results are not used
         best = _descended(*_begun(work, before, after, data, used))
     return _backward(best, after)
 
@@ -96,12 +96,11 @@ def _begun(
     data: FixedInterval,
     used: Mask | None,
 ) -> tuple[_FixedInterval, _SmootherPass | None]:
-    """Return the samples with the gate's decisions on them, and a first pass; None if all fail.
+    """Return the samples with the gate's decisions, and a first pass or None if all fail.
 
-    The readings are those that the run uses, in each pass, and its refit where there is one. The
-    gate of the run knows the errors of the discretisation, which widen it: what it uses without
-    them it uses with them. So these, which cost twice as much again, are followed only where it
-    refuses a reading.
+    Each pass uses the same readings as the run, or as its refit if there is one. The discretisation
+    errors widen the gate of the run, so that it uses any reading used without them. They triple the
+    cost, and are computed only if the gate refuses a reading.
     """
     start, initial = unjudged(work.at_level(before.now, after)), bool(before.initial[0])
     work = replace(work.unjudged, options=replace(work.options, adaptive=False))
@@ -109,7 +108,7 @@ def _begun(
     bare = _FixedInterval(work.unaccompanied, unaccompanied(start), initial, after, data)
     best = bare.about(bare.estimated)
     if best is None or best.refuses:
-        # Unknowns that move are estimated about each estimate in turn, those that stay about one.
+        # Try moving unknowns about each successive estimate first, constants about one trajectory.
         first, other = (None, whole.estimated) if whole.moves else (whole.estimated, None)
         best = whole.about(first) or whole.about(other)
     if best is None:
@@ -122,16 +121,16 @@ def _begun(
 
 
 def _fitted(decisions: list[GateDecision], used: Mask, data: FixedInterval) -> list[GateDecision]:
-    """Return the gate's decisions, those on the last samples as a refit has made them."""
+    """Return the gate's decisions, with a refit's decisions on the last samples."""
     first = len(decisions) - len(used)
-    found = decisions[:first]
+    fitted = decisions[:first]
     for decision, kept, sample in zip(
         decisions[first:], used, [data.opening, *data.intervals][first:], strict=True
     ):
         refused = (np.isfinite(sample.z1) & ~kept)[None]
-        found.append(GateDecision(refused, decision.anchored & refused))
-    alike = all((a.refused == b.refused).all() for a, b in zip(found, decisions, strict=True))
-    return decisions if alike else found
+        fitted.append(GateDecision(refused, decision.anchored & refused))
+    equal = all((a.refused == b.refused).all() for a, b in zip(fitted, decisions, strict=True))
+    return decisions if equal else fitted
 
 
 def _descended(samples: _FixedInterval, best: _SmootherPass | None) -> _SmootherPass:
@@ -141,18 +140,18 @@ def _descended(samples: _FixedInterval, best: _SmootherPass | None) -> _Smoother
             "smaller dt_max, or a prior closer to what the run found."
         )
     for _ in range(ITERATIONS):
-        # One by one: the filters of all samples at once, with their states, may need much memory.
-        found = [
+        # A list of the filters at all samples, with their states, may need too much memory.
+        moments = [
             (_reduced(samples.work, x, x.da), np.linalg.norm(x.C[0], axis=0))
             for x in _backward(best, best.points[-1].x)
         ]
-        target, std = map(np.array, zip(*reversed(found), strict=True))
+        target, std = map(np.array, zip(*reversed(moments), strict=True))
         step = target - best.trajectory
         if (np.abs(step) <= CONVERGED * std + ROUNDING).all():
             break
         step *= min(1.0, STRIDE / float(np.abs(step).max()))
         tried = (samples.about(best.trajectory + 0.5**k * step) for k in range(HALVINGS + 1))
-        better = next((one for one in tried if one and one.misfit < best.misfit), None)
+        better = next((trial for trial in tried if trial and trial.misfit < best.misfit), None)
         if better is None:
             break
         best = better
@@ -160,10 +159,10 @@ def _descended(samples: _FixedInterval, best: _SmootherPass | None) -> _Smoother
 
 
 def _backward(best: _SmootherPass, after: FilterState) -> Iterator[FilterState]:
-    """Iterate backward over the filters given all samples.
+    """Iterate backwards over the filters given all samples.
 
-    Innovations are those of the run, and so is by how much discretisation has shifted the unknowns
-    in the end; of the state the shift is known at the end only.
+    The innovation statistics, and the shift of the unknowns by discretisation errors, are taken
+    from the end of the run. The shift of the state is known at the end only.
     """
     rows = best.points[-1].x.C.shape[1]
     mu, B = np.zeros(rows), np.eye(rows)
@@ -182,7 +181,7 @@ def _backward(best: _SmootherPass, after: FilterState) -> Iterator[FilterState]:
         shadows = changed(shadows, u=0.0 * shadows.u, fine=0.0 * shadows.fine)
         T = x.past[0]
         mu = x.dpast[0] + mu @ T
-        # A square root is one up to rotations of its rows: the triangle is enough.
+        # A square root is unique up to rotations of its rows: the triangle suffices.
         B = np.asarray(np.linalg.qr(np.vstack([B @ T, point.R]), mode="r"))
 
 
@@ -194,14 +193,14 @@ def _reduced(work: SensitivityWork, x: FilterState, da: Array | float = 0.0) -> 
 
 @dataclass(frozen=True, eq=False)
 class _FixedInterval:
-    """The samples of one member, ready to be filtered about trajectories of its unknowns."""
+    """The samples of one member, to be filtered about trajectories of its unknowns."""
 
     work: SensitivityWork
     start: FilterState
-    initial: bool  # True if it begins with the initial state that the model says
+    initial: bool  # True if the start is the initial state of the model (`Model.initial`)
     after: FilterState
     data: FixedInterval
-    # Those of the gate on the samples, the first one at the start; None: it decides.
+    # Decisions of the gate, beginning with the sample at the start; None: the gate decides.
     decisions: Sequence[GateDecision] | None = None
 
     @property
@@ -215,14 +214,14 @@ class _FixedInterval:
         options = self.work.options
         if self.decisions is not None:
             options = replace(options, decision=self.decisions[number])
-        x, told = absorb(self.work.filter, x, span, options)
-        none = np.zeros_like(told.refused)
-        anchored = none if told.anchored is None else told.anchored
-        return x, GateDecision(told.refused, anchored)
+        x, outcome = absorb(self.work.filter, x, span, options)
+        none = np.zeros_like(outcome.refused)
+        anchored = none if outcome.anchored is None else outcome.anchored
+        return x, GateDecision(outcome.refused, anchored)
 
     @property
     def estimated(self) -> Array:
-        """Trajectory of the run's estimates; coordinates without process noise are traced back."""
+        """Trajectory of the run's estimates; constant coordinates follow from the last estimate."""
         reduction, none = self.work.filter.reduction, np.zeros((1, self.work.filter.reduction.size))
         prior = self.work.filter.problem.model.latent.prior
         a = np.atleast_2d(reduction.reduced(np.array(self.data.q) - prior))
@@ -233,11 +232,11 @@ class _FixedInterval:
         return a
 
     def about(self, trajectory: Array | None) -> _SmootherPass | None:
-        """Filter the samples, linear about a trajectory or each estimate; None if that fails."""
+        """Filter the samples about a trajectory, or about each estimate; None if a step fails."""
         x, misfit, decision = self._started(trajectory)
         rows = x.C.shape[1]
-        nothing = changed(x, past=np.eye(rows)[None], dpast=np.zeros((1, rows)))  # lies before
-        points = [self._kept(nothing, 0, np.zeros((0, rows)))]
+        first = changed(x, past=np.eye(rows)[None], dpast=np.zeros((1, rows)))
+        points = [self._kept(first, 0, np.zeros((0, rows)))]
         followed, decisions = [_reduced(self.work, x)], [decision]
         filter_ = self.work.filter
         for number, interval in enumerate(self.data.intervals, start=1):
@@ -259,7 +258,7 @@ class _FixedInterval:
             misfit += missed(filter_, x, interval)
             misfit += moved(filter_, followed[-2], followed[-1], h, gained) if self.moves else 0.0
         if trajectory is None or not np.isfinite(misfit):
-            misfit = np.inf  # a pass about each estimate in turn follows no single trajectory
+            misfit = np.inf  # a pass about successive estimates has no single trajectory
         return _SmootherPass(np.array(followed), points, misfit, decisions)
 
     def _started(self, trajectory: Array | None) -> tuple[FilterState, float, GateDecision]:
@@ -279,25 +278,25 @@ class _FixedInterval:
             length=end - opening.t1,
         )
         x = placed(filter_, window, filter_.reduction.bounded(q))
-        # Coordinates xi of the shift: its probability at the start goes with exp(-|xi|^2/2).
+        # The probability density of a shift with coordinates xi is proportional to exp(-|xi|^2/2).
         weights = coordinates(start.C[0], shift)
         misfit = float(weights @ weights)
         span = filter_.span(filter_.problem.unread(opening))
         predicted, Y = filter_.sensors.observe(x, span.end)
         none = np.zeros(predicted.shape, dtype=bool)
         decision = GateDecision(none, none)
-        if filter_.learns(Y):  # as the law begins
+        if filter_.learns(Y):  # the rule of `SensitivityLaw.begin`
             misfit += missed(filter_, x, opening)
             x, decision = self._absorbed(x, span, 0)
         return x, misfit, decision
 
     def _gained(self, variance: Array, number: int, h: float) -> Array:
-        """Return the variance that coordinates gain in an interval, with a jump, shape (k,)."""
+        """Return the variance that coordinates gain in an interval, with its jumps, shape (k,)."""
         filter_, jumps = self.work.filter, self.work.jumps
         drifts = filter_.drifts(self.after.member)
         gained = filter_.reduction.gained(h, variance, drifts)[0]
         if jumps is not None and number in self.data.jumps:
-            # The jump is at the beginning of the interval, and is carried to its end.
+            # The jump is at the start of the interval, and is propagated to its end.
             F = filter_.reduction.transition(h)
             gained = gained + jumps.size**2 * (F**2 @ self.work.jumping)
         return np.asarray(gained)
@@ -313,7 +312,7 @@ class _FixedInterval:
         return x, x.past[0] if failure is None else None
 
     def _kept(self, x: FilterState, number: int, R: Array) -> _Point:
-        """Return a point with the state where it is asked for."""
+        """Return the point of a sample, with the state only if it is in `data.fields`."""
         x = changed(unaccompanied(x), kept=KeptFactors.none(1))
         if number not in self.data.fields:
             x = changed(x, u=x.u[:, :0], du=x.du[:, :0], U=x.U[:, :, :0])
