@@ -170,7 +170,7 @@ class Gate:
         aside = aside & ~back
         refused, changes = np.where(back, 0, refused), np.where(back, 0, changes)
         kept = used & ~aside & (~misfit | late)
-        again = misfit & (refused > 1) & ~aside & ~implausible & (~outside | together)
+        repeated = misfit & (refused > 1) & ~aside & ~implausible & (~outside | together)
         apart = (refused > self.patience) & ~aside & (x.taken >= SETTLED) & self.anchors
         strain = x.strain + (apart & misfit)
         lasting = (strain > LASTING).any(axis=1)[:, None]
@@ -193,7 +193,7 @@ class Gate:
         # A single misfit does not count as a change of the process; a second in a row may.
         anchored = kept & apart.any(axis=1)[:, None]
         learned = kept & ~anchored
-        return Gated(learned, anchored, learned | again, state.used(z, kept, learned))
+        return Gated(learned, anchored, learned | repeated, state.used(z, kept, learned))
 
     @staticmethod
     def _out_of_range(x: Screened, z: Array, noise: Array) -> tuple[Mask, Mask]:

@@ -56,7 +56,7 @@ class Window:
     length: float  # time since the start
 
 
-def _missed(filter_: Filter, window: Window) -> Array:
+def _estimate_shift(filter_: Filter, window: Window) -> Array:
     """Return the estimate minus the reference, at the start of the window, shape (k,)."""
     reduction, drift = filter_.reduction, float(filter_.drifts(window.now.member)[0])
     estimate = reduction.bounded(filter_.estimate(window.now)[0])
@@ -66,20 +66,20 @@ def _missed(filter_: Filter, window: Window) -> Array:
 
 def next_reference(filter_: Filter, window: Window) -> Array:
     """Return the next reference at the start of the window, towards the estimate, (m,)."""
-    step = _missed(filter_, window)
+    step = _estimate_shift(filter_, window)
     step = step * min(1.0, TRUSTED / max(float(np.abs(step).max()), 1e-300))
     return window.reference + filter_.reduction.Phi @ step
 
 
 def missed_most(filter_: Filter, window: Window) -> float:
     """Return the largest distance of reference and estimate, in prior standard deviations."""
-    return float(np.abs(_missed(filter_, window)).max(initial=0.0))
+    return float(np.abs(_estimate_shift(filter_, window)).max(initial=0.0))
 
 
 def distance(filter_: Filter, window: Window) -> float:
     """Return the distance between estimate and reference, in standard deviations."""
     now = window.now
-    shift = filter_.reduction.transition(window.length) @ _missed(filter_, window)
+    shift = filter_.reduction.transition(window.length) @ _estimate_shift(filter_, window)
     # The inflation makes these the reported standard deviations.
     return deviations(now, shift) / float(now.innovations.inflation[0])
 
@@ -184,7 +184,7 @@ def _searched(
 def iterated_smoother(samples: _Samples) -> _Pass | None:
     """Return the pass about the most probable trajectory; None if all trajectories fail."""
     ends: list[_Pass] = []
-    for trajectory in _beginnings(samples):
+    for trajectory in _initial_trajectories(samples):
         first = samples.about(trajectory)
         if first is None:
             continue
@@ -204,7 +204,7 @@ def usual(x: FilterState) -> bool:
     return bool(squares <= count + 3.0 * math.sqrt(2.0 * count))
 
 
-def _beginnings(samples: _Samples) -> Iterator[Array]:
+def _initial_trajectories(samples: _Samples) -> Iterator[Array]:
     """Yield trajectories to start from, the most promising first."""
     shape = 1 + len(samples.intervals), samples.state.now.C.shape[2]
     if not samples.work.filter.moves:  # the estimate of the filter, which used safeguards
@@ -280,19 +280,19 @@ class _Samples:
         precise = None if self.work.filter.shadows is None else self
         return replace(self, work=work, state=state, precise=precise)
 
-    def explained(self, one: _Pass) -> bool:
+    def explained(self, pass_: _Pass) -> bool:
         """Return True if the misfit of a pass is not significantly larger than the noise.
 
         The sum of m squared residuals, in units of the noise, has the mean m and variance 2 m.
         """
         readings = sum(int(np.isfinite(interval.z1).sum()) for interval in self.intervals)
-        return one.misfit <= readings + 3.0 * math.sqrt(2.0 * readings)
+        return pass_.misfit <= readings + 3.0 * math.sqrt(2.0 * readings)
 
-    def believable(self, one: _Pass) -> bool:
+    def believable(self, pass_: _Pass) -> bool:
         """Return True if the last estimate of a pass is within `within` of the prior then."""
         reduction = self.work.filter.reduction
         parts = reduction.problem.model.latent.parts.values()
-        last = reduction.in_prior_units(one.smoothed[-1][None, None], one.x.age)
+        last = reduction.in_prior_units(pass_.smoothed[-1][None, None], pass_.x.age)
         return bool(np.abs(last).max() <= max(item.unknown.within for item in parts))
 
     @property
@@ -307,7 +307,7 @@ class _Samples:
         result = self._about(trajectory)
         return result if result or self.precise is None else self.precise.about(trajectory)
 
-    def _unlike(self, x: FilterState) -> bool:
+    def _needs_precise(self, x: FilterState) -> bool:
         """Return True if the gate refused a reading that it may use with discretisation errors.
 
         These errors widen the gate, so that a reading used without them is used with them.
@@ -325,7 +325,7 @@ class _Samples:
         if self.state.opening[0]:
             misfit += missed(filter_, x, self.opening)
             x, _ = absorb(filter_, x, filter_.span(self.opening), self.work.options)
-            if self._unlike(x):
+            if self._needs_precise(x):
                 return None
         x = self._remembered(x)
         # The prior at the start is a ~ N(0, I): minus twice its log density is |a|^2.
@@ -338,7 +338,7 @@ class _Samples:
             elif filter_.moves:
                 x = expecting(filter_, x, trajectory[number], h)
             x, outcome = assimilate(filter_, x, filter_.span(interval), self.work.options)
-            if self._unlike(x) or not outcome.good:
+            if self._needs_precise(x) or not outcome.good:
                 return None
             x = self._remembered(x)
             followed.append(reduction.reduced(x.q[0] - prior))

@@ -43,7 +43,7 @@ class MemberSensors:
     def _read(self) -> RowProduct:
         return row_product(sp.csr_array(self.problem.observed.steady_matrix))
 
-    def _seen(self, columns: Array) -> Array:
+    def _observed(self, columns: Array) -> Array:
         """Return G times states, (..., sensors) for (..., n)."""
         readings = self._read(columns.reshape(-1, columns.shape[-1]))
         return readings.reshape(*columns.shape[:-1], readings.shape[1])
@@ -52,7 +52,7 @@ class MemberSensors:
         """Return D of time-independent sensors z = G u + D q; None for other sensors."""
         return None if self.fixed else self.problem.observed.steady_direct(at.member(0))
 
-    def _of_unknowns(self, x: FilterState, D: Array) -> Array:
+    def _direct_part(self, x: FilterState, D: Array) -> Array:
         """Return D q of each member, (members, sensors)."""
         return np.array([D @ self.problem.model.latent.value(q) for q in x.q])
 
@@ -60,10 +60,10 @@ class MemberSensors:
         """Return predictions, (members, sensors), and Y = [U C] H^T, (members, r, sensors)."""
         D = self._direct(at)
         if self.fixed or D is not None:
-            seen = self._seen(x.u + x.du)
+            seen = self._observed(x.u + x.du)
             if D is not None:
                 shift = self.reduction.directions(x.q, x.da[:, None])[:, 0]
-                seen = seen + self._of_unknowns(x, D) + shift @ D.T
+                seen = seen + self._direct_part(x, D) + shift @ D.T
             return seen, self.rows(x, x.U, x.C, at)
         predicted, rows = [], []
         for k in range(len(x)):
@@ -76,7 +76,7 @@ class MemberSensors:
             # The deviation of the estimate is one more row, which keeps predictions linear.
             if deviates:
                 U, C = np.vstack([U, x.du[k]]), np.vstack([C, x.da[k]])
-            z, Y = self._of_one(x.u[k], x.q[k], U, C, at, k)
+            z, Y = self._observe_member(x.u[k], x.q[k], U, C, at, k)
             predicted.append(z + Y[-1] if deviates else z)
             rows.append(Y[: len(x.U[k])])
         return np.array(predicted), np.array(rows)
@@ -91,12 +91,12 @@ class MemberSensors:
         """
         D = self._direct(end(0)) if len(columns) else None
         if self.fixed or D is not None:
-            seen = self._seen(columns)
+            seen = self._observed(columns)
             predicted, Y = seen[:, 0], seen[:, 1:].swapaxes(1, 2)
             if D is None:
                 return predicted, Y
             slopes = self.reduction.directions(x.q, x.C[:, : Y.shape[2]]) @ D.T
-            return predicted + self._of_unknowns(x, D), Y + slopes
+            return predicted + self._direct_part(x, D), Y + slopes
         shape, sensors = columns.shape, self.problem.observed.size
         predicted = np.empty((shape[0], shape[2], sensors))
         Y = np.empty((shape[0], shape[2], shape[1] - 1, sensors))
@@ -109,16 +109,16 @@ class MemberSensors:
         """Return [U C] H^T for rows of each member, (members, rows, sensors)."""
         D = self._direct(at)
         if self.fixed or D is not None:
-            seen = self._seen(U)
+            seen = self._observed(U)
             return seen if D is None else seen + self.reduction.directions(x.q, C) @ D.T
-        each = (self._of_one(x.u[k], x.q[k], U[k], C[k], at, k)[1] for k in range(len(x)))
+        each = (self._observe_member(x.u[k], x.q[k], U[k], C[k], at, k)[1] for k in range(len(x)))
         return np.array(list(each))
 
     def _predicted(self, u: Array, q: Array, at: Moments, k: int) -> Array:
         observed, latent = self.problem.observed, self.problem.model.latent
         return observed.predict(u, latent.value(q), at.member(k))
 
-    def _of_one(
+    def _observe_member(
         self, u: Array, q: Array, U: Array, C: Array, at: Moments, k: int
     ) -> tuple[Array, Array]:
         """Return the predicted readings of member `k`, and [U C] H^T for its rows."""

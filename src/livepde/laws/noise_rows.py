@@ -102,7 +102,7 @@ class NoiseRows:
         last = min(first + length / self.length, 1.0)
         # The tolerance allows for rounding of the times: an inner stage is far from the end.
         inner = t < begun + 0.99 * length
-        return self._rows(_seen(self.lengths, first, last, self.weight, inner))
+        return self._rows(_stage_values(self.lengths, first, last, self.weight, inner))
 
     def _rows(self, paths: Array) -> Array:
         """Return rows of C from the values of ramps and arches, shape (2, moving)."""
@@ -167,7 +167,7 @@ def _mean(lengths: tuple[float, ...], first: float, last: float) -> Array:
 
 
 @lru_cache(maxsize=256)
-def _seen(
+def _stage_values(
     lengths: tuple[float, ...], first: float, last: float, weight: float, inner: bool
 ) -> Array:
     """Return the values of ramp and arch for a stage of a substep, shape (2, moving)."""
@@ -198,9 +198,9 @@ def with_input_errors(
     within a span, the variance is too large by up to a quarter. A row is the change of the state if
     the input changes by one standard deviation, which is exact for a model affine in the input.
     """
-    bare, rows = _bare(x), []
+    bare, rows = _without_tangents(x), []
     for name, size in sizes.items():
-        shifted, _, failure = propagate(bare, _moved(span, name, size))
+        shifted, _, failure = propagate(bare, _with_input_change(span, name, size))
         if failure is not None:
             return end, failure
         rows.append(shifted.u - end.u)
@@ -227,7 +227,7 @@ def unread_inputs(problem: Problem, x: FilterState, span: Span) -> dict[str, Arr
     return sizes
 
 
-def _bare(x: FilterState) -> FilterState:
+def _without_tangents(x: FilterState) -> FilterState:
     """Return a filter state with the linearisation point alone, without tangents or deviation."""
     members, _, n = x.U.shape
     return changed(
@@ -241,7 +241,7 @@ def _bare(x: FilterState) -> FilterState:
     )
 
 
-def _moved(span: Span, name: str, change: float | Array) -> Span:
+def _with_input_change(span: Span, name: str, change: float | Array) -> Span:
     shift = change * (np.arange(len(span.channels)) == span.channels.index(name))
     last = span.inputs1 + shift
     first = last if span.inputs0 is span.inputs1 else span.inputs0 + shift
@@ -270,15 +270,15 @@ def after_pause(
     pause = end.driven.pause
     length = span.t1 - span.t0
     sizes = x.driven.deviation(length) * pause[:, None]
-    members, bare = len(x), _bare(x)
+    members, bare = len(x), _without_tangents(x)
     knots = np.linspace(0.0, 1.0, PIECES + 1)
 
     def after(name: str, mode: int) -> tuple[Array, StepFailed | None]:
         """Return u after the pause; the input deviates by a mode, unless `mode` is zero."""
         at, column, size = bare, span.channels.index(name), sizes[:, problem.channels.index(name)]
-        last = _mixed(span, 0.0)
+        last = _interpolated(span, 0.0)
         for a, b in pairwise(knots.tolist()):
-            first, last = last, _mixed(span, b)
+            first, last = last, _interpolated(span, b)
             if mode:
                 last = np.array(np.broadcast_to(last, (members, last.shape[1])))
                 amplitude = np.sin(mode * np.pi * b) * np.sqrt(8.0) / (mode * np.pi)
@@ -314,14 +314,14 @@ def after_pause(
     return with_rows(end, U, np.zeros((*U.shape[:2], x.C.shape[2]))), None
 
 
-def _mixed(span: Span, s: float) -> Array:
+def _interpolated(span: Span, s: float) -> Array:
     return (1.0 - s) * span.inputs0 + s * span.inputs1
 
 
 def rows_of_sensors(problem: Problem, reduction: Reduction) -> IntArray:
     """Return the indices of initial rows for readings with the stated noise of their sensor."""
     readings = problem.initial_readings.items()
-    of_sensor = [name in problem.observed.names and np.isnan(one.noise) for name, one in readings]
+    of_sensor = [name in problem.observed.names and np.isnan(item.noise) for name, item in readings]
     return reduction.size + np.flatnonzero(of_sensor)
 
 

@@ -48,9 +48,9 @@ def step_alone(
     """Return one member after a sample, with safeguards and alarms."""
     new, report = _assimilated(work, state, interval)
     if (guards := work.guards) is not None:
-        new, report = _rescued(work, guards, state, interval, new, report)
+        new, report = _with_safeguards(work, guards, state, interval, new, report)
     if report.status.ok and (jumps := work.jumps) is not None:
-        new, report = _jumped(work, jumps, state, interval, new, report)
+        new, report = _with_jump_test(work, jumps, state, interval, new, report)
     return new, report
 
 
@@ -152,7 +152,7 @@ def _converged(
     return None
 
 
-def _rescued(
+def _with_safeguards(
     work: SensitivityWork,
     guards: Guards,
     state: SensitivityState,
@@ -165,11 +165,11 @@ def _rescued(
     z = interval.z1[None]
     scale = state.scale.add(z, z - report.predicted)
 
-    def astray(report: Report) -> bool:
+    def unusable(report: Report) -> bool:
         beyond = scale.beyond(z - report.predicted, noise)
         return not report.status.ok or bool(beyond[0] > guards.runaway)
 
-    if not astray(report):
+    if not unusable(report):
         return changed(
             new, scale=scale.without_refused(state.scale, new.now.screened.refused)
         ), report
@@ -179,8 +179,8 @@ def _rescued(
     silent = [item.silent for item in [*_since(work, state, row), interval]]
     # Try the older estimate with a wider covariance first, and the prior last.
     for start in (work.filter.inflated(older, 1.0), work.filter.with_prior(older)):
-        restart, outcome = _retaken(work, state, start, row, silent)
-        if not astray(outcome):
+        restart, outcome = _reassimilated(work, state, start, row, silent)
+        if not unusable(outcome):
             outcome = outcome.updated(Diagnostics(restarted=1.0))
             return changed(without_past(restart), scale=scale), outcome
     if not report.status.ok:
@@ -192,7 +192,7 @@ def _since(work: SensitivityWork, state: SensitivityState, row: int) -> list[Int
     return intervals_since(state.log[:, row:], work.filter.problem.channels)
 
 
-def _retaken(
+def _reassimilated(
     work: SensitivityWork,
     state: SensitivityState,
     start: FilterState,
@@ -208,7 +208,7 @@ def _retaken(
     return state, report
 
 
-def _most_likely(
+def _most_likely_onset(
     work: SensitivityWork, jumps: Jumps, x: FilterState, known: Sequence[Interval], guess: int
 ) -> int:
     """Return the number of samples before a jump that maximises the likelihood, near a guess.
@@ -236,11 +236,11 @@ def _likelihood(
     work: SensitivityWork, jumps: Jumps, x: FilterState, intervals: Sequence[Interval]
 ) -> float:
     """Return the log-likelihood of all samples if the unknowns jump before `intervals`."""
-    x, status = _after(work, work.filter.inflated(x, jumps.size, work.jumping), intervals)
+    x, status = _filtered_all(work, work.filter.inflated(x, jumps.size, work.jumping), intervals)
     return float(x.evidence[0]) if status.ok else -np.inf
 
 
-def _after(
+def _filtered_all(
     work: SensitivityWork, x: FilterState, intervals: Sequence[Interval]
 ) -> tuple[FilterState, Status]:
     """Return the filter after samples, up to the first failure, and the last status."""
@@ -264,7 +264,7 @@ def watched(
     return where(np.broadcast_to(present, alarm.shape), seen, state.watch), alarm & present
 
 
-def _jumped(
+def _with_jump_test(
     work: SensitivityWork,
     jumps: Jumps,
     state: SensitivityState,
@@ -291,13 +291,13 @@ def _jumped(
     moving = np.where(state.watch.repeating(screened.run), np.nan, e)
     onset = max(jumps.onset(state.watch, moving), doubted)
     guess = len(known) - reaching([bool(item.present.any()) for item in known], onset)
-    before = _most_likely(work, jumps, state.older, known, guess)
+    before = _most_likely_onset(work, jumps, state.older, known, guess)
     x = changed(work.filter.relinearised(state.older), kept=new.now.kept)
-    x, status = _after(work, x, known[:before])
+    x, status = _filtered_all(work, x, known[:before])
     start = work.filter.inflated(x, jumps.size, work.jumping)
     # Rows without a time are samples that this member did not assimilate.
     taken = np.flatnonzero(np.isfinite(state.log[0, row:, 0]))
-    restart, outcome = _retaken(work, new, start, row + int(taken[before]), known[before:])
+    restart, outcome = _reassimilated(work, new, start, row + int(taken[before]), known[before:])
     if status.ok and outcome.status.ok:
         new = restart
     else:

@@ -75,7 +75,7 @@ NEAR = 1.0  # standard deviations within which an intermediate refit keeps the v
 LATER = 8  # the result of a refit of n samples is used n / 8 samples after its start
 AT_A_TIME = 3  # samples since then that each step assimilates with the filter of the refit
 
-UNDER_WAY: WeakKeyDictionary[FilterState, Future[SensitivityState]] = WeakKeyDictionary()
+IN_PROGRESS: WeakKeyDictionary[FilterState, Future[SensitivityState]] = WeakKeyDictionary()
 LOCK = threading.Lock()
 
 
@@ -119,10 +119,10 @@ def refitted(
     )
 
 
-def plausible(samples: StoredSamples, options: Refit, one: Passed) -> Mask:
+def plausible(samples: StoredSamples, options: Refit, current: Passed) -> Mask:
     """Return the readings that a fit with a given solution uses, shape (samples, sensors)."""
     search = _Search(samples, options, last=True)
-    search.best = one
+    search.best = current
     return search.plausible if samples.gated else search.used
 
 
@@ -236,12 +236,12 @@ class _Search:
             self.best, self.settled = end, settled
         return end
 
-    def _free(self, one: Passed, g: Array) -> Array:
+    def _free(self, current: Passed, g: Array) -> Array:
         """Return a basis of the directions without an active bound, shape (r, free)."""
         samples = self.samples
         reduction, start = samples.filter.reduction, samples.start
         lower, upper = reduction.ends
-        q = start.q[0] + reduction.Phi @ (start.C[0].T @ one.xi)
+        q = start.q[0] + reduction.Phi @ (start.C[0].T @ current.xi)
         along = reduction.Phi @ (start.C[0].T @ g)
         span = np.abs(reduction.Phi).max(axis=1, initial=0.0)
         low, high = q <= lower + 1e-9 * span, q >= upper - 1e-9 * span
@@ -252,66 +252,66 @@ class _Search:
         return np.asarray(scipy.linalg.null_space(rows))
 
     def _stepped(
-        self, one: Passed, model: _Quadratic, delta: float, budget: float
+        self, current: Passed, model: _Quadratic, delta: float, budget: float
     ) -> tuple[Passed | None, float]:
         """Return the pass after an accepted step, or None, and the trust radius."""
-        cost, bend = one.cost(self.used), None
+        cost, bend = current.cost(self.used), None
         several = 1  # one trial; if it fails, several shorter trials together
         while self.passes < budget:
-            if several == 1 and (better := self._short_step(one, model, delta)):
+            if several == 1 and (better := self._short_step(current, model, delta)):
                 return better, delta
-            steps, predicted, bend = self._trials(one, model, delta, several, bend)
+            steps, predicted, bend = self._trials(current, model, delta, several, bend)
             if not steps:
                 return None, delta
-            tried, taken = self.samples.costs(one.xi + np.array(steps), self.used, cost)
+            tried, taken = self.samples.costs(current.xi + np.array(steps), self.used, cost)
             self.passes += taken
             best = int(np.argmin(tried))
             ratio = (cost - float(tried[best])) / predicted[best]
             delta = _trusted(delta, float(np.linalg.norm(steps[best])), ratio)
             several = self.samples.together
-            if ratio > ACCEPTED and (better := self._about(one.xi + steps[best])):
+            if ratio > ACCEPTED and (better := self._about(current.xi + steps[best])):
                 return better, delta
         return None, delta
 
     def _trials(
-        self, one: Passed, model: _Quadratic, delta: float, several: int, bend: Array | None
+        self, current: Passed, model: _Quadratic, delta: float, several: int, bend: Array | None
     ) -> tuple[list[Array], list[float], Array | None]:
         """Return steps of decreasing length, their predicted decreases of the cost, and the bend.
 
         `bend`: result of `_bend`, or None if it has not been computed.
         """
-        steps, predicted, cost = list[Array](), list[float](), one.cost(self.used)
+        steps, predicted, cost = list[Array](), list[float](), current.cost(self.used)
         for radius in delta * SHORTER ** np.arange(several):
             step, shift = model.step(radius)
             gain = model.gain(step)
             if np.linalg.norm(step) < SHORTEST or gain < LEAST * cost:
                 break
-            bend = self._bend(one, step) if bend is None else bend
+            bend = self._bend(current, step) if bend is None else bend
             curved = model.shifted(model.axes.T @ (bend * (step @ step)), shift)
             if np.linalg.norm(curved) < CURVED * np.linalg.norm(step):
                 step = step + 0.5 * curved
-            steps.append(self.samples.within_bounds(one.xi + step) - one.xi)
+            steps.append(self.samples.within_bounds(current.xi + step) - current.xi)
             predicted.append(gain)
         return steps, predicted, bend
 
-    def _short_step(self, one: Passed, model: _Quadratic, delta: float) -> Passed | None:
+    def _short_step(self, current: Passed, model: _Quadratic, delta: float) -> Passed | None:
         """Return the pass after a step short enough to omit its second-order part, or None."""
         step, _ = model.step(delta)
-        gain, cost = model.gain(step), one.cost(self.used)
+        gain, cost = model.gain(step), current.cost(self.used)
         if not SHORTEST <= np.linalg.norm(step) < SHORT or gain < LEAST * cost:
             return None
-        better = self._about(self.samples.within_bounds(one.xi + step))
+        better = self._about(self.samples.within_bounds(current.xi + step))
         accepted = better is not None and cost - better.cost(self.used) > ACCEPTED * gain
         return better if accepted else None
 
-    def _bend(self, one: Passed, step: Array) -> Array:
+    def _bend(self, current: Passed, step: Array) -> Array:
         """Return J' d2r/ds2 of the residuals r along a step, by differences; zero on failure."""
-        near = self.samples.residuals(one.xi + CLOSE * step)
+        near = self.samples.residuals(current.xi + CLOSE * step)
         self.passes += 1.0 / (1 + int(self.samples.alive.sum()))
         if near is None:
             return np.zeros(len(step))
-        J = one.slopes[self.used]
-        change = (near - one.residuals)[self.used] / CLOSE + J @ step
+        J = current.slopes[self.used]
+        change = (near - current.residuals)[self.used] / CLOSE + J @ step
         bend: Array = J.T @ change * (2.0 / CLOSE) / float(step @ step)
         return bend if np.isfinite(bend).all() else np.zeros(len(step))
 
@@ -378,16 +378,16 @@ class _Search:
         alive = self.samples.alive
         whole = np.zeros((len(points), len(alive)))
         whole[:, alive] = points
-        return np.array([self.samples.within_bounds(one) for one in whole])
+        return np.array([self.samples.within_bounds(xi) for xi in whole])
 
-    def _near(self, one: Passed, xi: Array) -> bool:
+    def _near(self, current: Passed, xi: Array) -> bool:
         """True if a point is within a posterior standard deviation of a trajectory."""
-        H, _ = one.model(self.used)
-        away = xi - one.xi
+        H, _ = current.model(self.used)
+        away = xi - current.xi
         return float(away @ H @ away) < 1.0
 
-    def _misfit(self, one: Passed) -> float:
-        return float((one.residuals[self.used] ** 2).sum())
+    def _misfit(self, current: Passed) -> float:
+        return float((current.residuals[self.used] ** 2).sum())
 
     def draw(self) -> None:
         """Search from random points, as a last attempt."""
@@ -489,11 +489,11 @@ def refit_due(
         return state, None
     alone = len(state) == 1
     which = np.flatnonzero(due).tolist()
-    each = {k: _after_due(work, options, take(state, k), alone=alone) for k in which}
+    each = {k: _with_due_refit(work, options, take(state, k), alone=alone) for k in which}
     return put_each(state, each), None
 
 
-def _after_due(
+def _with_due_refit(
     work: SensitivityWork, options: Refit, state: SensitivityState, *, alone: bool
 ) -> SensitivityState:
     """Return one member after a refit that is due; `alone`: not part of a fleet."""
@@ -533,13 +533,13 @@ def _settled(
     samples = StoredSamples.of(work, state)
     state = changed(state, fork=Fork.none(state.now))  # replaced by this refit of more samples
     try:
-        found = refitted(samples, options, last=True, screened=int(state.fit.screened[0]))
-        after = _after(work, state, samples, found, last=True)
+        result = refitted(samples, options, last=True, screened=int(state.fit.screened[0]))
+        after = _with_result(work, state, samples, result, last=True)
     except Exception as error:
         if numerical(error) is None:
             raise
-        return _after(work, state, samples, None, last=True), None
-    return after, None if found is None else found.used
+        return _with_result(work, state, samples, None, last=True), None
+    return after, None if result is None else result.used
 
 
 def refitted_now(
@@ -547,33 +547,33 @@ def refitted_now(
 ) -> SensitivityState:
     """Return one member after an intermediate refit, which a later refit follows."""
     samples = StoredSamples.of(work, state)
-    found = refitted(samples, options, last=False, screened=int(state.fit.screened[0]))
-    return _after(work, state, samples, found, last=False)
+    result = refitted(samples, options, last=False, screened=int(state.fit.screened[0]))
+    return _with_result(work, state, samples, result, last=False)
 
 
-def _after(
+def _with_result(
     work: SensitivityWork,
     state: SensitivityState,
     samples: StoredSamples,
-    found: Found | None,
+    result: Found | None,
     *,
     last: bool,
 ) -> SensitivityState:
     count, spent = state.assimilated, state.fit.work
-    x = None if found is None else _filter(samples, found, last=last)
-    if found is None or x is None:
+    x = None if result is None else _filter(samples, result, last=last)
+    if result is None or x is None:
         fit = changed(state.fit, samples=count, converged=np.zeros(1))
         return changed(state, fit=fit)
-    there = np.isfinite(samples.readings)
+    present = np.isfinite(samples.readings)
     fit = FitState(
         samples=count,
-        cost=np.array([found.best.cost(found.used)]),
-        readings=np.array([float(there.sum())]),
-        refused=np.array([float((there & ~found.used).sum())]),
-        work=spent + found.passes * len(samples),
-        converged=np.array([float(found.converged)]),
-        screened=np.array([len(samples)]) if found.screened else state.fit.screened,
-        xi=found.best.xi[None, :, None],
+        cost=np.array([result.best.cost(result.used)]),
+        readings=np.array([float(present.sum())]),
+        refused=np.array([float((present & ~result.used).sum())]),
+        work=spent + result.passes * len(samples),
+        converged=np.array([float(result.converged)]),
+        screened=np.array([len(samples)]) if result.screened else state.fit.screened,
+        xi=result.best.xi[None, :, None],
     )
     now = work.filter.relinearised(x)
     # If the newer point of return is this sample, it becomes the filter after the fit.
@@ -581,17 +581,17 @@ def _after(
     return changed(state, now=now, newer=newer, fit=fit)
 
 
-def _filter(samples: StoredSamples, found: Found, *, last: bool) -> FilterState | None:
+def _filter(samples: StoredSamples, result: Found, *, last: bool) -> FilterState | None:
     """Return the filter that continues from the result of a search; None if a step fails."""
     now = samples.state.now
-    evidence = samples.start.evidence + samples.log_evidence(found.best, found.used)
-    best = changed(samples.updated(found.best, found.used), evidence=evidence)
+    evidence = samples.start.evidence + samples.log_evidence(result.best, result.used)
+    best = changed(samples.updated(result.best, result.used), evidence=evidence)
     distance = apart(samples.filter, best, now)
     # Close to the present filter, its ledger and discretisation errors remain valid. An
     # intermediate refit tolerates more, because a later one computes both again.
     if (distance <= HOLDS and usual(now)) or (distance <= NEAR and not last):
         return _within(samples.filter, best) if last else best
-    x = samples.judged(found.best, found.used)
+    x = samples.judged(result.best, result.used)
     if x is None:
         return None
     x = changed(x, evidence=evidence)
@@ -620,36 +620,36 @@ def go_on(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
     if options is None:
         return state
     if not fork.fitted[0]:
-        refit = _under_way(work, options, state)
+        refit = _in_progress(work, options, state)
         count = int(fork.samples[0])
         if state.assimilated[0] < count + max(count // LATER, 1):
             return state
         try:
-            found = refit.result()
+            result = refit.result()
         except Exception as error:
             if numerical(error) is None:
                 raise
             # Repeating it on the same samples would fail again: the filter continues without it.
             failed = changed(state.fit, samples=fork.samples, converged=np.zeros(1))
-            return _without(changed(state, fit=failed), fork.filter)
-        state = changed(state, fit=found.fit)
-        if found.now is fork.filter:  # the refit found no trajectory
-            return _without(state, fork.filter)
-        fork = changed(fork, filter=found.now, fitted=np.ones(1, dtype=bool))
+            return _without_fork(changed(state, fit=failed), fork.filter)
+        state = changed(state, fit=result.fit)
+        if result.now is fork.filter:  # the refit found no trajectory
+            return _without_fork(state, fork.filter)
+        fork = changed(fork, filter=result.now, fitted=np.ones(1, dtype=bool))
     return _caught_up(work, state, fork)
 
 
-def _under_way(
+def _in_progress(
     work: SensitivityWork, options: Refit, state: SensitivityState
 ) -> Future[SensitivityState]:
     fork = state.fork
     with LOCK:
-        if fork.filter in UNDER_WAY:
-            return UNDER_WAY[fork.filter]
-        future = UNDER_WAY[fork.filter] = Future()
+        if fork.filter in IN_PROGRESS:
+            return IN_PROGRESS[fork.filter]
+        future = IN_PROGRESS[fork.filter] = Future()
     log = state.log[:, : int(fork.row[0]) + 1]
     begun = changed(state, now=fork.filter, log=log, assimilated=fork.samples)
-    begun = _without(begun, fork.filter)
+    begun = _without_fork(begun, fork.filter)
     # The program must not wait for a daemon thread at its end.
     threading.Thread(target=_run, args=(future, work, options, begun), daemon=True).start()
     return future
@@ -672,13 +672,13 @@ def _caught_up(work: SensitivityWork, state: SensitivityState, fork: Fork) -> Se
     for interval in intervals_since(rows, work.filter.problem.channels):
         x, outcome = assimilate(work.filter, x, work.filter.span(interval), work.options)
         if not outcome.good:
-            return _without(state, x)
+            return _without_fork(state, x)
         x, row = work.filter.relinearised(x), row + 1
     if row < last:
         return changed(state, fork=changed(fork, filter=x, row=np.array([row])))
     newer = x if state.since_newer[0] == last else state.newer
-    return _without(changed(state, now=x, newer=newer), x)
+    return _without_fork(changed(state, now=x, newer=newer), x)
 
 
-def _without(state: SensitivityState, x: FilterState) -> SensitivityState:
+def _without_fork(state: SensitivityState, x: FilterState) -> SensitivityState:
     return changed(state, fork=Fork.none(x))

@@ -321,12 +321,12 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             filter_ = work.filter
             parts = (filter_.problem, filter_.reduction, filter_.noise)
             x = with_initial_rows(state.now, *parts, moment)
-            return state if x is state.now else _started(work, state, x)
+            return state if x is state.now else _with_start(work, state, x)
         # The initial state depends on the unknowns. Its derivative gives their cross-covariance, so
         # that samples correct both from the first one on.
         U = model.initial_directions(q0, work.filter.reduction.Phi, moment).T[None]
         x = changed(state.now, U=U)
-        return changed(_started(work, state, x), initial=np.ones(1, dtype=bool))
+        return changed(_with_start(work, state, x), initial=np.ones(1, dtype=bool))
 
     @nonfinite_allowed()  # a sample with a nonfinite result is not used
     def begin(
@@ -427,7 +427,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         scale = state.scale.add(span.z1, span.z1 - outcome.predicted)
         parts: dict[str, Any] = {"scale": scale.without_refused(state.scale, x.screened.refused)}
         if self.guards is not None:
-            regular = regular & _within(self.guards, filter_, before, x, outcome, scale, span)
+            regular = regular & _admissible(self.guards, filter_, before, x, outcome, scale, span)
         if self.jumps is not None and span.present.any():
             parts["watch"], alarm = watched(work, self.jumps, state, x, span)
             regular = regular & ~alarm
@@ -494,8 +494,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         if self.fades:
             return super().smoothed(work, before, after, data)
         settled, (used,) = settle(work, after)
-        found = smoothed(work, before, settled.now, data, used)
-        return (self.member_belief(work, x, 0) for x in found)
+        result = smoothed(work, before, settled.now, data, used)
+        return (self.member_belief(work, x, 0) for x in result)
 
     def belief(self, work: SensitivityWork, state: SensitivityState) -> Belief:
         return self.member_belief(work, state.now, 0)
@@ -506,10 +506,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         judge, level = judged(work.filter, state.now, now), float(now.level[0])
 
         def verdict() -> Verdict:
-            found = with_noise(with_fit(judge(), fit), work, level)
+            result = with_noise(with_fit(judge(), fit), work, level)
             if not self.verdict:
-                return found
-            return with_discretisation(found, work.filter.shadows, now.shadows)
+                return result
+            return with_discretisation(result, work.filter.shadows, now.shadows)
 
         return Deferred(read_later(self._beliefs, work, now), verdict)
 
@@ -524,9 +524,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         tried = Columns.of(work, state) if columns else None
 
         def verdict() -> Verdict:
-            found = after_fit(before(), whole)
-            found = found if tried is None else with_columns(found, tried)
-            return with_errors(found, work, state)
+            result = after_fit(before(), whole)
+            result = result if tried is None else with_columns(result, tried)
+            return with_errors(result, work, state)
 
         return Deferred(belief, verdict)
 
@@ -555,7 +555,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         ]
 
 
-def _within(
+def _admissible(
     guards: Guards,
     filter_: Filter,
     before: FilterState,
@@ -574,7 +574,7 @@ def _within(
     return near
 
 
-def _started(work: SensitivityWork, state: SensitivityState, x: FilterState) -> SensitivityState:
+def _with_start(work: SensitivityWork, state: SensitivityState, x: FilterState) -> SensitivityState:
     start, trial = work.kept_start(x), zeros(x) if work.fits else x
     fit = FitState.none(start)
     return changed(state, start=start, trial_start=trial, fit=fit, now=x, older=x, newer=x)

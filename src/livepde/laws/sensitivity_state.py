@@ -34,11 +34,10 @@ NEVER = np.iinfo(np.int64).max  # value of `due` if no refit is due any more
 
 @dataclass(frozen=True, eq=False)
 class SensitivityWork:
-    """Parts that the law computes once, and its options."""
+    """Filter and update options of a law; the other fields are attributes of the law."""
 
     filter: Filter
     options: UpdateOptions
-    # Attributes of the law with the same names.
     refit: Refit | None
     guards: Guards | None
     jumps: Jumps | None
@@ -489,32 +488,33 @@ def _diagnosed(
     """Return the diagnostics of each sample, from the filter after it and the refused readings."""
     (work, *_), now = samples[0], joined([x for _, x, _ in samples])
     reduction, shadows = work.filter.reduction, work.filter.shadows
-    found = replace(now.innovations.diagnostics, log_evidence=now.evidence)
+    result = replace(now.innovations.diagnostics, log_evidence=now.evidence)
     if work.options.adaptive:
-        found = replace(found, noise_level=np.sqrt(now.level))
+        result = replace(result, noise_level=np.sqrt(now.level))
     if work.options.gate.beyond < np.inf:
         refused = np.concatenate([refused for *_, refused in samples])
-        found = _with_refused(found, refused, work.filter.problem.observed.names)
+        result = _with_refused(result, refused, work.filter.problem.observed.names)
     if work.jumps is not None:
-        found = replace(found, jump=np.zeros(len(now)))
+        result = replace(result, jump=np.zeros(len(now)))
     if shadows is not None:
-        found = found.updated(shadows.diagnostics(now, robust_factors(reduction, now)[1]))
+        result = result.updated(shadows.diagnostics(now, robust_factors(reduction, now)[1]))
     estimate = work.filter.estimate(now)
     held = reduction.held(estimate)
     if held.any():
-        found = replace(found, bounded=np.where(held > 0, held, np.nan))
+        result = replace(result, bounded=np.where(held > 0, held, np.nan))
     if len(samples) == 1:
-        return [found]
-    return [found.each(itemgetter([k])) for k in range(len(samples))]
+        return [result]
+    return [result.each(itemgetter([k])) for k in range(len(samples))]
 
 
 def _with_refused(
-    found: Diagnostics[Array], refused: Mask, sensors: Sequence[str]
+    result: Diagnostics[Array], refused: Mask, sensors: Sequence[str]
 ) -> Diagnostics[Array]:
     """Return diagnostics with the number of refused readings, and a number for each sensor."""
     which = np.flatnonzero(refused.any(axis=0)).tolist()
     each = {refusal(sensors[i]): np.where(refused[:, i], 1.0, np.nan) for i in which}
-    return replace(found, refused=refused.sum(axis=1).astype(float), extra={**found.extra, **each})
+    count = refused.sum(axis=1).astype(float)
+    return replace(result, refused=count, extra={**result.extra, **each})
 
 
 def joined(states: Sequence[FilterState]) -> FilterState:

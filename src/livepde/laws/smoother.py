@@ -85,11 +85,11 @@ def smoothed(
     that a refit used, (samples, sensors); None without a refit.
     """
     with nonfinite_allowed():  # passes with nonfinite results are not used
-        best = _descended(*_begun(work, before, after, data, used))
+        best = _descended(*_first_pass(work, before, after, data, used))
     return _backward(best, after)
 
 
-def _begun(
+def _first_pass(
     work: SensitivityWork,
     before: SensitivityState,
     after: FilterState,
@@ -236,7 +236,7 @@ class _FixedInterval:
         x, misfit, decision = self._started(trajectory)
         rows = x.C.shape[1]
         first = changed(x, past=np.eye(rows)[None], dpast=np.zeros((1, rows)))
-        points = [self._kept(first, 0, np.zeros((0, rows)))]
+        points = [self._point(first, 0, np.zeros((0, rows)))]
         followed, decisions = [_reduced(self.work, x)], [decision]
         filter_ = self.work.filter
         for number, interval in enumerate(self.data.intervals, start=1):
@@ -253,7 +253,7 @@ class _FixedInterval:
             if not np.isfinite((x.u + x.du).sum() + x.da.sum() + x.C.sum()):
                 return None
             decisions.append(decision)
-            points.append(self._kept(x, number, _forgotten(P)))
+            points.append(self._point(x, number, _truncation(P)))
             followed.append(_reduced(self.work, x))
             misfit += missed(filter_, x, interval)
             misfit += moved(filter_, followed[-2], followed[-1], h, gained) if self.moves else 0.0
@@ -311,7 +311,7 @@ class _FixedInterval:
         x, _, failure = filter_.predict(x, span)
         return x, x.past[0] if failure is None else None
 
-    def _kept(self, x: FilterState, number: int, R: Array) -> _Point:
+    def _point(self, x: FilterState, number: int, R: Array) -> _Point:
         """Return the point of a sample, with the state only if it is in `data.fields`."""
         x = changed(unaccompanied(x), kept=KeptFactors.none(1))
         if number not in self.data.fields:
@@ -319,7 +319,7 @@ class _FixedInterval:
         return _Point(x, R)
 
 
-def _forgotten(P: Array) -> Array:
+def _truncation(P: Array) -> Array:
     """Return R with R^T R = I - P^T P."""
     values, vectors = np.linalg.eigh(np.eye(P.shape[1]) - P.T @ P)
     lost = values > ROUNDING

@@ -187,8 +187,8 @@ class StoredSamples:
         if self.state.initial[0]:
             model, moment = self.filter.problem.model, self.spans[0].at(float(self.spans[0].t0[0]))
             at = moment.member(0)
-            u = np.array([model.initial_state(one, at) for one in q])
-            slopes = [model.initial_directions(one, reduction.Phi, at).T for one in q]
+            u = np.array([model.initial_state(passed, at) for passed in q])
+            slopes = [model.initial_directions(passed, reduction.Phi, at).T for passed in q]
             U = C @ np.array(slopes)
         else:
             u = start.u + points @ start.U[0]
@@ -251,9 +251,9 @@ class StoredSamples:
                     return
             yield slice(number, number + 1), columns[None]
 
-    def along(self, one: Passed) -> Iterator[FilterState]:
+    def along(self, passed: Passed) -> Iterator[FilterState]:
         """Yield the state and the unknowns of a trajectory at each sample."""
-        x = self.placed(one.xi[None], rows=False)
+        x = self.placed(passed.xi[None], rows=False)
         for _, block in self._followed(x):
             for columns in block:
                 yield changed(x, u=columns[0])
@@ -325,16 +325,16 @@ class StoredSamples:
         costs = np.where(whole & np.isfinite(sums), sums, np.inf)
         return costs, taken / (columns * max(len(self), 1))
 
-    def updated(self, one: Passed, used: Mask) -> FilterState:
+    def updated(self, passed: Passed, used: Mask) -> FilterState:
         """Return the filter after all readings in use, linear about a trajectory.
 
         It keeps the ledger and discretisation errors of the present filter, which must be close.
         """
-        end, now, J = one.end, self.state.now, one.slopes[used]
+        end, now, J = passed.end, self.state.now, passed.slopes[used]
         # The prior of xi is N(0, I); relative to the trajectory, its mean is -xi.
-        mean, C, U = -one.xi, end.C[0], end.U[0]
+        mean, C, U = -passed.xi, end.C[0], end.U[0]
         if len(J):
-            W, half, _ = contraction(J.T[None], (one.residuals[used] + J @ one.xi)[None])
+            W, half, _ = contraction(J.T[None], (passed.residuals[used] + J @ passed.xi)[None])
             mean, C, U = mean + W[0] @ half[0], W[0].T @ C, W[0].T @ U
         # Causes are coordinates on the rows of the square root, which is unique up to a rotation.
         # The rotation chosen here brings the rows closest to the rows of the present filter.
@@ -349,40 +349,40 @@ class StoredSamples:
         x: FilterState = changed(now, q=end.q, u=end.u, **parts)
         return self.filter.compressed(x) if rows > self.filter.rank else x
 
-    def log_evidence(self, one: Passed, used: Mask) -> float:
+    def log_evidence(self, passed: Passed, used: Mask) -> float:
         """Return the log evidence of all readings, linear about a trajectory.
 
         The unknowns are integrated out. A refused reading counts as a reading at the limit of the
         gate, which is wider for sensors whose residuals in use exceed their noise.
         """
-        (H, g), present = one.model(used), np.isfinite(self.readings)
+        (H, g), present = passed.model(used), np.isfinite(self.readings)
         sizes, axes = principal(H)
-        lowest = one.cost(used) - 0.5 * float(((axes.T @ g) ** 2 / sizes).sum())
+        lowest = passed.cost(used) - 0.5 * float(((axes.T @ g) ** 2 / sizes).sum())
         evidence = -lowest - 0.5 * float(np.log(sizes).sum())
         evidence -= float((np.log(self.noise) + HALF_LOG)[present].sum())
         refused = (present & ~used).sum(axis=0)
         for k in np.flatnonzero(refused).tolist():
             square = max(
-                1.0, float((one.residuals[used[:, k], k] ** 2).sum()) / max(used[:, k].sum(), 1)
+                1.0, float((passed.residuals[used[:, k], k] ** 2).sum()) / max(used[:, k].sum(), 1)
             )
             evidence -= 0.5 * self.work.options.gate.beyond**2 * square * float(refused[k])
         return evidence
 
-    def judged(self, one: Passed, used: Mask) -> FilterState | None:
+    def judged(self, passed: Passed, used: Mask) -> FilterState | None:
         """Return the filter after assimilating the readings in use one by one, about a trajectory.
 
         Unlike `updated`, it computes ledger and discretisation errors. None if a step fails.
         """
         state, filter_ = self.state, self.filter
         now = state.now
-        at = self.placed(one.xi[None], rows=True)
+        at = self.placed(passed.xi[None], rows=True)
         start = changed(
             self.start,
             q=at.q,
             u=at.u,
             U=at.U,
-            da=-(one.xi @ at.C[0])[None],
-            du=-(one.xi @ at.U[0])[None],
+            da=-(passed.xi @ at.C[0])[None],
+            du=-(passed.xi @ at.U[0])[None],
             level=now.level,
             samples=now.samples,
             kept=now.kept,

@@ -84,30 +84,30 @@ def judged(filter_: Filter, x: FilterState, kept: FilterState) -> Callable[[], V
     if ledger.process.size:
         ledger = changed(ledger, process=ledger.process[:, :0, :0].copy())
 
-    def found() -> Verdict:
+    def assessed() -> Verdict:
         w, settled = judge.summed_up(ledger, causes)
         with nonfinite_allowed():
             at = _position(filter_, changed(kept, causes=w, ledger=settled))
             return assess(judge.dictionary, at)
 
-    return found
+    return assessed
 
 
 def with_fit(verdict: Verdict, fit: Fit | None) -> Verdict:
     """Return a verdict with findings if the last fit did not converge or refused many readings."""
     if fit is None:
         return verdict
-    found = []
+    findings = []
     if not fit.converged:
         text, remedy = FINDINGS["fit, not converged"].filled(samples=fit.samples)
-        found.append(Finding("fit", "do not trust", text, remedy=remedy))
+        findings.append(Finding("fit", "do not trust", text, remedy=remedy))
     share = fit.refused / max(fit.readings, 1)
     if share > REFUSED:
         text, remedy = FINDINGS["fit, refused"].filled(
             samples=fit.samples, share=percent(share, 1), count=fit.refused
         )
-        found.append(Finding("fit", "caution", text, evidence=share, remedy=remedy))
-    return verdict.with_findings(found) if found else verdict
+        findings.append(Finding("fit", "caution", text, evidence=share, remedy=remedy))
+    return verdict.with_findings(findings) if findings else verdict
 
 
 def with_noise(verdict: Verdict, work: SensitivityWork, level: float) -> Verdict:
