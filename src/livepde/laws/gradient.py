@@ -1,4 +1,4 @@
-"""The paper's update law, and the parts around it: stages, the rule for u_alpha, metric, gate."""
+"""`GradientLaw`, the adaptive observer of Boiger and Kaltenbacher: stages, parameters and state."""
 
 from __future__ import annotations
 
@@ -44,47 +44,45 @@ from livepde.linalg import Array, Memo, Pattern
 from livepde.model import h1_form
 from livepde.stepping import Interval, Newton, advance
 
-ROUNDING = 1e-9  # of entries of P, which are at most about one
-MOST_STAGES = 8  # kept for different sets of present sensors
+ROUNDING = 1e-9  # absolute, for entries of P, which are at most about one
+MOST_STAGES = 8  # capacity of the cache, which has a stage for each set of present sensors
 
 
 @dataclass(frozen=True, eq=False)
 class GradientParts:
-    """Parts computed once for a problem, and the rules around the method."""
+    """Quantities computed once for a problem, and the rules that the method applies."""
 
-    # As given.
+    # The problem, the nonlinear iteration of a stage, and the rule for theta.
     problem: Problem
     newton: Newton
     damping: Damping
-    # As for `StageForms`.
+    # Integrands of M and N, and the weight of N: see `StageForms`.
     M_op: Any
     N_op: Any
     nu: float
     # Rules for u_alpha and for the metric of Q.
     observed: ObservedPart
     metric: MetricRule[Any]
-    # The excitation gate that holds q, and the probes that measure the excitation; None: q is never
-    # held.
+    # Gate that holds q without excitation, and probes that measure the excitation; None: no gate.
     gate: ExcitationGate | None = None
     probes: Probes | None = None
-    memory: Pattern | None = None  # pattern of the information, for `StageTerms`
-    # Tests of the equation, for the verdict; None: there is none.
-    tests: EquationTests | None = None
+    memory: Pattern | None = None  # pattern of the information matrix J; None: constant gain
+    tests: EquationTests | None = None  # tests for the verdict; None: runs are not judged
     _stages: Memo[bytes, CoupledStage] = field(default_factory=lambda: Memo(MOST_STAGES))
 
     def stage(self, present: Array) -> CoupledStage:
-        def made() -> CoupledStage:
+        def build() -> CoupledStage:
             terms = StageTerms(self.forms(present), self.damping, self.memory)
             return CoupledStage(terms, self.newton)
 
-        return self._stages.get(present.tobytes(), made)
+        return self._stages.get(present.tobytes(), build)
 
     def forms(self, present: Array) -> StageForms:
         split = self.problem.observed.split(present)
         return StageForms(self.problem.model, split, self.M_op, self.N_op, self.nu)
 
     def prepared(self) -> GradientParts:
-        """Return the same with the stage of all sensors prepared, before the first sample comes."""
+        """Prepare the stage for the complete set of sensors, and return these parts."""
         present = np.ones(self.problem.observed.size, dtype=bool)
         self.stage(present).solver.prepare()
         return self
@@ -94,13 +92,13 @@ class GradientParts:
     ) -> ExcitationLevel:
         if self.gate is None or self.probes is None:
             return excitation
-        seen = self.probes(np.array([w, u]).T, q, moment)
-        return self.gate.add(excitation, seen[:, 0], seen[:, 1])
+        values = self.probes(np.array([w, u]).T, q, moment)
+        return self.gate.add(excitation, values[:, 0], values[:, 1])
 
     def tested(
         self, tested: EquationLedger, present: Array, equation: Callable[[], ObservedEquation]
     ) -> EquationLedger:
-        """Return the sums of the tests after a sample; one of some sensors only is left out."""
+        """Return the sums of the equation tests after a sample; incomplete samples are skipped."""
         if self.tests is None or not self.tests.possible:
             return tested
         if not present.all():
@@ -110,36 +108,36 @@ class GradientParts:
 
 @dataclass(eq=False)
 class StageSequence:
-    """The coupled stages of one interval, one after the other: a `Stage` for `advance`."""
+    """Consecutive coupled stages of one interval: a `Stage` for `advance`."""
 
     coupled: CoupledStage
     path: ObservedPath
     metric: MetricStep
-    slope: Array | None  # last change of (u - u_alpha, q) per unit of time; None: none predicts
+    slope: Array | None  # last rate of change of (u - u_alpha, q); None: stages are not predicted
     kept: KeptFactor
-    # Residual of the last stage, and its step.
+    # Residual of the last stage, and its step size.
     left: Array
     width: float
     _last: tuple[StageProblem, float, StageIterate] | None = None
 
     def __call__(self, c: Array, t: float, h: float) -> Array:
-        """Return y = (u, q) at t of the stage that begins at c; raises `StepFailed`."""
+        """Return the solution y = (u, q) at t of the stage from c; raises `StepFailed`."""
         n, project = self.coupled.terms.n, self.coupled.terms.forms.split.project
         u_alpha = self.path.at(t).u
         carries, moment = self.coupled.carries, self.path.interval.at(t)
-        # A shorter step makes up for its share only: in no time the rest would be an impulse.
+        # The ratio of steps is at most 1: in a short step the full residual would be an impulse.
         left = min(1.0, self.width / h) * self.left if carries else None
         problem = StageProblem(c, h, moment, u_alpha, self.metric(h), left)
-        # The observed part moves with the data, the rest as in the step before.
+        # The prediction shifts the observed part with the data, and extrapolates u - u_alpha and q.
         follows = c.copy()
         follows[:n] += u_alpha - self.path.at(max(t - h, self.path.interval.t0)).u
 
-        def start() -> Array:  # with r as it was
+        def start() -> Array:  # r is unchanged
             if self.slope is None:
                 return follows
-            moved = follows + h * self.slope
-            moved[:n] -= project(h * self.slope[:n])
-            return moved
+            y = follows + h * self.slope
+            y[:n] -= project(h * self.slope[:n])
+            return y
 
         predicted = None if self.slope is None else follows + h * self.slope
         at, self.kept = self.coupled.solve(problem, start, predicted, self.kept)
@@ -149,25 +147,25 @@ class StageSequence:
         return at.y
 
     def equation_error(self) -> Array:
-        """Return R^T eps at the end, the equation error of the data, a dual vector, shape (n,).
+        """Return the equation error R^T eps of the data at the end, a dual vector of shape (n,).
 
-        It balances the terms of r in the last stage, -theta R^T M_op r - R^T M r', up to the
-        remaining residual of the iteration.
+        In the last stage it equals -theta R^T M_op r - R^T M r', up to the residual of the
+        nonlinear iteration.
         """
         if self._last is None:
             return np.zeros(self.coupled.terms.n)
         (problem, t, at), forms = self._last, self.coupled.terms.forms
         n, begin = self.coupled.terms.n, max(t - problem.h, self.path.interval.t0)
-        # r at the beginning of the stage: M r' is the change of M r over its length.
+        # r at the beginning of the stage: M r' is a difference quotient over the stage.
         before = forms.split.project(problem.c[:n]) - self.path.at(begin).u
         change = at.mass_r - forms.mass @ before
         return np.asarray(at.residual[:n] - at.theta * at.Mr - change / problem.h)
 
     def rate(self, begin: Array, end: Array) -> Array:
-        """Return the change of (u - u_alpha, q) over the interval, per unit of time."""
+        """Return the mean rate of change of (u - u_alpha, q) over the interval."""
         n, interval = self.coupled.terms.n, self.path.interval
         change = end - begin
-        if self.slope is None:  # the data at the beginning are not those of these sensors
+        if self.slope is None:  # the initial data may come from other sensors
             change[:n] -= self.coupled.terms.forms.split.project(change[:n])
         else:
             change[:n] -= self.path.at(interval.t1).u - self.path.at(interval.t0).u
@@ -203,7 +201,7 @@ def constant_parts(
 
 
 def _tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> GradientParts:
-    """Return the parts of the law that tunes itself."""
+    """Return the parts of a law with `gain="auto"`."""
     _require_linear_readings(problem)
     model, observation = problem.model, problem.observed.observation
     if model.latent.moves:
@@ -220,7 +218,7 @@ def _tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Grad
             "SensitivityLaw on this Subdomain or these sensors, or give a number for gain."
         )
     metric = InformationMetric(model, observation.nodal)
-    # Of partial data the smoothed part moves with w, and errors grow: they stay as they are.
+    # Partial data are not smoothed: the part that smoothing removes moves with w, and errors grow.
     own = whole and smooths(problem.observed)
     return GradientParts(
         problem=problem,
@@ -236,7 +234,7 @@ def _tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Grad
 
 
 def _for_scheme(newton: Newton, problem: Problem) -> Newton:
-    """Return the iteration for a scheme: one of second order leaves out less than a prediction."""
+    """Return the iteration; the stages of second-order schemes are solved to `tolerance`."""
     return replace(newton, share=0.0) if problem.control.scheme.order > 1 else newton
 
 
@@ -256,12 +254,12 @@ class GradientState:
     u: Array
     q: Array
     u_alpha: Array  # observed part of the state at the last sample, shape (n,)
-    rate: Array  # last change of (u^ - u_alpha, q^) per unit of time, shape (n + m,)
-    kept: KeptFactor  # factor of the coupled stage
-    # Residual of the last stage, shape (n + m,), for which the next one makes up, and its step.
+    rate: Array  # last rate of change of (u^ - u_alpha, q^), shape (n + m,)
+    kept: KeptFactor  # cached factor of the coupled stage
+    # Residual of the last stage, shape (n + m,), which the next stage corrects; and its step size.
     left: Array
     width: float
-    # Sensors of the last sample, shape (sensors,), and whether q was held.
+    # Mask of the sensors with a reading in the last sample, (sensors,); True if q was held.
     present: Array
     frozen: bool
     # States of the rules for u_alpha and for the metric of Q, and of the excitation gate.
@@ -269,56 +267,56 @@ class GradientState:
     metric: Any
     excitation: ExcitationLevel
     tested: EquationLedger  # sums of the tests of the equation
-    readings: ReadingRange  # range of the readings, outside of which they are wild
+    readings: ReadingRange  # range of the accepted readings, to detect wild ones
 
 
 @dataclass(frozen=True)
 class GradientLaw(Law[GradientParts, GradientState]):
-    """The online method of Boiger and Kaltenbacher, (est_exact_q) and (est_exact_u).
+    """Adaptive observer of Boiger and Kaltenbacher (2016), (est_exact_q) and (est_exact_u).
 
         q' = gain A(w)* r - sigma q,            w = u_alpha + P u,  r = R u - u_alpha
         M u' + B(w) + A(w) q + theta R^T M_op r + nu P^T N_op P u = F
 
-    `StageSolver.evaluate` of `livepde.laws.coupled.equation` has these two lines, as one implicit
-    step solves them for every model.
+    An implicit step solves both equations as one system: see `StageSolver.evaluate` in
+    `livepde.laws.coupled.equation`.
 
-    u_alpha = G^+ z, or G_alpha z if the observation has a `reconstruction` that regularises: then
-    these are (noisy_q) and (noisy_u), and the diagnostics of each report hold alpha and the misfit
-    ||G u_alpha - z||_Z. For a `Subdomain` the integrals are split as the paper splits them: over
-    omega the forms see the data, M_op and r are integrated there, and N_op over the rest.
+    u_alpha = G^+ z. If the `reconstruction` of the observation regularises, u_alpha = G_alpha z:
+    the equations are (noisy_q) and (noisy_u), and the diagnostics contain alpha and the misfit
+    ||G u_alpha - z||_Z. For a `Subdomain` the integrals are split as in the paper: over omega the
+    forms use the data, M_op and r are integrated over omega, and N_op outside omega.
 
-    A reading ten times the range of all readings so far outside of its own is wild: up to three in
-    a row of a sensor are not used.
+    A reading is wild if it exceeds the past range of its sensor by ten times the range of all
+    readings. Up to three consecutive wild readings of a sensor are discarded.
 
-    For observed subdomains and averages. A few noisy point sensors mislead it (jumps of the flux at
-    the sensors reward a vanishing diffusivity): use `SensitivityLaw` there.
+    Use this law for observed subdomains and averages. A few noisy point sensors mislead it, because
+    flux jumps at the sensors reward a vanishing diffusivity: use `SensitivityLaw` for them.
 
     Parameters
     ----------
     gain
-        Scale of the inner product of Q, > 0. The theory holds for every value; it sets how fast q
-        learns. Stable for every value, because u and q are solved together.
+        Scale of the inner product of Q, > 0: it determines how fast q adapts. The theory holds for
+        every value. The step is stable for every value, because u and q are solved together.
 
-        "auto": the law tunes itself, from r, the excitation and the prior (`std` of the unknowns)
-        alone (`livepde.laws.information`). Then `damping`, `M_op` and `sigma` are not to be given.
-        It needs data of the whole state. With partial data it is experimental: they are not
-        smoothed, and an A with derivatives of u, such as a diffusivity, is refused.
+        "auto": the metric of Q follows from r, the excitation and the prior (`std` of the unknowns)
+        alone (`livepde.laws.information`). `damping`, `M_op` and `sigma` must keep their defaults.
+        "auto" requires data of the whole state. With partial data it is experimental: the data are
+        not smoothed, and an A with derivatives of u, such as a diffusivity, raises `LawError`.
     damping
         Rule for theta = mu / ||r||_V~.
     nu
-        Weight of P N P u >= 0. It draws P u to zero, not to the truth: needed where the process
-        does not damp the unobserved part (D < 0), and it may help or harm where it does.
+        Weight of P N P u, >= 0. It draws P u to zero, not to the truth. It is required if the
+        process does not damp the unobserved part (D < 0); otherwise it may help or harm.
     sigma
-        Stabilising term of (noisy_q), >= 0. It draws q to zero, and the logarithm of a positive
-        unknown to its prior median.
+        Weight of the stabilising term of (noisy_q), >= 0. It draws q to zero, and the logarithm of
+        a positive unknown to its prior median.
     M_op, N_op
         Integrands (u, v, x) of M and N of (MN1), (MN2); default u v + grad u . grad v.
-        `diffusion_operator(D)` is the paper's, with |D|.
+        `diffusion_operator(D)` is the integrand of the paper, with |D|.
     newton
-        The nonlinear iteration, and when a stage counts as solved.
+        The nonlinear iteration, with its stopping criterion.
     gate
-        With a number for gain: when q is held, because nothing excites it but noise, with which it
-        would drift; None: never.
+        With a constant gain: rule that holds q while only noise excites it, because q would drift
+        with the noise. None: q is never held.
 
     Examples
     --------
@@ -370,7 +368,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
             )
         parts = self._parts(problem)
         metric, prior = parts.metric, np.zeros((problem.model.Q.dim, 0))
-        # A constant gain does not go by the prior, which need not have a size that means anything.
+        # A constant gain does not use the prior, whose standard deviation may be arbitrary.
         if isinstance(metric, InformationMetric):
             prior = metric.probes
         forms = parts.stage(np.ones(problem.observed.size, dtype=bool)).terms.forms
@@ -424,11 +422,10 @@ class GradientLaw(Law[GradientParts, GradientState]):
         interval, readings = state.readings.screened(interval, work.problem.observed.noise)
         refused = int(np.count_nonzero(readings.wild > state.readings.wild))
         interval = work.problem.linear_readings(interval, state.u)
-        given, state = state, replace(state, readings=readings)
+        before, state = state, replace(state, readings=readings)
         closed = work.gate is not None and work.gate.closed(state.excitation)
         new, report = self._advanced(work, state, interval, closed)
-        # A q that prior and data cannot explain is not believed: the step is taken again with q
-        # held.
+        # If prior and data cannot explain the new q, the step is repeated with q held.
         if report.status.ok and (doubt := work.metric.doubt(new.metric, new.q)):
             new, report = self._advanced(work, state, interval, frozen=True)
             if report.status.ok:
@@ -437,7 +434,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
             tested = replace(new.tested, rests=new.tested.rests + 1)
             new, report = replace(new, tested=tested), report.updated(Diagnostics(at_rest=1.0))
         if not report.status.taken:
-            return given, report
+            return before, report
         if refused:
             report = report.updated(Diagnostics(refused=float(refused)))
         return new, report
@@ -445,7 +442,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
     def _advanced(
         self, work: GradientParts, state: GradientState, interval: Interval, frozen: bool
     ) -> tuple[GradientState, Report]:
-        """Return the state at the end of an interval; with `frozen`, q is held."""
+        """Return the state at the end of an interval, with q held if `frozen`, and a report."""
         model, n = work.problem.model, len(state.u)
         coupled = work.stage(interval.present)
         forms, length = coupled.terms.forms, interval.t1 - interval.t0
@@ -463,10 +460,10 @@ class GradientLaw(Law[GradientParts, GradientState]):
 
         # u and q together, by coupled stages
         predicts = same and frozen == state.frozen
-        # Other sensors, or a q that is held now or was before, have another matrix: so that the
-        # factor of the last stage does not serve.
+        # The matrix depends on the sensors and on whether q is held: if either changed, the factor
+        # of the last stage is not used.
         rate, kept = (state.rate, state.kept) if predicts else (None, KeptFactor.none())
-        # While q is held its equation has a huge inner product: its residual is rounding.
+        # While q is held, the residual of its equation is rounding, due to the large weight of Q.
         left = state.left if predicts and not frozen else 0.0 * state.left
         stages = StageSequence(coupled, path, metric, rate, kept, left, state.width)
         y = np.concatenate([state.u, state.q])
@@ -475,8 +472,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
             predicted = work.problem.predict(state.u, state.q, interval.end)
             return state, Report(Status.of(failure), predicted)
 
-        # Below, u - r is w = u_alpha + P u at the end; the metric learns from q before it is
-        # clipped.
+        # u - r is w = u_alpha + P u at the end. The metric is updated with q before clipping.
         u, q = end[:n], model.latent.clipped(end[n:])
         r, change = R(u) - u_alpha, end[n:] - state.q
         error = cache(stages.equation_error)
@@ -503,13 +499,13 @@ class GradientLaw(Law[GradientParts, GradientState]):
             tested=work.tested(state.tested, interval.present, equation),
             readings=state.readings,
         )
-        found = path.diagnostics().updated(work.metric.diagnostics(learned, q, length))
+        known = path.diagnostics().updated(work.metric.diagnostics(learned, q, length))
 
-        def diagnosed() -> Diagnostics[float]:
-            return replace(found, residual=model.X.norm(r))
+        def diagnostics() -> Diagnostics[float]:
+            return replace(known, residual=model.X.norm(r))
 
         predicted = work.problem.predict(u, q, interval.end)
-        return new, Report(Status(), predicted, steps, cache(diagnosed))
+        return new, Report(Status(), predicted, steps, cache(diagnostics))
 
     def belief(self, work: GradientParts, state: GradientState) -> Belief:
         return Belief(state.q, state.u)

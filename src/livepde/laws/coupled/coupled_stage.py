@@ -1,4 +1,4 @@
-"""The implicit stage of the paper's method, u and q in one system: solver and warm start."""
+"""Solution of a coupled stage of u and q: prediction, cached factors, and search for theta."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-import scipy  # scipy.optimize is slow to load, and rarely needed
+import scipy  # scipy.optimize is slow to import, and rarely needed
 
 from livepde.fem import Moment
 from livepde.laws.coupled.equation import (
@@ -23,25 +23,25 @@ from livepde.laws.coupled.stage_solvers import BilinearSolver, BlockSolver, Mono
 from livepde.linalg import Array, Factor
 from livepde.stepping import Near, Newton, Solution, StepFailed
 
-STRIDE = 1.5  # factor between two values of theta that are tried
-SAME = 1e-9  # of a step: steps that are the same but for rounding
-ACCURACY = 1e-8  # relative, of theta: Newton goes on from there
+STRIDE = 1.5  # ratio of consecutive trial values of theta
+SAME = 1e-9  # relative difference of steps that are equal up to rounding
+ACCURACY = 1e-8  # relative accuracy of theta before the final Newton iteration
 
 
 @dataclass(frozen=True, eq=False)
 class KeptFactor:
-    """Where a factor was made: where it is gone, as after a restart, the same is made again."""
+    """Linearisation point of a cached factor, from which a restart recomputes the same factor."""
 
-    # Point, data and step of its Jacobian, shapes (n + m,) and (n,); empty if none is kept.
+    # Point, data and step of the Jacobian, shapes (n + m,) and (n,); empty without a factor.
     y: Array
     u_alpha: Array
     h: float
-    # Of its metric; `information` is empty and `theta` NaN without one.
+    # Fields of its `Metric`; `information` empty or `theta` NaN: None in the metric.
     weight: float
     sigma: float
     information: Array
     theta: float
-    spent: int  # updates that stages took since then, beyond one each
+    spent: int  # updates with the factor, beyond one for each stage
 
     @classmethod
     def none(cls) -> KeptFactor:
@@ -49,17 +49,17 @@ class KeptFactor:
 
     @classmethod
     def of(cls, data: StageData, y: Array) -> KeptFactor:
-        """Return the value for a factor made at a point y of a stage."""
+        """Return the linearisation point of a factor that was computed at y."""
         problem, metric = data.problem, data.problem.metric
         information = np.zeros(0) if metric.information is None else metric.information
         theta = math.nan if metric.theta is None else metric.theta
-        made = y, problem.u_alpha, problem.h
-        return cls(*made, metric.weight, metric.sigma, information, theta, 0)
+        point = y, problem.u_alpha, problem.h
+        return cls(*point, metric.weight, metric.sigma, information, theta, 0)
 
 
 @dataclass(frozen=True, eq=False)
 class _CoupledEquation:
-    """The equation of one stage, as `Newton` sees it."""
+    """The equation of one stage: a `StageEquation` for `Newton`."""
 
     solver: StageSolver
     data: StageData
@@ -77,14 +77,14 @@ class _CoupledEquation:
 def nearest_root(
     function: Callable[[float], float], start: float, least: float, most: float
 ) -> float | None:
-    """Return the root of a function of a positive number that is nearest to a start, or None."""
-    # Each value is asked for once: that of a stage depends on where its iteration began.
+    """Return the root in [least, most] nearest to a positive start, or None without a root."""
+    # A value is computed once: the function of a stage depends on its initial iterate.
     values = cache(function)
     start = min(max(start, least), most)
     first = values(start)
     if first == 0.0:
         return start
-    # Where theta is too small a root lies above it.
+    # A positive value is a theta that is too small: the side above is searched first.
     ends = {1: most, -1: least}
     sides = (1, -1) if first > 0.0 else (-1, 1)
     near = dict.fromkeys(sides, start)
@@ -101,20 +101,20 @@ def nearest_root(
 class CoupledStage:
     """Solves coupled stages for one set of sensors; see `livepde.laws.coupled.equation`.
 
-    `carries`: True if each stage makes up for the remaining residual of the one before.
+    `carries`: True if each stage corrects the residual of the previous stage.
     """
 
     def __init__(self, terms: StageTerms, newton: Newton) -> None:
         self.terms = terms
         self.solver = BlockSolver.of(terms) or BilinearSolver.of(terms) or MonolithicSolver(terms)
-        # The metric of the information learns from the residual of a stage, which therefore must
-        # not be carried over to the next one.
+        # The metric of the information uses the residual of a stage, which therefore must not be
+        # carried over to the next stage.
         learns = terms.memory is not None
         least = 0.0 if learns else self.solver.ceiling
         self.newton = replace(newton, ceiling=max(newton.ceiling, least))
         self.carries = newton.share > 0.0 and not learns
-        # The last factor and where it was made. Copies of an identifier share it, maybe in threads:
-        # the pair is read once and replaced as a whole, and a factor made again is the same.
+        # The last factor and its linearisation point. Copies of an identifier may share it between
+        # threads: the pair is read once and replaced as a whole; a recomputed factor is identical.
         self._last: tuple[Array, Factor] | None = None
 
     def solve(
@@ -124,7 +124,7 @@ class CoupledStage:
         predicted: Array | None = None,
         kept: KeptFactor | None = None,
     ) -> tuple[StageIterate, KeptFactor]:
-        """Return the solution of one stage, and the factor to keep; raises `StepFailed`."""
+        """Return the solution and the record of the factor to keep; raises `StepFailed`."""
         solver, kept = self.solver, kept or KeptFactor.none()
         data = solver.data(problem)
         near = None
@@ -145,11 +145,11 @@ class CoupledStage:
         return solved.at, self._kept(kept, data, solved)
 
     def _by_theta(self, equation: _CoupledEquation, start: Array) -> Solution[StageIterate]:
-        """Return the solution whose theta is nearest to that of the start; raises `StepFailed`.
+        """Return the solution whose theta is nearest to its initial value; raises `StepFailed`.
 
-        Where theta is given the stage is all but linear. So theta is found as the root of one
-        scalar function. It has a root between ends that are known beforehand: a rule is continuous,
-        positive without any pull, and bounded, by mu/(floor ||u_alpha||_V~) for a constant mu.
+        For fixed theta a stage is nearly linear, so theta is computed as the root of a scalar
+        function. Known bounds enclose a root: a damping rule is continuous, positive without any
+        pull, and bounded, for a constant mu by mu/(floor ||u_alpha||_V~).
         """
         data, newton = equation.data, replace(self.newton, share=0.0)
         y = start
@@ -176,7 +176,7 @@ class CoupledStage:
         return imposed
 
     def _factor(self, kept: KeptFactor, problem: StageProblem) -> Factor | None:
-        """Return the factor that is kept, made again if the last one is another."""
+        """Return the cached factor, recomputed if it is no longer in memory."""
         if not len(kept.y) or abs(kept.h - problem.h) > SAME * problem.h:
             return None
         last = self._last
@@ -188,10 +188,10 @@ class CoupledStage:
         n = self.terms.n
         w = kept.u_alpha.copy()
         fixed = self.terms.forms.model.X.fixed
-        # Dirichlet values of the stage that the factor is of, not those of this moment.
+        # Dirichlet values at the linearisation point, not at this moment.
         w[fixed] = kept.y[:n][fixed]
-        made = StageProblem(kept.y, kept.h, problem.moment, kept.u_alpha, metric)
-        data = self.solver.data(made, w)
+        linearised = StageProblem(kept.y, kept.h, problem.moment, kept.u_alpha, metric)
+        data = self.solver.data(linearised, w)
         at = self.solver.evaluate(data, kept.y)
         factor = self.solver.kept(self.solver.factor(data, at))
         self._last = (kept.y, factor)
@@ -200,7 +200,7 @@ class CoupledStage:
     def _kept(
         self, kept: KeptFactor, data: StageData, solved: Solution[StageIterate]
     ) -> KeptFactor:
-        """Return the cached factor to keep after a stage."""
+        """Return the record of the factor to keep after a stage."""
         if not self.solver.keeps:
             return kept
         if solved.made is not None:

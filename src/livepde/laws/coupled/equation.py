@@ -1,27 +1,26 @@
-"""The nonlinear equation of one coupled stage: its residual, term by term, and when it is solved.
+"""The nonlinear equation of one coupled stage: residual, scales and stopping criterion.
 
-With w = u_alpha + P u and r = R u - u_alpha, the unknowns y = (u, q) of one implicit Euler stage of
-(est_exact_q), (est_exact_u), or (noisy_q), (noisy_u), with u_t = (u - c_u)/h, q_t = (q - c_q)/h,
+With w = u_alpha + P u, r = R u - u_alpha, u_t = (u - c_u)/h and q_t = (q - c_q)/h, the unknowns
+y = (u, q) of one implicit Euler stage of (est_exact_q), (est_exact_u), or (noisy_q), (noisy_u),
 solve
 
     M u_t + B(w) + A(w) q + theta R^T M_op r + nu P^T N_op P u = F
     G_Q (q_t + sigma q)/gain                                   = A(w)^T r
 
-together, so that with full data the two terms with A cancel in the energy, as in the paper
-(align:neplusnr). Over omega w is the data, elsewhere the estimate. `StageSolver.evaluate` has both
-lines. `Metric` lists what may stand in the second one besides.
-The remaining residual of the stage before, times the ratio of its step to this one, is subtracted
-from both right-hand sides: so the residuals of a run of stages do not add up.
+as one system, so that with full data the two terms with A cancel in the energy, as in the paper
+(align:neplusnr). Over omega, w is the data; elsewhere it is the estimate. `StageSolver.evaluate`
+computes both equations, and `Metric` lists further terms of the second equation.
+The residual of the previous stage, times the ratio of its step to the current step, is subtracted
+from both right-hand sides, so that the residuals of consecutive stages do not accumulate.
 
-theta depends on all of r; its derivative is a rank-one term of the Jacobian. Where A is nonlinear
-in q, A(w) in the second line is its derivative.
+theta depends on all of r: its derivative is a rank-one term of the Jacobian. If A is nonlinear in
+q, A(w) in the second equation is the derivative in q.
 
-*Forms.* The paper splits u into R u = chi_omega u and P u = chi_(Omega without omega) u. Both have
-a jump at the boundary of omega, which no function of a finite-element space has. So the integrals
-are split, and not the coefficients: over omega the forms see w = u_alpha + P u, outside of it the
-estimate u. Selecting coefficients instead would let P u fall to zero over one element, with a
-gradient of size u over the size of the element: M and N of (MN1), (MN2) would see that and diverge
-with the mesh.
+*Forms.* The paper splits u into R u = chi_omega u and P u = chi_(Omega without omega) u. Both jump
+at the boundary of omega, which a function in a finite-element space cannot. Therefore the integrals
+are split, not the coefficients: the forms use w = u_alpha + P u over omega, and the estimate u
+outside omega. If coefficients were selected, P u would fall to zero over one element, with a
+gradient of size u over the element size: M and N of (MN1), (MN2) would diverge with the mesh.
 
 Averages, points and matrices have no omega: R = G^+ G and P = I - R split the state in all of
 Omega.
@@ -48,30 +47,30 @@ from livepde.spaces import HilbertSpace
 from livepde.stepping import TINY
 
 AnyForm: TypeAlias = Form | Composed
-FLOOR = 1e-6  # of ||u_alpha||: what is smaller of r counts as zero
-RESOLVED = 1e-3  # relative accuracy of r, as far as it is above the floor
-CARRIED = 1e-2  # the same where the next stage makes up for the remaining residual
-STIFFEST = 1e12  # times 1/h, of theta: then a step takes all but this part of r away
-RESTING = 1e-6  # of u and q: residuals of smaller changes in a step are relative to it
-OWED = 0.1  # weight of the second line's residual, where a later step makes up for it
-ROUNDING = 4e-16  # times the sizes of all terms of a row: what their sum is exact to
+FLOOR = 1e-6  # norm of r, relative to ||u_alpha||, below which r counts as zero
+RESOLVED = 1e-3  # relative accuracy of r above the floor
+CARRIED = 1e-2  # relative accuracy of r if the next stage corrects the residual of this one
+STIFFEST = 1e12  # largest theta h: one step then reduces r by about this factor
+RESTING = 1e-6  # least change of u and q in a step, relative to them, that scales a residual
+OWED = 0.1  # weight of the residual of the second equation if the next step corrects it
+ROUNDING = 4e-16  # rounding error of a row, relative to the sum of the sizes of its terms
 
 
 @dataclass(frozen=True, eq=False)
 class StageForms:
-    """Forms and matrices of a stage for one set of sensors; fixed, whatever the step."""
+    """Forms and matrices of a stage for one set of sensors; they do not depend on the step."""
 
     # The process, and the split of its state into an observed and a hidden part.
     model: Model
     split: Split
-    # Integrands (u, v, x) of M and N, integrated as in (MN1), (MN2); M_op None: that of M.
+    # Integrands (u, v, x) of M and N, integrated as in (MN1), (MN2); M_op None: the mass form.
     M_op: Any
     N_op: Any
     nu: float  # weight of N
 
     @cached_property
     def _outside(self) -> IntArray | None:
-        """The elements outside omega; None where there are none."""
+        """The elements outside omega; None without omega."""
         omega = self.split.omega
         if omega is None:
             return None
@@ -92,25 +91,25 @@ class StageForms:
 
     @cached_property
     def A_out(self) -> AnyForm | None:
-        """A outside omega; None where there is nothing."""
+        """A outside omega; None without omega."""
         return None if self._outside is None else self.model.form_A.on(self._outside)
 
     @cached_property
     def B_out(self) -> AnyForm | None:
-        """B outside omega; None where there is nothing."""
+        """B outside omega; None without omega."""
         return None if self._outside is None else self.model.form_B.on(self._outside)
 
     def argument(self, u: Array, r: Array) -> Array:
-        """Return w = u_alpha + P u, which A and B see over omega: u - r, since P = I - R."""
+        """Return w = u_alpha + P u = u - r, the argument of A and B over omega."""
         return u - r
 
     @cached_property
     def W(self) -> sp.csr_array | None:
-        """dw/du over omega, shape (n, n); None where w is known there: the data give all of it."""
+        """dw/du over omega, shape (n, n); None if the data determine w over omega."""
         n = self.model.X.dim
         estimated = sp.csr_array(self.split.P @ sp.diags_array(self.model.X.free))
         if self.split.omega is not None:
-            # Only coefficients that the forms over omega read can make w unknown.
+            # w is needed only for the coefficients that the forms over omega use.
             touched = np.zeros(n)
             touched[self.B_in.pattern("v", "u").indices] = 1.0
             touched[self.A_in.pattern("v", "u").indices] = 1.0
@@ -120,20 +119,20 @@ class StageForms:
 
     @cached_property
     def mass(self) -> sp.csr_array:
-        """Matrix of ||r||_X^2 = r^T mass r: R^T M R, integrated over omega."""
+        """Matrix R^T M R of ||r||_X^2 = r^T mass r, integrated over omega."""
         form = self._inside(self.model.form_M)
         return self._observed(form.matrix("v", "u"))
 
     @cached_property
     def pull(self) -> sp.csr_array:
-        """R^T M_op R, integrated over omega (MN1)."""
+        """Matrix R^T M_op R, integrated over omega (MN1)."""
         if self.M_op is None:
             return self.mass
         return self._observed(self.model.bilinear(self.M_op, self.split.omega))
 
     @cached_property
     def hidden(self) -> sp.csr_array:
-        """Matrix nu P^T N_op P over omega, and nu N_op outside it (MN2), shape (n, n)."""
+        """Sum of nu P^T N_op P over omega and nu N_op outside omega (MN2), shape (n, n)."""
         n, P = self.model.X.dim, self.split.P
         if not self.nu:
             return sp.csr_array((n, n))
@@ -147,7 +146,7 @@ class StageForms:
 
     @cached_property
     def tests(self) -> HilbertSpace:
-        """X without the functions that reach out of omega: the test functions of ||r||_V~."""
+        """Test functions of ||r||_V~: the functions of X with support in omega."""
         if self._outside is None:
             return self.model.X
         reach = np.zeros(self.model.X.dim, dtype=bool)
@@ -160,26 +159,26 @@ class StageForms:
 
 @dataclass(frozen=True, eq=False)
 class Metric:
-    """Weights of the second line of a stage, an equation of dual vectors of Q.
+    """Weights of the second equation of a stage, an equation of dual vectors of Q.
 
         weight G_Q (q_t + sigma (q - q_0) - K (q - prior)) + J (q - c_q) = A(w)^T r + load
 
-    with q_t = (q - c_q)/h, the Gram matrix G_Q, the generator K of unknowns that move by
-    themselves, and q_0 = 0 (`Latent.origin`). With J = 0 and without load it is (noisy_q), and with
-    sigma = 0 (est_exact_q), for weight = 1/gain.
+    with q_t = (q - c_q)/h, the Gram matrix G_Q, the generator K of the evolution of unknowns, and
+    the origin q_0 (`Latent.origin`). If weight = 1/gain, J = 0 and load = 0, this is (noisy_q); if
+    also sigma = 0, it is (est_exact_q).
     """
 
     weight: float  # 1/gain, >= 0
     sigma: float = 0.0  # stabilising term of (noisy_q), >= 0
-    # Terms of the right-hand side besides A(w)^T r, shape (m,); None: zero.
+    # Further terms of the right-hand side, shape (m,); None: zero.
     load: Array | None = None
-    # Data of J, in the pattern that the stage was made with; None: zero.
+    # Entries of J in the pattern `StageTerms.memory`; None: zero.
     information: Array | None = None
-    # Weight of R^T M_op r in the stage, where the metric sets it; None: by the damping rule.
+    # Weight of R^T M_op r in the stage; None: the damping rule determines it.
     theta: float | None = None
 
     def scale(self, h: float) -> float:
-        """Return the weight of G_Q q in a stage with step h."""
+        """Return the coefficient of G_Q q in a stage with step h."""
         return self.weight * (1.0 / h + self.sigma)
 
 
@@ -194,49 +193,49 @@ class Inside:
 
 @dataclass(frozen=True, eq=False)
 class StageProblem:
-    """One stage to be solved."""
+    """Data that define one stage."""
 
     c: Array  # (c_u, c_q), shape (n + m,)
     # Step, and time and inputs at its end.
     h: float
     moment: Moment
     u_alpha: Array  # observed part of the state, shape (n,)
-    metric: Metric  # weights of the second line
-    # Remaining residual of the stage before, for which this one makes up, a dual vector, shape (n +
-    # m,); None: residuals are not carried from stage to stage.
+    metric: Metric  # weights of the second equation
+    # Residual of the previous stage that this stage corrects, a dual vector of shape (n + m,);
+    # None: residuals are not carried over.
     left: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class StageData:
-    """A stage with the data that are computed once for it."""
+    """A stage with the quantities that do not depend on its iterate."""
 
-    problem: StageProblem  # the stage
-    # F and the load, less the remaining residual of the stage before, shapes (n,) and (m,).
+    problem: StageProblem  # definition of the stage
+    # F and the load, less the residual of the previous stage, shapes (n,) and (m,).
     source: Array
     load: Array
-    rest: Array  # left side of the second line for a q that does not change, shape (m,)
-    inside: Inside | None  # A and B over omega, where the data give all of w there
-    # Least scales of the residuals of both lines, and ||u_alpha||_X. Scales are the dual norms of F
-    # and of the load less `rest`, or of changes by `RESTING` of c if these are larger.
+    rest: Array  # left-hand side of the second equation for a constant q, shape (m,)
+    inside: Inside | None  # A and B over omega; None if they depend on the iterate
+    # Least scales of the residuals of both equations, and ||u_alpha||_X. The scales are the dual
+    # norms of F and of the load less `rest`, or of changes by `RESTING` of c if these are larger.
     sizes: tuple[float, float, float]
-    # Function that returns the squared norms of u_alpha, computed once.
+    # Function that returns the squared norms of u_alpha, with a cached result.
     observed: Callable[[], Residual]
-    J: Any = None  # information in the metric, a matrix of shape (m, m); None: zero
+    J: Any = None  # information matrix of the metric, shape (m, m); None: zero
 
 
 @dataclass(frozen=True, eq=False)
 class StageIterate:
     """The stage at a point y = (u, q)."""
 
-    # Shape (n + m,).
+    # The iterate and its residual, shape (n + m,).
     y: Array
     residual: Array
     # See `livepde.stepping.newton.StagePoint`.
     size: float
     resolved: bool
-    scales: tuple[float, float]  # dual norms of the largest terms of the two lines
-    # Argument of A and B over omega, and the observed residual, shape (n,).
+    scales: tuple[float, float]  # dual norms of the largest terms of the two equations
+    # Argument of A and B over omega, and the residual of the data, shape (n,).
     w: Array
     r: Array
     A_in: Any  # A(w) over omega, shape (n, m)
@@ -248,9 +247,9 @@ class StageIterate:
 
 
 class StageTerms:
-    """Terms of a stage that all solvers share: its forms, gains and norms.
+    """Terms and norms of a stage that all solvers share.
 
-    `memory` is the pattern of `Metric.information`; None: there is none.
+    `memory` is the pattern of `Metric.information`; None: the metric has no information matrix.
     """
 
     def __init__(self, forms: StageForms, damping: Damping, memory: Pattern | None = None) -> None:
@@ -258,19 +257,19 @@ class StageTerms:
         self.forms, self.damping, self.memory = forms, damping, memory
         self.n, self.size = model.X.dim, model.X.dim + model.Q.dim
         self.parts = slice(0, self.n), slice(self.n, self.size)  # of u and q in y
-        # One for each free coefficient of the state, (n,), and of the parameter, (m,).
+        # 1 for free and 0 for fixed coefficients of the state, (n,), and the parameter, (m,).
         self.free, self.free_q = model.X.free, model.Q.free
-        # G_Q, or where that is dense a sparse matrix of which it is the Schur complement, with
-        # auxiliary unknowns behind q.
+        # G_Q; if G_Q is dense, a sparse matrix with auxiliary unknowns after q, of which G_Q is the
+        # Schur complement.
         self.gram: sp.csr_array = model.Q.augmented
         self.auxiliary = self.gram.shape[0] - model.Q.dim
-        self.linear = model.form_A.linear_in_parameter  # in q
-        self.moves = bool(model.latent.generator.nnz)  # whether an unknown moves by itself
+        self.linear = model.form_A.linear_in_parameter  # whether A is linear in q
+        self.moves = bool(model.latent.generator.nnz)  # whether an unknown has an evolution
         self.observes = bool(forms.split.present.any())  # whether a sensor is present
         # M, R^T M_op R and R^T M R over omega; dense if small.
         self.mass, self.pull = compact(model.mass), compact(forms.pull)
         self.observed_mass = compact(forms.mass)
-        # Diagonal of the mass: the norm by it is equivalent to that of X.
+        # Diagonal of M: its norm is equivalent to the norm of X.
         self.lumped: Array = np.abs(model.mass.diagonal())
         self.dual_weights = self._dual_weights()
         weights = self.dual_weights
@@ -280,8 +279,8 @@ class StageTerms:
     def _dual_weights(self) -> Array:
         """Return weights of squared dual norms, (n + m,): the inverse diagonals of M and G_Q.
 
-        For functionals of the same kind, as a residual and the terms that it is the sum of, the
-        ratio of these norms is that of the dual norms, and larger where a residual is rough.
+        For functionals of one kind, such as a residual and its terms, the ratio of the weighted
+        norms approximates the ratio of the dual norms. For rough residuals it is larger.
         """
         parts, Q = [], self.forms.model.Q
         grams = self.forms.model.mass, self.gram if self.auxiliary else Q.gram
@@ -294,8 +293,8 @@ class StageTerms:
     def duals(self, functionals: Sequence[Array], part: slice) -> list[float]:
         """Return the dual norms of functionals on u or q."""
         squares = np.square(np.array(functionals)) @ self.dual_weights[part]
-        found: list[float] = np.sqrt(squares).tolist()
-        return found
+        norms: list[float] = np.sqrt(squares).tolist()
+        return norms
 
     def measured(
         self,
@@ -312,15 +311,15 @@ class StageTerms:
         scales = max(data.sizes[0], *terms), max(data.sizes[1], *terms_q)
         own, own_q = state / max(scales[0], TINY), other / max(scales[1], TINY)
         if data.problem.metric.theta is not None:
-            # With such a metric the next step makes up for the remaining residuals of this one.
+            # With the metric of the information, the next step corrects the residuals of this one.
             return max(own, OWED * own_q), True, scales
-        # S >= M (1/h + theta) on the observed part, which bounds the error of u by the residual.
+        # S >= M (1/h + theta) on the observed part: the residual bounds the error of u.
         least = 1.0 / data.problem.h + theta
         r = math.sqrt(max(X, 0.0)) + FLOOR * data.sizes[2]
         return max(own, own_q), state <= accuracy * r * least or not self.observes, scales
 
     def given(self, problem: StageProblem, source: Array, inside: Inside | None) -> StageData:
-        """Return a stage, from its F and the terms of the data on omega."""
+        """Return the data of a stage, from F and from A and B over omega if they are known."""
         metric, left, c_q = problem.metric, problem.left, problem.c[self.n :]
         load = np.zeros_like(c_q) if metric.load is None else metric.load
         if left is not None:
@@ -334,10 +333,10 @@ class StageTerms:
         return StageData(problem, source, load, rest, inside, sizes, observed, J)
 
     def learned(self, problem: StageProblem, q: Array, J: Any = None) -> Array:
-        """Return the left side of (est_exact_q), (noisy_q) over the gain, G_Q (q_t + sigma q)/gain.
+        """Return the left-hand side of (est_exact_q) or (noisy_q), G_Q (q_t + sigma q)/gain.
 
-        Of unknowns that move by themselves less G_Q K (q - prior)/gain, and with the information
-        J (q - c_q). A dual vector, shape (m,).
+        An evolution of the unknowns adds -G_Q K (q - prior)/gain, and an information matrix adds
+        J (q - c_q). The result is a dual vector of shape (m,).
         """
         metric, latent = problem.metric, self.forms.model.latent
         change = q - problem.c[self.n :]
@@ -358,7 +357,7 @@ class StageTerms:
         self, problem: StageProblem, source: Array, load: Array
     ) -> tuple[float, float, float]:
         """Return `StageData.sizes`: scales of both residuals, and the norm of u_alpha."""
-        # Where nothing moves, all terms of a line are rounding errors, and none is a scale.
+        # At rest all terms of an equation are rounding errors, which cannot serve as a scale.
         unchanged = np.square(problem.c) * self.diagonal
         least = math.sqrt(float(unchanged[: self.n].sum())) / problem.h
         least_q = math.sqrt(float(unchanged[self.n :].sum())) * problem.metric.scale(problem.h)
@@ -368,7 +367,7 @@ class StageTerms:
         return max(own, RESTING * least), max(other, RESTING * least_q), known
 
     def observed(self, u_alpha: Array) -> Callable[[], Residual]:
-        """Return a function that computes the norms of u_alpha when it is called first."""
+        """Return a function that computes the norms of u_alpha at its first call."""
 
         @cache
         def norms() -> Residual:
@@ -379,7 +378,7 @@ class StageTerms:
     def norms(
         self, r: Array, Mr: Array, mass_r: Array, observed: Callable[[], Residual] | None = None
     ) -> Residual:
-        """Return the norms of r that a damping rule may use."""
+        """Return the norms of r for a damping rule."""
         tests = self.forms.tests
 
         def V() -> float:
@@ -388,15 +387,14 @@ class StageTerms:
         return Residual(float(r @ mass_r), float(r @ Mr), V, observed)
 
     def damped(self, data: StageData, norms: Residual) -> float:
-        """Return the theta of the rule, with a bound that keeps the stage solvable.
+        """Return theta by the damping rule, with an upper bound that keeps the stage solvable.
 
-        A rule with a pull that does not vanish with r has no bound of its own while u_alpha is
-        zero, or tiny.
+        A rule whose pull does not vanish with r is unbounded if u_alpha is zero or tiny.
         """
         return min(self.damping.theta(norms), STIFFEST / data.problem.h)
 
     def bracket(self, data: StageData) -> tuple[float, float]:
-        """Return two ends between which the theta of a solved stage lies."""
+        """Return lower and upper bounds for the theta of a solved stage."""
         h = data.problem.h
         return 1.0 / (STIFFEST * h), min(self.damping.most(data.observed()), STIFFEST / h)
 
@@ -404,8 +402,8 @@ class StageTerms:
         """Return the derivative of theta in u, shape (n,); None if it is zero."""
         if data.problem.metric.theta is not None or at.theta >= STIFFEST / data.problem.h:
             return None
-        # Chain rule: the squared norms of r in X, VX~ and V~ have the derivatives 2 R^T M r, 2 R^T
-        # M_op r and 2 M_op^T times the representative of M_op r.
+        # Chain rule: the squared norms of r in X, VX~ and V~ have the derivatives 2 R^T M r,
+        # 2 R^T M_op r and 2 M_op^T times the Riesz representative of M_op r.
         dX, dVX, dV = self.damping.slopes(at.norms)
         row = (2.0 * dX) * at.mass_r + (2.0 * dVX) * at.Mr
         if dV:
@@ -413,9 +411,9 @@ class StageTerms:
         return row if row.any() else None
 
     def limited(self, data: StageData, at: StageIterate, allowed: float) -> bool:
-        """Return true if the residual of each line is as small as allowed or as its rounding error.
+        """Return True if the residual of each equation is within `allowed` or its rounding error.
 
-        Line by line: one that is small beside the rounding errors of the other is not solved.
+        Each equation has its own rounding error: the rounding of one must not excuse the other.
         """
         left = (at.residual[part] for part in self.parts)
         own = [self.duals([line], part)[0] for line, part in zip(left, self.parts, strict=True)]
@@ -423,13 +421,13 @@ class StageTerms:
         return all(line <= max(allowed * scale, rounding) for line, scale, rounding in sizes)
 
     def rounding(self, data: StageData, at: StageIterate) -> tuple[float, float]:
-        """Return bounds of the rounding errors of both lines at a point, in dual norms."""
+        """Return bounds for the rounding errors of both equations at a point, in dual norms."""
         forms, model, n = self.forms, self.forms.model, self.n
         u, q = np.abs(at.y[:n]), np.abs(at.y[n:])
         problem, moment = data.problem, data.problem.moment
         c, v = np.abs(problem.c), np.abs(at.w) + np.abs(problem.u_alpha)
         w, own = {"u": at.w}, {"u": at.y[:n]}
-        # Row by row the sum of the sizes of all terms; differences count with both operands.
+        # Sum of the sizes of all terms of each row; a difference counts with both operands.
         A = abs(forms.A_in.matrix("v", "q", moment, q=at.y[n:], **w))
         first = abs(model.mass) @ ((u + c[:n]) / problem.h) + A @ q + np.abs(data.source)
         first += abs(forms.B_in.matrix("v", "u", moment, **w)) @ np.abs(at.w)
@@ -448,11 +446,11 @@ class StageTerms:
 class StageSolver(ABC):
     """Abstract solver of coupled stages: evaluates their equation and factorises its Jacobian."""
 
-    keeps: bool  # whether a factor is worth keeping from stage to stage
-    patience: int  # updates, beyond one for each stage, after which a kept factor is made again
-    refresh = 0.2  # share of the residual that an update by a kept factor may leave
-    ceiling = 0.0  # relative residual up to which a predicted stage is not solved further
-    carried = CARRIED  # relative accuracy of r where the next stage makes up for the residual
+    keeps: bool  # whether a factor is reused in later stages
+    patience: int  # updates, beyond one for each stage, after which a cached factor is recomputed
+    refresh = 0.2  # largest contraction factor of the residual by a cached factor
+    ceiling = 0.0  # accepted relative residual of a predicted stage
+    carried = CARRIED  # relative accuracy of r if the next stage corrects the residual
 
     def __init__(self, terms: StageTerms) -> None:
         self.terms = terms
@@ -462,15 +460,18 @@ class StageSolver(ABC):
         """Return the factorised Jacobian at a point."""
 
     def kept(self, factor: Factor) -> Factor:
-        """Return the part of a factor that is kept for later stages."""
+        """Return the part of a factor that is cached for later stages."""
         return factor
 
     @abstractmethod
     def prepare(self) -> None:
-        """Compute the parts that do not depend on the samples."""
+        """Compute the quantities that do not depend on the samples."""
 
     def data(self, problem: StageProblem, w: Array | None = None) -> StageData:
-        """Return a stage, with the terms that do not depend on its solution."""
+        """Return a stage with the quantities that do not depend on its iterate.
+
+        `w`: argument of A and B over omega if the data determine it; None: from u_alpha.
+        """
         forms, moment, inside = self.terms.forms, problem.moment, None
         if forms.W is None and self.terms.linear:
             w = forms.model.impose(problem.u_alpha, moment) if w is None else w
@@ -480,8 +481,7 @@ class StageSolver(ABC):
     def evaluate(self, data: StageData, y: Array) -> StageIterate:
         """Return the stage at y = (u, q): (est_exact_u), (est_exact_q), or (noisy_u), (noisy_q).
 
-        These are the only lines that state the method. How A, B and F are computed is the matter of
-        `inside`, `outside` and `source`.
+        The method is defined here alone; `inside`, `outside` and `source` compute A, B and F.
         """
         terms, forms, stage, n = self.terms, self.terms.forms, data.problem, self.terms.n
         u, q = y[:n], y[n:]
@@ -504,8 +504,8 @@ class StageSolver(ABC):
         pull, coupling = theta * Mr, inside.transposed @ r
         learned = terms.learned(stage, q, data.J)
         residual = np.empty_like(y)
-        # u' + A(w) q + B(w) + theta R^T M r + nu P^T N P u = f, and (q' + sigma q)/gain = A(w)* r;
-        # rows of fixed coefficients are zero.
+        # u' + A(w) q + B(w) + theta R^T M r + nu P^T N P u = f, and (q' + sigma q)/gain = A(w)* r.
+        # Rows of fixed coefficients are zero.
         residual[:n] = (u_t + Aq + B + pull - data.source) * terms.free
         residual[n:] = (learned - coupling - data.load) * terms.free_q
 
@@ -515,11 +515,11 @@ class StageSolver(ABC):
         return StageIterate(y, residual, size, resolved, scales, w, r, A, theta, norms, Mr, mass_r)
 
     def source(self, moment: Moment) -> Array:
-        """Return F, less a constant part of B, shape (n,)."""
+        """Return F, shape (n,); a subclass may subtract the constant part of B."""
         return self.terms.forms.model.F(moment)
 
     def inside(self, moment: Moment, w: Array, q: Array | None = None) -> Inside:
-        """Return A(w) and B(w) over omega; q where A is not linear in it."""
+        """Return A(w) and B(w) over omega; `q` is required if A is nonlinear in q."""
         forms = self.terms.forms
         A = forms.A_in.matrix("v", "q", moment, **({"u": w} if q is None else {"u": w, "q": q}))
         return Inside(A, A.T, forms.B_in.vector("v", moment, u=w))

@@ -1,21 +1,21 @@
-"""Solvers of coupled stages: one sparse matrix of u and q together, and large ones by blocks.
+"""Solvers of coupled stages: one sparse matrix for u and q, or blocks for large problems.
 
-If A is bilinear, B affine, and both are constant in time, their products are made ahead.
+If A is bilinear, B affine, and both are constant in time, their tensors are precomputed.
 
 The Jacobian of a stage is
 
     K = [[S, A], [-A_in^T R - ..., H]],    S = M/h + B' + d(A q)/du + theta R^T M_op R + nu N,
 
-of which the blocks have the patterns of the forms. By blocks no matrix of all of it is formed. The
-Schur complement H + A_in^T R S^{-1} A is dense; C = H + (a sparse matrix of the size of the
-product) stands for it. For a field q that A does not differentiate this matrix is diagonal and
-agrees with the product on constants: for smooth functions the difference is small, and rough ones
-are ruled by G_Q. Else it is A_in^T R D^{-1} R^T A with D, the lumped mass times 1/h + theta, in the
-place of S. An approximate solution with K is then
+whose blocks have the patterns of the forms. The block solver does not assemble K. The Schur
+complement H + A_in^T R S^{-1} A is dense; a sparse matrix C approximates it. If q is one field that
+A does not differentiate, C - H is diagonal and agrees with the product on constants: the error is
+small for smooth functions, and G_Q dominates for rough ones. Otherwise C - H is
+A_in^T R D^{-1} R^T A, where D, the lumped mass times 1/h + theta, replaces S. An approximate
+solution with K is then
 
     u = S^{-1} b_u,    q = C^{-1} (b_q + A_in^T R u),    u = S^{-1} (b_u - A q).
 
-It serves Newton as a kept factor; where it reduces the residual too little, GMRES solves with K.
+Newton uses it as a cached factor. If it does not reduce the residual enough, GMRES solves with K.
 """
 
 from __future__ import annotations
@@ -52,58 +52,58 @@ from livepde.linalg import (
 )
 from livepde.linalg.solvers import check_finite
 
-LARGE = 4000  # unknowns u and q together, from which a matrix that is not banded goes by blocks
-TOLERANCE = 1e-4  # of GMRES, relative to the first approximation, which Newton then improves
-ITERATIONS = 60  # each keeps a vector
-RESOLVED = 1e-10  # of u and q: smaller updates by GMRES are as good as none
-ONE_SIGN = 1.1  # sum of sizes over size of sums, of entries that have one sign nearly everywhere
+LARGE = 4000  # least number of unknowns in (u, q) to solve by blocks if the matrix is not banded
+TOLERANCE = 1e-4  # of GMRES, relative to the preconditioned right-hand side; Newton corrects it
+ITERATIONS = 60  # of GMRES, which stores a vector for each
+RESOLVED = 1e-10  # size of an update of u or q, relative to it, below which it is negligible
+ONE_SIGN = 1.1  # largest ratio of sum |a| to |sum a| for entries a of nearly constant sign
 ROUNDING = 1e-12  # asymmetry of a symmetric matrix, relative to its largest entry
 REMEDY = "take a smaller gain or a smaller time step."
 
 
 class MonolithicSolver(StageSolver):
-    """Factorises the matrix of u and q, with auxiliary unknowns behind."""
+    """Factorises the matrix of (u, q, auxiliary unknowns) with a direct solver."""
 
     keeps = False
 
     def __init__(self, terms: StageTerms) -> None:
         super().__init__(terms)
-        # The engine of the coupled matrix, and for each block the map of its data into that matrix.
+        # Engine of the coupled matrix, and for each block the map of its data to the matrix data.
         self.solver, self.maps = self._assembled()
         self.patience = 2 if isinstance(self.solver, BandedSolver) else 12
         self._constant: tuple[tuple[float, float, float], Array] | None = None
 
     def changing(self, data: StageData, at: StageIterate) -> Array:
-        """Return the data of the Jacobian that depend on the iterate."""
+        """Return the part of the Jacobian data that depends on the iterate."""
         terms, forms, maps = self.terms, self.terms.forms, self.maps
         A, moment, n = forms.A_in, data.problem.moment, self.terms.n
         u, q = at.y[:n], at.y[n:]
-        found: Array = maps["A_in"] @ at.A_in.data
+        entries: Array = maps["A_in"] @ at.A_in.data
         if forms.W is not None:
-            found += maps["A_in u"] @ A.data("v", "u", moment, u=at.w, q=q)
-            found += maps["B_in"] @ forms.B_in.data("v", "u", moment, u=at.w)
+            entries += maps["A_in u"] @ A.data("v", "u", moment, u=at.w, q=q)
+            entries += maps["B_in"] @ forms.B_in.data("v", "u", moment, u=at.w)
             back = A.data("q", "u", moment, u=at.w, v=at.r, q=q)
-            found += maps["A_in^T r, u"] @ back
+            entries += maps["A_in^T r, u"] @ back
         if not terms.linear:
             back = A.data("q", "q", moment, u=at.w, v=at.r, q=q)
-            found += maps["A_in^T r, q"] @ back
+            entries += maps["A_in^T r, q"] @ back
         if forms.A_out is not None and forms.B_out is not None:
-            found += maps["A_out"] @ forms.A_out.data("v", "q", moment, u=u, q=q)
-            found += maps["A_out u"] @ forms.A_out.data("v", "u", moment, u=u, q=q)
-            found += maps["B_out"] @ forms.B_out.data("v", "u", moment, u=u)
-        return found
+            entries += maps["A_out"] @ forms.A_out.data("v", "q", moment, u=u, q=q)
+            entries += maps["A_out u"] @ forms.A_out.data("v", "u", moment, u=u, q=q)
+            entries += maps["B_out"] @ forms.B_out.data("v", "u", moment, u=u)
+        return entries
 
     def prepare(self) -> None:
         _ = self._parts, self._pull
 
     def factor(self, data: StageData, at: StageIterate) -> Factor:
         terms, metric = self.terms, data.problem.metric
-        found = self.changing(data, at)
-        found += self._fixed(data)
-        found += at.theta * self._pull
+        entries = self.changing(data, at)
+        entries += self._fixed(data)
+        entries += at.theta * self._pull
         if metric.information is not None:
-            found += self.maps["J"] @ metric.information
-        factor: Factor = self.solver.factorise(found)
+            entries += self.maps["J"] @ metric.information
+        factor: Factor = self.solver.factorise(entries)
         if terms.auxiliary:
             factor = Leading(factor, terms.size, terms.size + terms.auxiliary)
         row = terms.slope(data, at)
@@ -114,18 +114,18 @@ class MonolithicSolver(StageSolver):
         return factor
 
     def _fixed(self, data: StageData) -> Array:
-        """Return the data that depend on the step and on weight and sigma of the metric only."""
+        """Return the part of the data that depends only on the step, `weight` and `sigma`."""
         h, metric = data.problem.h, data.problem.metric
         key = (h, metric.weight, metric.sigma)
-        # Copies of an identifier share this, maybe in threads: the pair is read once, and replaced
-        # as a whole, so that the data are those of their key.
+        # Copies of an identifier may share this cache between threads: key and data are read once,
+        # and replaced as a pair, so that the data always match their key.
         known = self._constant
         if known is None or known[0] != key:
             parts = self._parts
-            found = parts["M"] / h + metric.scale(h) * parts["G"] + parts["rest"]
+            entries = parts["M"] / h + metric.scale(h) * parts["G"] + parts["rest"]
             if "GK" in parts:
-                found = found - metric.weight * parts["GK"]
-            self._constant = known = (key, found)
+                entries = entries - metric.weight * parts["GK"]
+            self._constant = known = (key, entries)
         return known[1]
 
     def _assembled(self) -> tuple[Solver, dict[str, sp.csr_array]]:
@@ -138,7 +138,7 @@ class MonolithicSolver(StageSolver):
         whole.add("pull", Pattern.of(forms.pull), free, free)
         whole.add("N", Pattern.of(forms.hidden), free, free)
         whole.add("A_in", A.pattern("v", "q"), free, free_q, at=(0, n))
-        # The same data a second time: -A^T R in the second line.
+        # -A^T R in the second equation has the same data.
         whole.add("A_in", A.pattern("v", "q"), minus, R, at=(n, 0), transposed=True)
         if forms.W is not None:
             W = sp.csr_array(forms.W @ free)
@@ -169,7 +169,7 @@ class MonolithicSolver(StageSolver):
 
     @property
     def _units(self) -> Array:
-        """Powers of two in which the blocks M and G_Q of the diagonal are about one."""
+        """Scales, powers of two, by which the diagonals of M and G_Q become about one."""
         terms = self.terms
         diagonal = np.abs(
             np.concatenate([terms.forms.model.mass.diagonal(), terms.gram.diagonal()])
@@ -184,7 +184,7 @@ class MonolithicSolver(StageSolver):
 
     @cached_property
     def _parts(self) -> dict[str, Array]:
-        """Data that never change: of M, of G_Q and G_Q K, and the rest."""
+        """Constant data: M, G_Q, G_Q K, and the sum of the other constant blocks."""
         terms, forms, maps = self.terms, self.terms.forms, self.maps
         gram = _stored(terms.gram)
         rest = maps["N"] @ _stored(forms.hidden)
@@ -197,7 +197,7 @@ class MonolithicSolver(StageSolver):
 
 @dataclass(frozen=True, eq=False)
 class _Bordered:
-    """K + b a^T by Sherman and Morrison, from the factor of K: theta depends on all of r."""
+    """Factor of K + b a^T by the Sherman-Morrison formula: theta depends on all of r."""
 
     inner: Factor
     column: Array
@@ -224,20 +224,20 @@ def _stored(matrix: sp.csr_array) -> Array:
 
 
 class BilinearSolver(MonolithicSolver):
-    """A, B and the Jacobian by products with small or sparse matrices: no form is evaluated."""
+    """Computes A, B and the Jacobian as products with precomputed tensors, not from forms."""
 
     keeps = True
 
     @classmethod
     def of(cls, terms: StageTerms) -> BilinearSolver | None:
-        """Return it for a stage; None where A or B is another, or the mesh is large."""
+        """Return the solver; None if A is not bilinear, B not affine, or the mesh is too large."""
         forms = terms.forms
         B = forms.model.form_B
         if terms.auxiliary or not (B.affine and B.constant):
             return None
         parts = [form for form in (forms.A_in, forms.A_out) if form is not None]
         # All derivatives are sparse matrices times coefficients.
-        bilinear = all(isinstance(one, sp.csr_array) for form in parts for one in _tensors(form))
+        bilinear = all(isinstance(each, sp.csr_array) for form in parts for each in _tensors(form))
         return cls(terms) if bilinear else None
 
     def prepare(self) -> None:
@@ -246,13 +246,13 @@ class BilinearSolver(MonolithicSolver):
 
     @cached_property
     def _coupling(self) -> tuple[_Coupling, _Coupling | None]:
-        """A(w) over omega as a function of w, and outside it as one of u."""
+        """A(w) over omega as a function of w, and A(u) outside omega as a function of u."""
         forms = self.terms.forms
         return _Coupling.of(forms.A_in), None if forms.A_out is None else _Coupling.of(forms.A_out)
 
     @cached_property
     def _jacobian(self) -> sp.csr_array:
-        """Map of (w, u, q, r) to the data of the Jacobian that change."""
+        """Map from (w, u, q, r) to the part of the Jacobian data that depends on the iterate."""
         forms, maps, m = self.terms.forms, self.maps, self.terms.size - self.terms.n
         vq, vu, qu = _tensors(forms.A_in)
         size, n = maps["M"].shape[0], self.terms.n
@@ -266,12 +266,12 @@ class BilinearSolver(MonolithicSolver):
             outside = _tensors(forms.A_out)
             by_u = by_u + maps["A_out"] @ outside[0]
             by_q = by_q + maps["A_out u"] @ outside[1]
-        # Each block is linear in one of the four vectors, and so all of them are one product.
+        # Each block is linear in one of the four vectors: one product computes all blocks.
         return sp.csr_array(sp.hstack([by_w, by_u, by_q, by_r]))
 
     @cached_property
     def _slopes(self) -> tuple[Any, Any]:
-        """B' over omega, and elsewhere."""
+        """B' over omega, and B' outside omega or None."""
         forms, zero = self.terms.forms, np.zeros(self.terms.n)
         outside = None if forms.B_out is None else forms.B_out.matrix("v", "u", u=zero)
         inside = compact(forms.B_in.matrix("v", "u", u=zero))
@@ -283,14 +283,14 @@ class BilinearSolver(MonolithicSolver):
 
     @cached_property
     def _fixed_data(self) -> Array:
-        """Data of the Jacobian that B adds."""
+        """Contribution of B to the data of the Jacobian."""
         forms, zero = self.terms.forms, np.zeros(self.terms.n)
-        found = np.zeros(self.maps["M"].shape[0])
+        entries = np.zeros(self.maps["M"].shape[0])
         if forms.W is not None:
-            found += self.maps["B_in"] @ forms.B_in.data("v", "u", u=zero)
+            entries += self.maps["B_in"] @ forms.B_in.data("v", "u", u=zero)
         if forms.B_out is not None:
-            found += self.maps["B_out"] @ forms.B_out.data("v", "u", u=zero)
-        return found
+            entries += self.maps["B_out"] @ forms.B_out.data("v", "u", u=zero)
+        return entries
 
     def source(self, moment: Moment) -> Array:
         return super().source(moment) - self._offset
@@ -313,7 +313,7 @@ class BilinearSolver(MonolithicSolver):
 
 @dataclass(frozen=True, eq=False)
 class _Coupling:
-    """A(w) as a matrix whose data are linear in w."""
+    """Matrix A(w), whose data are linear in w."""
 
     pattern: Pattern
     data: sp.csr_array | Array
@@ -323,7 +323,7 @@ class _Coupling:
         return cls(form.pattern("v", "q"), compact(_tensors(form)[0]))
 
     def at(self, w: Array) -> tuple[Any, Any]:
-        """Return A(w) and its transpose; small ones are dense."""
+        """Return A(w) and its transpose, dense if small."""
         data = self.data @ w
         if self.pattern.small:
             dense = self.pattern.compact(data)
@@ -332,7 +332,7 @@ class _Coupling:
 
 
 def _tensors(form: AnyForm) -> tuple[sp.csr_array, sp.csr_array, sp.csr_array]:
-    """Return the maps to the data of A(w), of d(A(w) q)/dw and of d(A(w)^T r)/dw."""
+    """Return the maps to the data of A(w), d(A(w) q)/dw and d(A(w)^T r)/dw."""
     pairs = ("v", "q"), ("v", "u"), ("q", "u")
     vq, vu, qu = (cast("sp.csr_array", form.tensor(*pair)) for pair in pairs)
     return vq, vu, qu
@@ -342,9 +342,9 @@ class BlockSolver(StageSolver):
     """Solves the coupled systems of a stage by blocks."""
 
     refresh = 0.5  # an update costs a twentieth of new factors
-    ceiling = 5e-3  # one more update costs as much as a forward step
-    carried = 3e-2  # for the same reason
-    patience = 12  # updates and iterations: about what new factors cost
+    ceiling = 5e-3  # large, since each update costs as much as a forward step
+    carried = 3e-2  # large for the same reason
+    patience = 12  # so many updates cost about as much as new factors
 
     def __init__(self, terms: StageTerms) -> None:
         super().__init__(terms)
@@ -353,7 +353,7 @@ class BlockSolver(StageSolver):
 
     @classmethod
     def of(cls, terms: StageTerms) -> BlockSolver | None:
-        """Return it for a stage; None where that is small, or its matrix is banded."""
+        """Return the solver; None if the stage is small or its matrix is banded."""
         if terms.size < LARGE:
             return None
         pattern = Pattern.of(terms.forms.model.mass + terms.forms.pull)
@@ -388,9 +388,9 @@ class BlockSolver(StageSolver):
             flux = forms.B_in.matrix("v", "u", moment, u=at.w)
             flux = flux + form.matrix("v", "u", moment, u=at.w, q=q)
             S = S + masked(sp.csr_array(flux @ forms.W), free, free)
-            # The derivative of A(w)^T r in w; W = dw/du makes it one in u.
-            seen = form.matrix("q", "u", moment, u=at.w, v=at.r, q=q)
-            back = sp.csr_array(masked(seen, free_q, np.ones(n)) @ forms.W)
+            # The derivative of A(w)^T r in w, times W = dw/du, is the derivative in u.
+            by_w = form.matrix("q", "u", moment, u=at.w, v=at.r, q=q)
+            back = sp.csr_array(masked(by_w, free_q, np.ones(n)) @ forms.W)
         if not terms.linear:
             curved = masked(form.matrix("q", "q", moment, u=at.w, v=at.r, q=q), free_q, free_q)
         forward = A
@@ -402,7 +402,7 @@ class BlockSolver(StageSolver):
             forward = sp.csr_array(A + outside)
         S = S + masked(sp.csr_array(at.theta * forms.pull + forms.hidden), free, free)
         S = sp.csr_array(S + sp.diags_array(1.0 - free))
-        # S without its stiffness: on the observed part the pull adds theta to 1/h.
+        # Diagonal approximation of S without stiffness: the pull adds theta to 1/h where observed.
         rates = self.lumped * (1.0 / h + at.theta * np.abs(forms.split.R.diagonal()))
         row = terms.slope(data, at)
         border = None if row is None else (at.Mr * free, row * free)
@@ -411,7 +411,7 @@ class BlockSolver(StageSolver):
         return BlockJacobian(self, *blocks, least, back, curved, border)
 
     def _metric(self, data: StageData) -> sp.csr_array:
-        """Return H on the free coefficients, with its auxiliary unknowns."""
+        """Return H on the free coefficients and the auxiliary unknowns."""
         terms, metric = self.terms, data.problem.metric
         rest = np.zeros(terms.auxiliary)
         free = np.concatenate([terms.free_q, 1.0 - rest])
@@ -425,20 +425,20 @@ class BlockSolver(StageSolver):
         return sp.csr_array(masked(sp.csr_array(H), free, free) + sp.diags_array(1.0 - free))
 
     def factorise(self, name: str, matrix: sp.csr_array, approximate: bool = False) -> Factor:
-        """Return the factor of a matrix, by an engine for symmetric ones if it is positive."""
+        """Return the factor of a matrix; a symmetric engine is used for positive definite ones."""
         matrix.sort_indices()
         check_finite(matrix.data)
         if abs(matrix - matrix.T).max() <= ROUNDING * abs(matrix).max():
             try:
                 return self._engine(name, matrix, True, approximate).factorise(matrix.data)
-            except LinearAlgebraError:  # it is indefinite
+            except LinearAlgebraError:  # the matrix is indefinite
                 pass
         return self._engine(name, matrix, False, approximate).factorise(matrix.data)
 
     def _engine(
         self, name: str, matrix: sp.csr_array, symmetric: bool, approximate: bool
     ) -> Solver:
-        """Return the engine of a matrix, analysed again only where its pattern has changed."""
+        """Return the cached engine of a matrix; a new pattern or symmetry requires a new engine."""
         solver, kind = self._solvers.get(name, (None, symmetric))
         if (
             solver is None
@@ -453,30 +453,30 @@ class BlockSolver(StageSolver):
 
     @property
     def engines(self) -> dict[str, str]:
-        """Names of the engines of the blocks that were factorised."""
+        """Names of the engines of the factorised blocks."""
         return {name: solver.name for name, (solver, _) in self._solvers.items()}
 
 
 @dataclass(frozen=True, eq=False)
 class BlockJacobian:
-    """K at a point, as a `Factor`: GMRES, preconditioned by its approximate inverse."""
+    """`Factor` of K at a point by GMRES, preconditioned by an approximate inverse."""
 
     solver: BlockSolver
-    # Its blocks on free coefficients: `forward` is A(w) over omega and elsewhere, `A` over omega
-    # only; H with its auxiliary unknowns behind.
+    # Blocks on the free coefficients: `forward` is A over the whole domain, `A` is A over omega;
+    # the auxiliary unknowns of H follow q.
     S: sp.csr_array
     forward: sp.csr_array
     A: sp.csr_array
     H: sp.csr_array
-    rates: Array  # lumped mass times the rate of each equation of the state, shape (n,)
-    least: tuple[float, ...]  # sizes of updates of u and q that are not resolved further
-    # Derivatives of A(w)^T r in u and in q; None if they are held or zero.
+    rates: Array  # diagonal of D, the lumped mass times 1/h + theta, shape (n,)
+    least: tuple[float, ...]  # norms of negligible updates of u and q
+    # Derivatives of A(w)^T r in u and in q; None: zero.
     back: sp.csr_array | None
     curved: sp.csr_array | None
-    border: tuple[Array, Array] | None = None  # (b, a): b a^T is added to S
+    border: tuple[Array, Array] | None = None  # (b, a) of the term b a^T of S; None: zero
 
     def apply(self, x: Array) -> Array:
-        """Return K x, auxiliary unknowns behind (u, q)."""
+        """Return K x for x = (u, q, auxiliary unknowns)."""
         terms = self.solver.terms
         n, size = terms.n, terms.size
         u, q = x[:n], x[n:size]
@@ -503,34 +503,34 @@ class BlockJacobian:
         return ApproximateFactor(solver, state, schur, self.forward, self.A)
 
     def _information(self, state: Factor) -> sp.csr_array:
-        """Return the term of C that approximates A_in^T R S^{-1} A."""
+        """Return C - H, the approximation of A_in^T R S^{-1} A."""
         terms = self.solver.terms
         split = terms.forms.split
         parts = list(terms.forms.model.latent.parts.values())
         if len(parts) == 1 and isinstance(parts[0].unknown, Field):
-            # Entries of one sign show that A does not differentiate q: then a diagonal stands for
-            # the product, with the same image of a constant q.
+            # Entries of one sign indicate that A does not differentiate q: then a diagonal matrix
+            # with the same image of a constant q replaces the product.
             image = self.forward @ terms.free_q
             if np.abs(self.forward.data).sum() <= ONE_SIGN * np.abs(image).sum():
-                seen = self.A.T @ split.project(state.solve(image))
-                return sp.csr_array(sp.diags_array(np.maximum(seen, 0.0)))
+                diagonal = self.A.T @ split.project(state.solve(image))
+                return sp.csr_array(sp.diags_array(np.maximum(diagonal, 0.0)))
         forces = sp.csr_array(split.R.T @ self.A)
         return sp.csr_array(forces.T @ sp.diags_array(1.0 / self.rates) @ forces)
 
     def solve(self, b: Array) -> Array:
-        """Return x with K x = b to the tolerance; raises `LinearAlgebraError`."""
+        """Return the solution of K x = b within `TOLERANCE`; raises `LinearAlgebraError`."""
         return self.iterate(b, TOLERANCE)[0]
 
     def iterate(self, b: Array, tolerance: float) -> tuple[Array, int]:
-        """Return x with K x = b, and the iterations of GMRES that took."""
+        """Return the solution of K x = b, and the number of GMRES iterations."""
         terms, approximate = self.solver.terms, self.approximate
         n, size = terms.n, terms.size
         padded = np.zeros(size + terms.auxiliary)
         padded[:size] = b
         first = approximate.whole(padded)
-        # u and q count the same, unless the change of one is rounding.
-        found = (float(np.linalg.norm(part)) for part in (first[:n], first[n:size]))
-        sizes = [max(pair) or 1.0 for pair in zip(found, self.least, strict=True)]
+        # u and q have equal weight in the norm, unless one update is rounding.
+        norms = (float(np.linalg.norm(part)) for part in (first[:n], first[n:size]))
+        sizes = [max(pair) or 1.0 for pair in zip(norms, self.least, strict=True)]
         scale = np.repeat(1.0 / np.array(sizes), [n, len(first) - n])
 
         def scaled(r: Array) -> Array:
@@ -542,7 +542,7 @@ class BlockJacobian:
 
 @dataclass(frozen=True, eq=False)
 class ApproximateFactor:
-    """The approximate inverse of K by factors of S and C, as a `Factor`."""
+    """Approximate `Factor` of K, from the factors of S and C."""
 
     solver: BlockSolver
     state: Factor
@@ -558,7 +558,7 @@ class ApproximateFactor:
         return self.whole(padded)[: terms.size]
 
     def whole(self, b: Array) -> Array:
-        """Return the same with auxiliary unknowns behind, of b and of the solution."""
+        """Return an approximate solution; it and b include the auxiliary unknowns."""
         terms = self.solver.terms
         n, size, split = terms.n, terms.size, terms.forms.split
         x, right = np.empty_like(b), b[n:].copy()
@@ -567,12 +567,12 @@ class ApproximateFactor:
         x[n:] = approximate_inverse(self.schur)(right)
         x[:n] = approximate_inverse(self.state)(b[:n] - self.forward @ x[n:size])
         for fixed in (terms.forms.model.X.fixed, n + terms.forms.model.Q.fixed):
-            x[fixed] = b[fixed]  # which factors that iterate would leave to their tolerance
+            x[fixed] = b[fixed]  # exact: iterative factors are accurate to a tolerance only
         return x
 
 
 def masked(matrix: sp.csr_array, rows: Array, cols: Array) -> sp.csr_array:
-    """Return diag(rows) matrix diag(cols), with the same pattern."""
+    """Return diag(rows) matrix diag(cols) in the pattern of the matrix."""
     data = matrix.data * np.repeat(rows, np.diff(matrix.indptr)) * cols[matrix.indices]
     return sp.csr_array((data, matrix.indices, matrix.indptr), matrix.shape)
 
