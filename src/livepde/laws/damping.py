@@ -1,9 +1,9 @@
-"""Damping: how strongly the estimate is pulled to the observed state, and bounds of the paper.
+"""Damping rules, which pull the estimate to the observed state, and the bounds of the paper.
 
-The paper writes mu R M (r / ||r||_V~). At r = 0 that is 0/0, so a rule returns
-theta = mu / ||r||_V~, which multiplies R M r. A rule may use only quantities known online. Every
-formula of a bound returns theta, too (mu / ||r_alpha||_V~ with noise), never mu. In a twin
-experiment its arguments are the true norms; a rule is given bounds of them by the user.
+The paper's term mu R M (r / ||r||_V~) is 0/0 at r = 0. Therefore a rule returns
+theta = mu / ||r||_V~, the factor of R M r. A rule may use only quantities known online. The
+formulas of the bounds also return theta (mu / ||r_alpha||_V~ with noise), never mu. In a twin
+experiment their arguments are the true norms; for a rule the user provides bounds of the norms.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Diffusivity: TypeAlias = float | Callable[[Any], Any]
 
 
 class Residual:
-    """Squared norms of the observed residual r = R u - u_alpha, and of u_alpha to compare it with.
+    """Squared norms of the observed residual r = R u - u_alpha, and of u_alpha as a reference.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Residual:
     V
         Function that returns ||r||_V~^2, the squared dual norm of M_op r.
     observed
-        Function that returns the squared norms of u_alpha; None: nothing is observed.
+        Function that returns the squared norms of u_alpha; None: the norms are zero.
     """
 
     def __init__(
@@ -55,11 +55,11 @@ class Residual:
 
     @cached_property
     def observed(self) -> Residual:
-        """Squared norms of u_alpha: the size of the state, to which floors are relative."""
+        """Squared norms of u_alpha, the reference for floors."""
         return Residual(0.0, 0.0, lambda: 0.0) if self._observed is None else self._observed()
 
     def replaced(self, X: float, VX: float, V: Callable[[], float]) -> Residual:
-        """Return other norms of r, with the same norms of u_alpha."""
+        """Return a copy with other norms of r; the norms of u_alpha are unchanged."""
         return Residual(X, VX, V, lambda: self.observed)
 
 
@@ -71,14 +71,14 @@ class Damping(ABC):
         """Return theta >= 0, in 1/time."""
 
     def most(self, observed: Residual) -> float:
-        """Return a bound of theta for all r, from the norms of u_alpha; infinity without one."""
+        """Return a bound of theta for all r, from the norms of u_alpha; default: infinity."""
         return math.inf
 
     def slopes(self, r: Residual) -> tuple[float, float, float]:
         """Return the derivatives of theta in r.X, r.VX and r.V, for the Newton iteration.
 
-        By difference quotients, good enough for any rule: they change the number of iterations,
-        not the result.
+        The default uses difference quotients: their accuracy affects the number of iterations, not
+        the result.
         """
         reads: list[bool] = []
 
@@ -93,7 +93,7 @@ class Damping(ABC):
             dX = self.theta(r.replaced(step * r.X, r.VX, lambda: r.V)) - theta
         if r.VX > 0:
             dVX = self.theta(r.replaced(r.X, step * r.VX, lambda: r.V)) - theta
-        # ||r||_V~ costs a solve, so it is varied only if the rule has read it.
+        # ||r||_V~ costs a linear solve, so it is varied only if the rule uses it.
         if reads and r.V > 0:
             dV = (self.theta(r.replaced(r.X, r.VX, lambda: step * r.V)) - theta) / (1e-6 * r.V)
         return dX / (1e-6 * r.X or 1.0), dVX / (1e-6 * r.VX or 1.0), dV
@@ -101,11 +101,10 @@ class Damping(ABC):
 
 @dataclass(frozen=True)
 class ResidualDamping(Damping):
-    """The lower bound on mu with c_1 (Assumption cond:mu02).
+    """The part of the lower bound on mu with c_1 (Assumption cond:mu02).
 
-    mu = c_1 ||r||_X^2 ||r||_V~ / ||r||_VX~^2, hence
-    theta = c_1 ||r||_X^2 / ||r||_VX~^2 is smooth and bounded by c_1. The other part of the bound
-    needs the unknown ||p||_V^ and does not enter.
+    mu = c_1 ||r||_X^2 ||r||_V~ / ||r||_VX~^2, hence theta = c_1 ||r||_X^2 / ||r||_VX~^2 is smooth
+    and bounded by c_1. The other part of the bound requires the unknown ||p||_V^ and is omitted.
     """
 
     c1: float = 1.0
@@ -126,16 +125,16 @@ class ResidualDamping(Damping):
 class ConstantDamping(Damping):
     """A constant mu, as in the paper's noisy experiments.
 
-    theta = mu / sqrt(||r||_V~^2 + (floor ||u_alpha||_V~)^2): for a residual that is smaller than
-    `floor` times the state the pull is linear instead of 0/0. Where u_alpha = 0, theta is
+    theta = mu / sqrt(||r||_V~^2 + (floor ||u_alpha||_V~)^2): if the residual is smaller than
+    `floor` times the state, the pull is linear instead of 0/0. If u_alpha = 0, theta is
     mu / ||r||_V~, and 0 at r = 0.
 
     Parameters
     ----------
     mu
-        In the unit of ||u||_V~ per time.
+        Size of the pull, >= 0, in the unit of ||u||_V~ per time.
     floor
-        A share of ||u_alpha||_V~, so without unit: the run is the same in every unit of u.
+        Relative to ||u_alpha||_V~, > 0, so that results do not depend on the unit of u.
     """
 
     mu: float = 1.0
@@ -164,15 +163,15 @@ class DiffusionOperator:
 
         (M v, phi)_X = integral over omega of |D| grad v . grad phi + v phi                 (MN1)
 
-    and (MN2) the same for N over Omega without omega: the law integrates each over its part. With
-    |D| both are coercive whatever the sign of D,
-    (M v, v)_X = ||sqrt|D| grad v||^2 + ||v||^2 = ||v||_VX~^2 with c_M = 1; in their own norms M and
-    N are bounded as long as D does not change its sign on omega nor outside.
+    N (MN2) has the same integrand over Omega without omega: the law integrates each over its part.
+    With |D| both are coercive for every sign of D,
+    (M v, v)_X = ||sqrt|D| grad v||^2 + ||v||^2 = ||v||_VX~^2 with c_M = 1. In their own norms M and
+    N are bounded if D does not change sign on omega, nor outside omega.
 
     Parameters
     ----------
     D
-        Diffusivity: a number, or a function of x; of any sign.
+        Diffusivity of any sign: a number, or a function of x.
     """
 
     D: Diffusivity
@@ -184,7 +183,7 @@ class DiffusionOperator:
 
 
 def diffusion_operator(D: Diffusivity) -> DiffusionOperator:
-    """Return M of (MN1), or N of (MN2), for `GradientLaw(M_op=..., N_op=...)`.
+    """Return the integrand of M (MN1) or N (MN2) for `GradientLaw(M_op=..., N_op=...)`.
 
     >>> import livepde as lp
     >>> MN = diffusion_operator(-1.0)
@@ -195,9 +194,9 @@ def diffusion_operator(D: Diffusivity) -> DiffusionOperator:
 
 @dataclass(frozen=True)
 class Norms:
-    """||x||_X, ||x||_VX and ||x||_V of one part of the state, or bounds of them.
+    """||x||_X, ||x||_VX and ||x||_V of one part of the state, or bounds of these norms.
 
-    Spaces with a tilde for an observed part (r, d), with a hat for the unobserved part (p).
+    The spaces have a tilde for an observed part (r, d), and a hat for the unobserved part (p).
     """
 
     X: float = 0.0
@@ -205,7 +204,7 @@ class Norms:
     V: float = 0.0
 
     def residual(self, observed: Norms) -> Residual:
-        """Return these norms, of r, and those of u_alpha as a damping rule takes them."""
+        """Return the argument of a damping rule: these norms of r, and norms of u_alpha."""
         seen = Residual(observed.X**2, observed.VX**2, lambda: observed.V**2)
         return Residual(self.X**2, self.VX**2, lambda: self.V**2, lambda: seen)
 
@@ -214,18 +213,18 @@ class Norms:
 class Constants:
     """The constants of Assumption ass:equation for a discretised model.
 
-    `diagnostics.constants` computes them; a user who knows better ones gives those.
+    `diagnostics.constants` computes the constants; a user may provide sharper ones.
 
     Attributes
     ----------
     L_C
         Lipschitz constant of C(q, .) (LipschitzC), in 1/time.
     C_A
-        ||A(u* + v)||_{Q -> X} <= C_A (1 + ||v||) (AbdV), (AbdX), (AbdVV).
+        Bound of A: ||A(u* + v)||_{Q -> X} <= C_A (1 + ||v||) (AbdV), (AbdX), (AbdVV).
     c_M, C_M
-        (M v, v)_X >= c_M ||v||_VX~^2, and ||R M v||_X <= C_M ||v||_V~.
+        Bounds of M: (M v, v)_X >= c_M ||v||_VX~^2, and ||R M v||_X <= C_M ||v||_V~.
     c_N, C_N
-        The same of N on the unobserved part.
+        Bounds of N on the unobserved part, defined as for M.
     observed_V_VX, observed_VX_X
         Embedding constants C_{V~ VX~} and C_{VX~ X}.
     hidden_V_VX, hidden_VX_X
@@ -233,7 +232,7 @@ class Constants:
     observed_ratio, hidden_ratio
         Largest ||v||_V ||v||_X / ||v||_VX^2 of each part: 1/c_int of (interpol).
     sampled
-        Names of the constants that were estimated from below by sampling; all others are bounds.
+        Names of the constants that sampling estimated from below; all others are bounds.
     """
 
     L_C: float
@@ -259,14 +258,14 @@ class Constants:
 
 
 def _over(numerator: float, denominator: float) -> float:
-    """Return a quotient; 0/0 is 0, as nothing is asked then."""
+    """Return a quotient; 0/0 is 0, because a zero numerator is no constraint."""
     if numerator <= 0.0:
         return 0.0
     return numerator / denominator if denominator > 0.0 else np.inf
 
 
 def theta_exact(c: Constants, p_V: float, r: Norms, c1: float = 0.0) -> float:
-    """Return the least theta for exact data, Assumptions cond:mu_1 and, with c1, cond:mu02.
+    """Return the least theta for exact data by Assumptions cond:mu_1 and, with c1, cond:mu02.
 
     mu >= max{2 L_C/c_M ||p||_V^, c_1 ||r||_X} ||r||_X ||r||_V~ / ||r||_VX~^2.
 
@@ -279,14 +278,14 @@ def theta_exact(c: Constants, p_V: float, r: Norms, c1: float = 0.0) -> float:
 def theta_noisy(
     c: Constants, e: float, p_V: float, r: Norms, d: Norms, sigma: float = 0.0, c1: float = 0.0
 ) -> float:
-    """Return the least theta for noisy data, Assumptions ass:mu_nu and, with c1, ass:mu_noisy.
+    """Return the least theta for noisy data by Assumptions ass:mu_nu and, with c1, ass:mu_noisy.
 
     mu >= max{4 L_C/c_M (||d||_V~ + ||p||_V^) ||r||_X
     + 4 C_A/c_M (1 + ||d||_V~ + ||p||_V^) ||e||_Q ||d||_X, 2 sigma/c_M ||r||_X^2, c_1 ||r||_X^2}
     ||r_alpha||_V~ / ||r||_VX~^2.
 
-    `e`: ||e||_Q in the gain-scaled norm. `r`: of the true residual r = R (u - u*), not of r_alpha.
-    `d`: of the data error u_alpha - R u*.
+    `e`: ||e||_Q in the gain-scaled norm. `r`: norms of the true residual r = R (u - u*), not of
+    r_alpha. `d`: norms of the data error u_alpha - R u*.
     """
     rough = d.V + p_V
     pull = 4.0 / c.c_M * (c.L_C * rough * r.X + c.C_A * (1.0 + rough) * e * d.X)
@@ -301,7 +300,7 @@ def theta_smoothed(
     mu >= max{2/c_M (L_C (||d||_V~ + ||p||_V^) + ||d~||_X), c_1 ||r_alpha||_X}
     ||r_alpha||_X ||r_alpha||_V~ / ||r_alpha||_VX~^2.
 
-    `r`: of r_alpha, which is known online. `rate_X`: ||d~||_X of the rate of the data error.
+    `r`: norms of r_alpha, which is known online. `rate_X`: ||d~||_X, d~ the rate of the data error.
     """
     pull = 2.0 / c.c_M * (c.L_C * (d_V + p_V) + rate_X)
     return _over(max(pull, c1 * r.X) * r.X, r.VX**2)
@@ -325,17 +324,17 @@ def unobserved_damping(c: Constants, e_bound: float) -> float:
     """Return a constant nu for `GradientLaw` that satisfies Assumption cond:nu for every p.
 
     The unknown quotient ||p||_V^ ||p||_X / ||p||_VX^^2 is at most `c.hidden_ratio`, so the bound
-    needs only ||e||_Q, which never exceeds its start: e_bound^2 = ||e(0)||_Q^2 + ||r(0)||_X^2.
-    With d != 0 there is no such constant: the noisy bound grows without limit as p vanishes.
+    requires only ||e||_Q, with e_bound^2 = ||e(0)||_Q^2 + ||r(0)||_X^2 as a bound for all times.
+    For d != 0 no constant exists: the bound for noisy data is unbounded as p vanishes.
 
-    It is a large number, of the order of the inverse size of an element, and the bound on mu has
-    then to cover nu times the flux of u through the boundary of omega, too: `ExactBound` with a
-    p_bound of about nu ||P u*||_V^.
+    This nu is large, of the order of the inverse element size. The bound on mu then also has to
+    cover nu times the flux of u through the boundary of omega: use `ExactBound` with a p_bound of
+    about nu ||P u*||_V^.
 
     >>> unobserved_damping(Constants(1.0, 0.0, hidden_ratio=2.0), e_bound=1.0)
     8.0
     """
-    # Norms of which the quotient ||p||_V^ ||p||_X / ||p||_VX^^2 is the largest possible one.
+    # Norms with the largest possible quotient ||p||_V^ ||p||_X / ||p||_VX^^2.
     return nu_exact(c, e_bound, Norms(c.hidden_ratio, 1.0, 1.0))
 
 
@@ -349,21 +348,21 @@ def _check_bounds(name: str, floor: float = 1.0, **values: float) -> None:
 
 @dataclass(frozen=True)
 class ExactBound(Damping):
-    """The whole lower bound on mu for exact data, cond:mu_1 (c1 = 0) and cond:mu02.
+    """The complete lower bound on mu for exact data, cond:mu_1 (c1 = 0) and cond:mu02.
 
     theta = max{2 L_C/c_M p_bound / ||r||_X, c_1} ||r||_X^2 / ||r||_VX~^2.
 
     Parameters
     ----------
     constants
-        Of the model.
+        Constants of the model.
     p_bound
         Upper bound of ||p||_V^, known to the user; 0 for full observation.
     c1
-        As in `ResidualDamping`.
+        c_1 of cond:mu02, as in `ResidualDamping`.
     floor
-        A share of ||u_alpha||_X: the first term is 0/0 at r = 0. Where ||r||_X is smaller the pull
-        is linear, and weaker than the bound.
+        Least ||r||_X in the first term, which is 0/0 at r = 0, relative to ||u_alpha||_X. Below
+        the floor the pull is linear and weaker than the bound.
     """
 
     constants: Constants
@@ -384,15 +383,15 @@ class SmoothedBound(Damping):
     """The lower bound on mu for smoothed data, ass:mu_nu_smooth (c1 = 0) and cond:mu_smooth_2.
 
     theta = max{2/c_M (L_C (d_bound + p_bound) + rate_bound) / ||r||_X, c_1}
-    ||r||_X^2 / ||r||_VX~^2 with r = R u - u_alpha: the only one of the paper's bounds whose
-    residual is known online.
+    ||r||_X^2 / ||r||_VX~^2 with r = R u - u_alpha. Of the paper's bounds for inexact data, only
+    this one has a residual that is known online.
 
     Parameters
     ----------
     p_bound, d_bound, rate_bound
-        Bounds of ||p||_V^, ||d||_V~ and ||d~||_X.
+        Upper bounds of ||p||_V^, ||d||_V~ and ||d~||_X.
     c1, floor
-        As in `ExactBound`.
+        See `ExactBound`.
     """
 
     constants: Constants
@@ -416,23 +415,23 @@ class SmoothedBound(Damping):
 class NoisyBound(Damping):
     """The lower bound on mu for noisy data, ass:mu_nu (c1 = 0) and ass:mu_noisy.
 
-    The paper's bound holds the true r. Online, ||r||_X <= ||r_alpha||_X + ||d||_X and
-    ||r||_VX~ >= ||r_alpha||_VX~ - ||d||_VX~ stand in for it, so the rule asks for at least the pull
-    of the paper, as long as the residual stands out of the noise. Where it does not, no theta
-    satisfies the bound (condition (cond_d) fails as well), and the rule returns `theta_max`.
+    The paper's bound contains the true r. Online it is replaced by the bounds
+    ||r||_X <= ||r_alpha||_X + ||d||_X and ||r||_VX~ >= ||r_alpha||_VX~ - ||d||_VX~. So the pull is
+    at least that of the paper if the residual exceeds the noise. Otherwise no theta satisfies the
+    bound (condition (cond_d) fails as well), and the rule returns `theta_max`.
 
     Parameters
     ----------
     p_bound, e_bound
-        Bounds of ||p||_V^ and of ||e||_Q in the gain-scaled norm.
+        Upper bounds of ||p||_V^ and of ||e||_Q in the gain-scaled norm.
     d_bound
-        Bounds of the norms of the data error d.
+        Upper bounds of the norms of the data error d.
     sigma
-        That of the law.
+        `sigma` of the law.
     c1
-        The c~_1 of ass:mu_noisy.
+        Constant c~_1 of ass:mu_noisy.
     theta_max
-        The largest pull, in 1/time.
+        Largest theta, in 1/time.
     """
 
     constants: Constants
@@ -450,19 +449,19 @@ class NoisyBound(Damping):
 
     def theta(self, r: Residual) -> float:
         d = self.d_bound
-        # The true r is not known: ||r||_X is bounded from above, ||r||_VX~ from below.
+        # The true r is unknown: ||r||_X is bounded from above, ||r||_VX~ from below.
         least = np.sqrt(r.VX) - d.VX
         if least <= 0.0:
             return self.theta_max
         size = Norms(float(np.sqrt(r.X)) + d.X, float(least))
-        asked = theta_noisy(
+        bound = theta_noisy(
             self.constants, self.e_bound, self.p_bound, size, d, self.sigma, self.c1
         )
-        return min(asked, self.theta_max)
+        return min(bound, self.theta_max)
 
 
 def _pulled(r: Residual, pull: float, c1: float, floor: float) -> float:
-    """Return max{pull / ||r||_X, c_1} ||r||_X^2 / ||r||_VX~^2, floored; c_1 where all is zero."""
+    """Return max{pull / ||r||_X, c_1} ||r||_X^2 / ||r||_VX~^2 with a floor; c_1 if r is zero."""
     size = float(np.sqrt(max(r.X, floor**2 * r.observed.X))) if pull > 0.0 else 0.0
     share = r.X / r.VX if r.VX > 0.0 else 1.0
     return max(pull / size if size > 0.0 else 0.0, c1) * share

@@ -1,44 +1,43 @@
-"""Tests of `GradientLaw` on its own equation: what excites q, and whether the model holds.
+"""Tests of `GradientLaw`: an excitation gate for q, and model checks by the equation error.
 
-*Excitation.* The law holds q while nothing but noise excites it.
+*Excitation.* The law holds q while only noise excites it.
 
-The law multiplies r by A(w), w = u_alpha + P u. At rest A(w) is noise, the same as in r, so that
-their product has a mean, and q drifts with it. Noise is independent from sample to sample, and an
-excitation that is resolved in time is not: with the vector a_k of (A(w_k) e, p) for a few fixed e
-and p, the mean of
+The law multiplies r by A(w), w = u_alpha + P u. At rest A(w) is noise that is correlated with the
+noise of r. Their product has a nonzero mean, with which q drifts. Noise is independent from sample
+to sample; an excitation that is resolved in time is not. With the vector a_k of (A(w_k) e, p) for a
+few fixed e and p, the mean of
 
     (a_k, a_{k-1}) / (|a_k| |a_{k-1}|)
 
-is about 1 for an excitation, and 0 for noise. It may be 0 for a process faster than the samples,
-too. So |a|^2 must have fallen, and the rest of it must be change that the estimate u^ does not
-follow: with b_k of (A(w_k) e, p) - (A(u^_k) e, p) the mean of
+is about 1 for an excitation, and 0 for noise. It may also be 0 for a process faster than the
+samples. Therefore two more criteria must hold: |a|^2 has fallen, and its remainder consists of
+changes that the estimate u^ does not follow. With b_k = (A(w_k) e, p) - (A(u^_k) e, p), the mean of
 
     |b_k - b_{k-1}|^2 / (|a_k|^2 + |a_{k-1}|^2)
 
-is about 1 for noise, and far smaller where the estimate follows exact data, or is still off after a
-transient. Only all three together close the gate.
+is about 1 for noise. It is far smaller if the estimate follows exact data, or still has a transient
+error. The gate closes only if all three criteria hold.
 
-*Equation.* The tests are of the equation on the observed part.
-With test functions p_j that vanish outside of omega the equation error of the data,
+*Equation.* The observed part of the equation is tested. With test functions p_j that vanish outside
+omega, the equation error of the data,
 
     a_k = (eps_k, p_j),        eps = M u_alpha' + B(u_alpha) + A(u_alpha) q - F,
 
-needs nothing but the data and q. If model and q are right, all of it comes from the noise of
-u_alpha, and the noise of one sample is in eps of this sample and, by the derivative, of the next.
-So the products (a_k, a_{k-2}) have the mean zero, whatever the level of the noise, and the scatter
-of their sum follows from the products themselves. What a wrong model leaves goes on from sample to
-sample. Its size, less three standard deviations of that sum, is compared with what q does and what
-the process does,
+depends only on the data and q. If model and q are right, eps is due to the noise of u_alpha. The
+noise of one sample enters eps of this sample and, by the derivative, of the next sample. So the
+products (a_k, a_{k-2}) have mean zero for every noise level, and the scatter of their sum follows
+from the products themselves. The error of a wrong model persists from sample to sample. Its size,
+less three standard deviations of the sum, is compared with the terms of the unknown and the process
 
     (A(u_alpha) q, p_j),        (M u_alpha', p_j),
 
-and for a law that is tuned by the prior with (A(u_alpha) e, p_j), e drawn from the prior: an error
-of a few per cent of them is that of mesh, time step and smoothing. Sums weigh the sample k by k^2:
-they forget the start, when q was not yet learned. The bounds were chosen on rods and squares with
-right models and wrong ones (`benchmarks.silent.unjudged`): with a right model and a q that is
-learned 0.1 is left at most, and up to 0.15 where a constant gain has not learned a field yet.
+and with (A(u_alpha) e, p_j), e drawn from the prior, if the gain follows from the prior. An error
+of a few per cent of these terms is due to mesh, time step and smoothing. Sums weight sample k by
+k^2, to forget the start, when q was not yet learned. The bounds were chosen on rods and squares
+with right and wrong models (`benchmarks.silent.unjudged`): with a right model and a converged q the
+persistent error is at most 0.1; it is up to 0.15 while a constant gain has not yet learned a field.
 
-Nothing of this sees the process outside of omega, nor errors of mesh and step by themselves.
+These tests do not detect errors outside omega, nor errors of mesh and step on their own.
 """
 
 from __future__ import annotations
@@ -62,11 +61,11 @@ from livepde.verdict import FEWEST, Finding, Severity, Verdict, too_few
 from livepde.verdict.sentences import FINDINGS, percent
 
 PROBES = 16  # pairs of random functions: their products scatter by a quarter
-TESTS = 8  # test functions: random, and smooth
-DEVIATIONS = 3.0  # of the sum of products, that may be chance
-LASTS = 0.15  # error that goes on, over what q and the process do, from which it is a caution
-GRAVE = 0.3  # the same, from which the estimate is not to be trusted
-POWER = 2  # of the number of a sample, that weighs it
+TESTS = 8  # number of random smooth test functions
+DEVIATIONS = 3.0  # standard deviations of the sum of products that are attributed to chance
+LASTS = 0.15  # least persistent error, relative to the terms of q and the process, for a caution
+GRAVE = 0.3  # least persistent error for the severity "do not trust"
+POWER = 2  # exponent of the sample number in the weight of a sample
 UNTESTED = (
     "the mesh and the time step: this law does not estimate their errors",
     "a refit of all samples: this law has none",
@@ -78,27 +77,27 @@ OUTSIDE = "the process outside the observed part"
 
 @dataclass(frozen=True)
 class ExcitationGate:
-    """Holds q of `GradientLaw` with a constant gain while nothing but noise excites it.
+    """Holds q of `GradientLaw` with a constant gain while only noise excites it.
 
-    A step holds q, and u goes on, if up to the sample before, in fading means, the excitation of q
-    was correlated from sample to sample by less than `correlation`, its mean square was less than
-    `energy` of the largest that was correlated, and more than the share `noise` of it changed from
-    sample to sample as the estimate did not. An unknown that moves by itself (evolution=) goes on
-    by that. Note: "at_rest".
+    A step holds q and updates u if three criteria held for exponentially weighted means up to the
+    previous sample. The correlation of the excitation of q between successive samples was below
+    `correlation`. Its mean square was below `energy` times the largest correlated mean square. More
+    than the share `noise` of it was changes between samples that the estimate did not follow. An
+    unknown with an evolution (evolution=) still evolves. The diagnostic is "at_rest".
 
-    Noise that is itself correlated in time, as behind a stream stage that averages, is no noise
-    here; where it is a third of the excitation or more, rests are not told from it.
+    Noise that is correlated in time, for example after an averaging stream stage, does not count as
+    noise. If it is at least a third of the excitation, the gate does not detect rests.
 
     Parameters
     ----------
     window
-        Samples that the means remember, >= 1.
+        Number of samples that the means remember, >= 1.
     correlation
         Least correlation of an excitation, in (0, 1).
     energy
-        Share of the largest mean square to which a rest has fallen, in (0, 1).
+        Mean square at a rest, relative to the largest correlated mean square, in (0, 1).
     noise
-        Share of the square that is noise at a rest, in (0, 1).
+        Least share of noise in the mean square at a rest, in (0, 1).
     """
 
     window: float = 30.0
@@ -115,7 +114,7 @@ class ExcitationGate:
                 raise LawError(f"ExcitationGate: {name} must lie between 0 and 1; got {value}.")
 
     def closed(self, excitation: ExcitationLevel) -> bool:
-        """Return true at a rest: q is held."""
+        """Return True at a rest, when q is held."""
         return (
             excitation.correlation < self.correlation
             and excitation.energy < self.energy * excitation.largest
@@ -124,7 +123,7 @@ class ExcitationGate:
 
     def add(self, excitation: ExcitationLevel, a: Array, followed: Array) -> ExcitationLevel:
         """Return the excitation after a sample, from probes at w and at the estimate, (PROBES,)."""
-        # Fading means: each moves by the share 1/window towards its new value.
+        # Exponentially weighted means with weight 1/window of the new value.
         size = float(a @ a)
         scale = math.sqrt(size * excitation.size)
         share = 1.0 / self.window
@@ -135,7 +134,7 @@ class ExcitationGate:
         energy = excitation.energy + share * (size - excitation.energy)
         correlated = excitation.correlated + share * (product - excitation.correlated)
         largest = max(excitation.largest, correlated)
-        # b_k of the docstring of this module, and the share of the square that is noise.
+        # b_k of the module docstring, and the share of noise in the square.
         left, noise = a - followed, excitation.noise
         if scale > 0.0:
             jump = left - excitation.left
@@ -147,18 +146,18 @@ class ExcitationGate:
 class ExcitationLevel:
     """Statistics of the excitation of q, to distinguish it from noise."""
 
-    # Values of the probes in the last sample, and their difference from those at the estimate,
-    # shape (PROBES,); and the squared norm of the values.
+    # Probe values at w in the last sample, their difference to the values at the estimate, shape
+    # (PROBES,), and the squared norm of the values.
     last: Array
     left: Array
     size: float
-    # Fading means: of the correlation of successive samples, of the square, and of the product with
-    # the sample before, in which noise and outliers have little part.
+    # Exponentially weighted means of the correlation of successive samples, of the square, and of
+    # the product with the previous sample, in which noise and outliers have little weight.
     correlation: float
     energy: float
     correlated: float
     largest: float  # the largest `correlated`
-    noise: float  # fading mean of the share of the square that is noise
+    noise: float  # exponentially weighted mean of the share of noise in the square
 
     @classmethod
     def none(cls) -> ExcitationLevel:
@@ -166,21 +165,21 @@ class ExcitationLevel:
 
 
 class Probes:
-    """(A(w) e_k, p_k) for fixed random pairs: e_k in the unit balls of Q, p_k = R p_k.
+    """(A(w) e_k, p_k) for fixed random pairs: each unknown of e_k has norm 1 in Q, p_k = R p_k.
 
-    p_k minimises a Dirichlet integral under a white load, in the range of R: so the rough parts of
-    w, such as noise, do not outweigh the smooth ones.
+    p_k minimises a Dirichlet integral under a white load in the range of R. It is smooth, so that
+    rough parts of w, such as noise, have little weight.
     """
 
     def __init__(self, model: Model, split: Split) -> None:
         self.form = model.form_A
         self.fixed: Array | None = None
         self.pairs = p, e = pairs(model, split)
-        # Where (A(w) e, p) is linear in w, it is one product with a row for each pair.
+        # If (A(w) e, p) is linear in w, it is a matrix product with one row for each pair.
         vq, qu = self.form.tensor("v", "q"), self.form.tensor("q", "u")
         if vq is not None and qu is not None:
             pattern = self.form.pattern("q", "u")
-            rows = [pattern.matrix(qu @ one).T @ other for one, other in zip(p.T, e.T, strict=True)]
+            rows = [pattern.matrix(qu @ p_k).T @ e_k for p_k, e_k in zip(p.T, e.T, strict=True)]
             self.fixed = np.array(rows)
             self.pairs = np.zeros((0, PROBES)), np.zeros((0, PROBES))  # no longer needed
 
@@ -194,43 +193,43 @@ class Probes:
 
 
 def pairs(model: Model, split: Split) -> tuple[Array, Array]:
-    """Return p and e of the probes, shapes (n, PROBES) and (m, PROBES)."""
+    """Return the random functions p and e of `Probes`, shapes (n, PROBES) and (m, PROBES)."""
     rng = np.random.default_rng(0)
     mass, smooth = _smooth_gram(model)
     parts = split.R.T @ smooth @ split.R + split.P.T @ smooth @ split.P
     space = HilbertSpace(sp.csr_array(parts), "probes", model.state_space.fixed)
-    # A white load: independent, with the variances on the diagonal of the mass matrix.
+    # White load: independent values whose variances are the diagonal of the mass matrix.
     root = np.sqrt(mass.diagonal())[:, None]
     white = root * rng.standard_normal((model.X.dim, PROBES))
     p = np.asarray(split.R @ space.riesz(split.R.T @ white))
-    # A copy of the space: the factor of a large one is not kept.
-    found = copy(model.Q).riesz(rng.standard_normal((model.Q.dim, PROBES)))
-    # Each unknown by itself, so that one in another unit does not outweigh it.
+    # A copy of the space, so that a large factor is not cached in the model.
+    e = copy(model.Q).riesz(rng.standard_normal((model.Q.dim, PROBES)))
+    # Each unknown is normalised separately: units do not affect its weight.
     for part in (item.part for item in model.latent.parts.values()):
-        for e in found.T:
-            alone = np.zeros_like(e)
-            alone[part] = e[part]
+        for e_k in e.T:
+            alone = np.zeros_like(e_k)
+            alone[part] = e_k[part]
             size = float(alone @ model.Q.dual(alone))
-            e[part] /= np.sqrt(size) if size > 0.0 else 1.0
-    return p, found
+            e_k[part] /= np.sqrt(size) if size > 0.0 else 1.0
+    return p, e
 
 
 def _smooth_gram(model: Model) -> tuple[Any, Any]:
     """Return the matrices of u v and u v + L^2 grad u . grad v, with the size L of the domain."""
     extent = float(np.ptp(model.mesh.p, axis=1).max())
     mass = model.bilinear(mass_form)
-    return mass, mass + extent**2 * (model.bilinear(h1_form) - mass)  # both have one unit
+    return mass, mass + extent**2 * (model.bilinear(h1_form) - mass)  # both have the same unit
 
 
 @dataclass(frozen=True, eq=False)
 class EquationLedger:
     """Running sums over the equation errors of the data, in constant memory."""
 
-    samples: int  # number of samples that were tested
-    rests: int  # number of samples in which q was held because nothing excited it
-    last: Array  # the errors a of the last two samples, shape (2, TESTS); NaN before
-    # Weighed sums of (a_k, a_{k-2}), of its square, and of the squared terms that it is compared
-    # with, shape (3,).
+    samples: int  # number of tested samples
+    rests: int  # number of samples in which the gate held q
+    last: Array  # errors a of the last two samples, shape (2, TESTS); NaN if unknown
+    # Weighted sums of (a_k, a_{k-2}), of its square, and of the squares of the reference terms,
+    # shape (3,).
     sums: Array
 
     @classmethod
@@ -240,18 +239,18 @@ class EquationLedger:
     def add(self, error: Array, square: float) -> EquationLedger:
         samples, sums = self.samples + 1, self.sums
         product = float(error @ self.last[0])
-        if math.isfinite(product + square):  # the third sample in a row, or a later one
+        if math.isfinite(product + square):  # from the third consecutive sample on
             weight = float(samples) ** POWER
             sums = sums + np.array([weight * product, (weight * product) ** 2, weight * square])
         return replace(self, samples=samples, last=np.stack([self.last[1], error]), sums=sums)
 
     def interrupted(self) -> EquationLedger:
-        """Return the value after a sample that could not be tested."""
+        """Return the sums after a sample that could not be tested."""
         return replace(self, last=np.full_like(self.last, np.nan))
 
     @property
     def lasting(self) -> float:
-        """Persistent part of the equation error, over what q and the process do; at least 0."""
+        """Persistent equation error relative to the terms of q and the process, >= 0."""
         product, square, terms = self.sums.tolist()
         surely = product - DEVIATIONS * math.sqrt(square)
         return math.sqrt(max(surely, 0.0) / terms) if terms > 0.0 else 0.0
@@ -259,21 +258,21 @@ class EquationLedger:
 
 @dataclass(frozen=True, eq=False)
 class ObservedEquation:
-    """The equation of one step, on the observed part."""
+    """Terms of the equation of one step, on the observed part."""
 
-    error: Array  # the equation error R^T eps at its end, shape (n,)
+    error: Array  # equation error R^T eps at the end of the step, shape (n,)
     rate: Array  # R^T M u_alpha', shape (n,)
-    # State and parameter that A is evaluated at.
+    # State and parameter at which A is evaluated.
     w: Array
     q: Array
-    moment: Moment  # time and inputs at its end
+    moment: Moment  # time and inputs at the end of the step
 
 
 class EquationTests:
-    """Test functions within omega, and the judgement of their products.
+    """Test functions with support in omega, and the verdict from their products.
 
-    `forms`: forms of a stage of all sensors. `prior`: columns V, shape (m, k), with the covariance
-    V V^T of q that a prior states; none where the law does not go by the prior.
+    `forms`: forms of the stage with all sensors. `prior`: columns V, shape (m, k), of the prior
+    covariance V V^T of q; no columns if the law does not use the prior.
     """
 
     def __init__(self, forms: StageForms, prior: Array) -> None:
@@ -284,9 +283,10 @@ class EquationTests:
         self.functions = self._functions(forms.model)
 
     def _functions(self, model: Model) -> Array:
-        """Return the test functions, shape (n, TESTS); no columns where the data are no function.
+        """Return test functions, (n, TESTS); no columns if the data do not determine w on omega.
 
-        They minimise a Dirichlet integral under a white load, so that rough noise has little part.
+        They minimise a Dirichlet integral under a white load, so that rough noise has little
+        weight.
         """
         free = self.forms.tests.free
         if self.forms.W is not None or not free.any():
@@ -299,13 +299,13 @@ class EquationTests:
 
     @property
     def possible(self) -> bool:
-        """Whether the data determine the state somewhere, so that its equation can be tested."""
+        """Whether the data determine the state on a part of the domain, as the tests require."""
         return bool(self.functions.shape[1])
 
     def add(self, ledger: EquationLedger, at: ObservedEquation) -> EquationLedger:
         p = self.functions
-        seen = self.forms.A_in.matrix("v", "q", at.moment, u=at.w, q=at.q).T @ p  # (m, TESTS)
-        terms = np.concatenate([[at.q @ seen, at.rate @ p], self.prior.T @ seen])
+        A_p = self.forms.A_in.matrix("v", "q", at.moment, u=at.w, q=at.q).T @ p  # (m, TESTS)
+        terms = np.concatenate([[at.q @ A_p, at.rate @ p], self.prior.T @ A_p])
         return ledger.add(at.error @ p, float((terms**2).sum()))
 
     def verdict(self, ledger: EquationLedger) -> Verdict:
@@ -321,7 +321,7 @@ class EquationTests:
 
 
 def rested(count: int, when: str = "") -> Finding:
-    """Return the note that q was held because nothing excited it; `when` as in ", last at noon"."""
+    """Return the note that q was held at rest; `when` is a phrase such as ", last at noon"."""
     text, _ = FINDINGS["rest"].filled(count=count, when=when)
     return Finding("rest", "note", text, "unknowns", float(count))
 

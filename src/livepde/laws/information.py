@@ -1,9 +1,9 @@
-"""The metric of Q in which q learns: a constant gain, or the information that the data have given.
+"""The metric of Q for the update of q: a constant gain, or the information in the data.
 
-A rule returns the `Metric` of the second line for each stage, and carries its statistics from
-sample to sample. With the metric of the information `GradientLaw(gain="auto")` tunes itself.
+A rule returns the `Metric` of the second equation for each stage, and updates its statistics after
+each sample. `GradientLaw(gain="auto")` uses the metric of the information.
 
-On the observed part q leaves the equation error
+On the observed part, a parameter q has the equation error
 
     eps(q) = M u_alpha' + B(w) + A(w) q - F,        eps(q) - eps(q*) = A(w) (q - q*).
 
@@ -12,55 +12,53 @@ the prior (G_Q is divided by the square of `std`). Then the best q given all dat
 
     S ||q - q0||_Q^2 + int ||R^T eps(q)||^2_{D^{-1}} dt.
 
-Its recursion, recursive least squares for a field, is the second line of the method in the metric
-of the information, H = S G_Q + J instead of G_Q/gain, J = int A^T R D^{-1} R^T A dt. With
-M_op = M and theta = PULL/h all of r, about -h M^{-1} eps/PULL, comes from the step itself, and the
-stage solves
+The recursion of this minimum, recursive least squares for a field, is the second equation of the
+method in the metric of the information, H = S G_Q + J instead of G_Q/gain, with
+J = int A^T R D^{-1} R^T A dt. With M_op = M and theta = PULL/h, r is about -h M^{-1} eps/PULL and
+depends on the current step alone. The stage solves
 
     H (q - c)/PULL = A(w)^T r + (b - J c - S G_Q (c - q0))/PULL
 
-from c, q before the step. The normal equations J q = b of the data so far are kept exactly: the
-equation error eps of a step follows from its r, y = A q - eps is the value of A q according to the
-data, and
+where c is q before the step. The normal equations J q = b of the data so far are exact: r gives the
+equation error eps of a step, y = A q - eps is the value of A q according to the data, and
 
     J <- J + h A^T R D^{-1} R^T A,        b <- b + h A^T R D^{-1} R^T y.
 
-So a step need not be exact: what it leaves is in b - J c - S G_Q (c - q0), and the next one makes
-it good. The drive A^T r alone would not: q and J disagree on rough functions by the ratio of D to
-M, and q would jump when S falls.
+So a step need not be exact: its residual is part of b - J c - S G_Q (c - q0), and the next step
+corrects it. The drive A^T r alone would not: q and J disagree on rough functions by the ratio of D
+to M, and q would jump when S decreases.
 
-S is the power of the remaining equation error, as far as q sees it,
+S is the power of the remaining equation error, measured by its effect on q,
 
     power(eps) = mean of h ||A^T D^{-1} eps||_{Q*}^2 / mean of trace(G_Q^{-1} A^T R D^{-1} R^T A),
     S          = (power(eps_k) power(eps_k - eps_{k-1})/2)^{1/2}.
 
-For white noise both powers are S. A lasting error counts less, the slower it changes. Errors of
-mesh, time step, smoothing and P u slow q down like noise; an error of q has little effect. The
-same is done with the diagonal of G_Q instead of G_Q, and the larger S is taken: the first
-measures the error against smooth functions, the second against rough ones, where derivatives of
-noisy data are far larger. Means weigh a sample at time t by t^FORGETS. The first sample moves
-nothing: it tells S.
+For white noise both powers equal S. The slower a persistent error changes, the less it contributes.
+Errors of mesh, time step, smoothing and P u slow the update of q like noise; an error of q has
+little effect. A second S has the diagonal of G_Q instead of G_Q, and the larger S is used. The
+first S measures the error against smooth functions. The second S measures it against rough
+functions, where derivatives of noisy data are far larger. The means weight a sample at time t by
+t^FORGETS. The first sample does not change q: it only initialises S.
 
-J and b fade in two kinds of rows. Those of tests within omega, which see nothing but the data, are
-weighed by the information that had been given up to a sample. The others hold fluxes of P u, which
-was wrong at first, and are weighed by t^4; since P u keeps an error that the data do not determine,
-S is not taken below a small share of their J.
+J and b have two kinds of rows with different forgetting. Rows of tests within omega depend on the
+data alone, and have a weight by the information up to the sample. Other rows contain fluxes of P u,
+which is wrong at first, and have the weight t^4. Since P u keeps an error that the data do not
+determine, S is at least a small share of the J of these rows.
 
-H is renewed when S or the trace of J have changed by more than `AGED`, or J along the last step has
-grown by more than `STEEPER`. In between a step is one of quasi-Newton's, and factors serve on.
+H is updated when S or the trace of J has changed by more than `AGED`, or J along the last step has
+grown by more than `STEEPER`. Between updates a step is a quasi-Newton step with cached factors.
 
-Every number above is a ratio of quantities with the same units, and refers neither to the mesh nor
-to the sampling interval.
+All constants are ratios of equal units: they depend neither on the mesh nor on the sampling rate.
 
-If all of this holds, ||q - q0||_Q^2 is a sum of chi-squares with weights of at most 1, whose sum k
-is at most m and at most trace(G_Q^{-1} J)/S, with a J that has not faded. It is more than
-k + 2 sqrt(k s) + 2 s with a probability below exp(-s) (Laurent and Massart 2000). Beyond that the
-step holds q, with a failed status, and J, b and S are updated as before. S does not contain a bias
-that q absorbs, such as that of too strong smoothing (`livepde.laws.observed_part`).
+Under these assumptions ||q - q0||_Q^2 is a sum of chi-squares with weights of at most 1, whose sum
+k is at most m and at most trace(G_Q^{-1} J)/S, with J without forgetting. It exceeds
+k + 2 sqrt(k s) + 2 s with a probability below exp(-s) (Laurent and Massart 2000). Beyond this
+bound the step holds q and reports "departed"; J, b and S are updated as usual. S does not contain a
+bias that q absorbs, such as the bias of too strong smoothing (`livepde.laws.observed_part`).
 
-A diagonal D >= M (Gershgorin; the lumped mass for P1) makes A^T R D^{-1} R^T A as sparse as A^T A
-where sensors select coefficients. Else the rows are those of a basis of N(G)^perp, D is M, and the
-matrix is dense.
+If sensors select coefficients, a diagonal D >= M (Gershgorin; the lumped mass for P1) makes
+A^T R D^{-1} R^T A as sparse as A^T A. Otherwise the rows belong to a basis of N(G)^perp, D is M,
+and the matrix is dense.
 """
 
 from __future__ import annotations
@@ -83,56 +81,56 @@ from livepde.linalg import Array, Memo, Pattern
 from livepde.model import Model
 from livepde.spaces import HilbertSpace
 
-HOLD = 1e12  # times smaller is a gain that keeps q where it is
+HOLD = 1e12  # factor by which a constant gain is reduced to hold q
 
 MetricStep = Callable[[float], Metric]
-"""Step h of a stage -> its metric."""
-PULL = 10.0  # theta h: r forgets within a step
-HELD = 1e6  # times heavier than a sample is a prior that keeps q where it is
-LEADING, DRAWS = 4, 4  # modes and draws of the prior, for traces: their error is a few per cent
-LANCZOS = 20  # steps for the square root of G_Q^{-1}; the trace is then exact to 1 %
-COARSE = 1e-3  # relative accuracy of those modes
-ROUNDING = 1e-12  # relative: what is smaller is zero
-FORGETS = 2.0  # power of time that weighs a sample in the means of S
-FADES = np.array([1.0, 4.0])  # powers of information and of time that weigh rows of both kinds
-AGED = 2.0  # relative change of S, or of the trace of J, that renews H
-STEEPER = 0.5  # relative growth of J along a step that renews H: at 1 steps would go to and fro
-MOST_NORMAL = 8  # sets of sensors of which normal equations are kept
-MOST_DENSE = 4000  # unknowns of which J may be dense
-CHANCE = 1e-6  # that a right model leaves its prior
-RESOLUTION = np.array([1e9, 1e5])  # largest ratio of information to prior, rows of both kinds
+"""Function from the step h of a stage to its metric."""
+PULL = 10.0  # theta h: r decays within a step
+HELD = 1e6  # weight of the prior that holds q, relative to the information of a sample
+LEADING, DRAWS = 4, 4  # modes and draws of the prior for traces, accurate to a few per cent
+LANCZOS = 20  # steps for the square root of G_Q^{-1}, for traces accurate to 1 %
+COARSE = 1e-3  # relative accuracy of the leading modes
+ROUNDING = 1e-12  # relative size below which a Lanczos vector is zero
+FORGETS = 2.0  # exponent of time in the weight of a sample in the means of S
+FADES = np.array([1.0, 4.0])  # exponents of information and of time that weight the row kinds
+AGED = 2.0  # relative change of S, or of the trace of J, that requires a new H
+STEEPER = 0.5  # growth of J along a step that requires a new H; at 1 steps would oscillate
+MOST_NORMAL = 8  # capacity of the cache of normal equations, by sets of sensors
+MOST_DENSE = 4000  # largest dimension of a dense J
+CHANCE = 1e-6  # probability that q exceeds its bound although the model is right
+RESOLUTION = np.array([1e9, 1e5])  # largest ratio of information to prior, by kind of row
 
 
 @dataclass(frozen=True)
 class NoState:
-    """Empty state of a rule that carries nothing from sample to sample."""
+    """Empty state of a rule without statistics."""
 
 
 @dataclass(frozen=True, eq=False)
 class StepBegin:
-    """A step before it is taken."""
+    """Data of a step that a rule needs before the step is computed."""
 
-    # Parameter at its beginning, and w = u_alpha + P u with the data at its end.
+    # Parameter at the beginning, and w = u_alpha + P u with the data at the end.
     q: Array
     w: Array
-    # Time and inputs at its end, and how long it is.
+    # Time and inputs at the end, and length of the step.
     moment: Moment
     length: float
 
 
 @dataclass(frozen=True, eq=False)
 class Transition:
-    """A step that was taken, for a rule to learn from."""
+    """Outcome of a step, from which a rule updates its statistics."""
 
-    forms: StageForms  # the forms of the stage
-    # Parameter as the stage has found it, and w = u_alpha + P u, at its end.
+    forms: StageForms  # forms of the stage
+    # Parameter before clipping, and w = u_alpha + P u, at the end of the step.
     q: Array
     w: Array
-    change: Array  # by how much q has changed, shape (m,)
-    # Returns the equation error of the data at its end, shape (n,), R^T eps = -theta R^T M_op r -
-    # R^T M r'.
+    change: Array  # change of q in the step, shape (m,)
+    # Function that returns the equation error of the data at the end of the step, shape (n,),
+    # R^T eps = -theta R^T M_op r - R^T M r'.
     error: Callable[[], Array]
-    # Time and inputs at its end, and how long it was.
+    # Time and inputs at the end, and length of the step.
     moment: Moment
     length: float
 
@@ -149,28 +147,28 @@ class MetricRule(ABC, Generic[State]):
 
     @abstractmethod
     def step(self, state: State, forms: StageForms, begin: StepBegin) -> MetricStep:
-        """Return the metric of the stages of a step."""
+        """Return the metric for the stages of a step."""
 
     @abstractmethod
     def frozen(self, state: State, forms: StageForms, begin: StepBegin) -> MetricStep:
-        """Return the same for a step in which q is held."""
+        """Return the metric for the stages of a step in which q is held."""
 
     def learn(self, state: State, after: Transition) -> State:
         """Return the state after a step."""
         return state
 
     def doubt(self, state: State, q: Array) -> str:
-        """Return why an estimate is not to be believed; empty if it may be."""
+        """Return the reason to reject an estimate; empty if it is plausible."""
         return ""
 
     def diagnostics(self, state: State, q: Array, length: float) -> Diagnostics[float]:
-        """Return gain, information and departure after a step, as far as known."""
+        """Return gain, information and departure after a step; NaN if the rule has none."""
         return Diagnostics()
 
 
 @dataclass(frozen=True, eq=False)
 class ConstantMetric(MetricRule[NoState]):
-    """G_Q/gain, and the stabilising term sigma q of (noisy_q)."""
+    """Constant metric G_Q/gain, with the stabilising term sigma q of (noisy_q)."""
 
     gain: float
     sigma: float
@@ -187,30 +185,30 @@ class ConstantMetric(MetricRule[NoState]):
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Sums over the samples so far, and the metric that was made of them last."""
+    """Sums over the samples so far, and the quantities of the current metric H."""
 
     origin: Array  # q0, shape (m,)
-    # Data of J in its pattern, shape (2, entries), and b, shape (2, m), of both kinds of rows.
+    # For both kinds of rows: entries of J in its pattern, shape (2, entries), and b, shape (2, m).
     matrix: Array
     right: Array
-    total: Array  # trace(G_Q^{-1} J) of the same, shape (2,)
-    given: float  # trace(G_Q^{-1} J) of all rows without fading
-    force: Array  # A^T D^{-1} eps of the last sample, and its representative in Q, shape (2, m)
-    # Means of the power of forces and of half that of their changes, each measured against smooth
-    # and against rough functions, shape (2, 2).
+    total: Array  # trace(G_Q^{-1} J) for both kinds of rows, shape (2,)
+    given: float  # trace(G_Q^{-1} J) of all rows, without forgetting
+    force: Array  # A^T D^{-1} eps of the last sample and its Riesz representative, shape (2, m)
+    # Mean powers of the forces and half the mean powers of their changes, in both norms (smooth and
+    # rough functions), shape (2, 2).
     power: Array
-    seen: Array  # means of the traces that they are relative to, shape (2,)
-    # Time and number of samples.
+    seen: Array  # means of the traces in the denominator of S, in both norms, shape (2,)
+    # Sum of the step lengths, and number of samples.
     elapsed: float
     samples: int
-    # S, data of J, and trace(G_Q^{-1} J) in the current H.
+    # S, entries of J, and trace(G_Q^{-1} J) in the current H.
     spread: float
     held: Array
     weighed: float
 
 
 def _diagonal(space: HilbertSpace) -> Array:
-    """Return the diagonal of G, or a bound of it where G is a Schur complement; positive."""
+    """Return the diagonal of G, or its upper bound if G is a Schur complement; zeros become 1."""
     diagonal = space.augmented.diagonal()[: space.dim]
     return np.where(diagonal > 0.0, diagonal, 1.0)
 
@@ -218,8 +216,8 @@ def _diagonal(space: HilbertSpace) -> Array:
 def trace_probes(space: HilbertSpace) -> Array:
     """Return columns V, shape (m, k), with trace(V^T J V) close to trace(G^{-1} J) for every J.
 
-    They are the leading modes of N(0, G^{-1}), in which most of the trace is, and fixed draws from
-    the rest of it. Each coefficient is scaled to a unit of its own.
+    The columns are the leading modes of N(0, G^{-1}), which contain most of the trace, and fixed
+    draws from the other modes. Each coefficient is scaled by the diagonal of G.
     """
     free, root = np.flatnonzero(space.free), np.sqrt(_diagonal(space))
     m, count = len(free), min(len(free), LEADING)
@@ -227,7 +225,7 @@ def trace_probes(space: HilbertSpace) -> Array:
     def inverse(x: Array) -> Array:
         full = np.zeros(space.dim)
         full[free] = x
-        # D^(1/2) G^-1 D^(1/2) with the diagonal D of G: it has no unit.
+        # D^(1/2) G^-1 D^(1/2) with the diagonal D of G is dimensionless.
         return np.asarray((root * space.riesz(root * full))[free])
 
     if m <= LEADING + DRAWS:
@@ -237,17 +235,17 @@ def trace_probes(space: HilbertSpace) -> Array:
         values, modes = eigsh(operator, k=count, v0=np.ones(m), tol=COARSE)
     columns = [modes * np.sqrt(values)]
     if m > LEADING + DRAWS:
-        # Random signs without their part in the modes, by Hutchinson's estimate of a trace.
+        # Hutchinson's trace estimator: random signs, orthogonal to the modes.
         signs = 2.0 * np.random.default_rng(0).integers(0, 2, (DRAWS, m)) - 1.0
         rest = [sign - modes @ (modes.T @ sign) for sign in signs]
         columns += [_root(inverse, x, modes)[:, None] / math.sqrt(DRAWS) for x in rest]
-    found = np.zeros((space.dim, sum(part.shape[1] for part in columns)))
-    found[free] = np.hstack(columns) / root[free, None]
-    return found
+    V = np.zeros((space.dim, sum(part.shape[1] for part in columns)))
+    V[free] = np.hstack(columns) / root[free, None]
+    return V
 
 
 def _root(inverse: Callable[[Array], Array], x: Array, modes: Array) -> Array:
-    """Return by Lanczos' method the root of an operator times x, orthogonal to some modes."""
+    """Return the square root of an operator times x, orthogonal to modes, by Lanczos' method."""
     size, basis, T = float(np.linalg.norm(x)), [], np.zeros((LANCZOS, LANCZOS))
     y = x / size
     for k in range(LANCZOS):
@@ -263,18 +261,18 @@ def _root(inverse: Callable[[Array], Array], x: Array, modes: Array) -> Array:
             break
         y /= left
     k = len(basis)
-    # The root times x is about ||x|| V T^(1/2) e_1, with the Lanczos basis V and its matrix T.
+    # The root times x is about ||x|| V T^(1/2) e_1, with Lanczos basis V and tridiagonal matrix T.
     values, vectors = np.linalg.eigh(T[:k, :k], UPLO="U")
     powers = vectors @ (np.sqrt(np.maximum(values, 0.0)) * vectors[0])
     return np.asarray(size * (powers @ np.array(basis)))
 
 
 def _pattern(model: Model, selects: bool) -> Pattern:
-    """Return the pattern of J; raises `LawError` where it is dense and too large."""
+    """Return the pattern of J; raises `LawError` if J is dense and too large."""
     if selects:
         A = model.form_A.pattern("v", "q")
         ones = A.matrix(np.ones(A.nnz))
-        # The diagonal counts as well where A does not touch a coefficient, as at an end alone.
+        # The pattern contains the diagonal also for coefficients without an entry of A^T A.
         return Pattern.of(sp.csr_array(ones.T @ ones + sp.eye_array(model.Q.dim)))
     if model.Q.dim > MOST_DENSE:
         raise LawError(
@@ -286,10 +284,10 @@ def _pattern(model: Model, selects: bool) -> Pattern:
 
 
 class InformationMetric(MetricRule[Information]):
-    """H/PULL instead of G_Q/gain, with H = S G_Q + J.
+    """Metric H/PULL instead of G_Q/gain, with H = S G_Q + J.
 
-    `model`: with its prior. `selects`: True if sensors select coefficients: then J is sparse.
-    `pattern` is that of J.
+    `model`: the process, with the prior of its unknowns. `selects`: True if sensors select
+    coefficients, so that J is sparse. `pattern`: pattern of J.
     """
 
     def __init__(self, model: Model, selects: bool) -> None:
@@ -338,17 +336,17 @@ class InformationMetric(MetricRule[Information]):
         return lambda h: Metric(h * weight, 0.0, None, held, PULL / h)
 
     def normal(self, forms: StageForms) -> SelectedRows | ProjectedRows:
-        """Return the contribution of the samples of a stage to the normal equations."""
-        return self._normal.get(forms.split.present.tobytes(), lambda: self._made(forms))
+        """Return the rows of the normal equations for the sensors of a stage, from a cache."""
+        return self._normal.get(forms.split.present.tobytes(), lambda: self._rows(forms))
 
-    def _made(self, forms: StageForms) -> SelectedRows | ProjectedRows:
+    def _rows(self, forms: StageForms) -> SelectedRows | ProjectedRows:
         X, Q, A = self.model.X, self.model.Q, forms.A_in.pattern("v", "q")
         if not self.selects:
             return ProjectedRows(A, forms.split.basis, forms.mass, X.free, Q.free)
         D = diagonal_bound(forms.mass)
         inverse = np.where(D > 0.0, X.free / np.where(D > 0.0, D, 1.0), 0.0)
-        own = inverse * forms.tests.free if forms.W is None else np.zeros_like(inverse)
-        return SelectedRows(A, np.stack([own, inverse - own]), Q.free, self.pattern)
+        inner = inverse * forms.tests.free if forms.W is None else np.zeros_like(inverse)
+        return SelectedRows(A, np.stack([inner, inverse - inner]), Q.free, self.pattern)
 
     def learn(self, state: Information, after: Transition) -> Information:
         Q, h = self.model.Q, after.length
@@ -357,20 +355,20 @@ class InformationMetric(MetricRule[Information]):
         rough = gain.matrix[:, self.on_diagonal] @ (1.0 / self.diagonal)
         seen = np.array([gain.trace.sum(), rough.sum()])
         if not state.samples and not np.all(seen > 0.0):
-            return state  # no data yet, or none that depend on q: the next sample is the first
+            return state  # the data do not depend on q yet: the next sample counts as the first
         force = np.stack([gain.force, Q.riesz(gain.force)])
-        # The first sample has no change: by this factor both powers are the same.
+        # The first sample has no predecessor: this factor makes both powers equal.
         change = force - state.force if state.samples else math.sqrt(2.0) * force
         power = np.stack([self._powers(force), self._powers(change) / 2.0])
-        elapsed, told = state.elapsed + h, h * float(gain.trace.sum())
-        given = state.given + told
-        share = told / given if given > 0.0 else 0.0
+        elapsed, information = state.elapsed + h, h * float(gain.trace.sum())
+        given = state.given + information
+        share = information / given if given > 0.0 else 0.0
         kept = max(0.0, 1.0 - FORGETS * h / elapsed)
-        # Rows within omega fade by information, those that hold fluxes of P u by time.
+        # Rows within omega are forgotten by information, rows with fluxes of P u by time.
         faded = np.maximum(0.0, 1.0 - FADES * np.array([share, h / elapsed]))
         matrix = h * gain.matrix
-        for new, old, left in zip(matrix, state.matrix, faded, strict=True):
-            new += left * old
+        for new, old, factor in zip(matrix, state.matrix, faded, strict=True):
+            new += factor * old
         learned = replace(
             state,
             matrix=matrix,
@@ -378,7 +376,7 @@ class InformationMetric(MetricRule[Information]):
             total=faded * state.total + h * gain.trace,
             given=given,
             force=force,
-            # One h is the time that the sample counts for, the other makes a squared force a
+            # One h is the weight of the sample in time, the other converts a squared force to a
             # spectral density.
             power=kept * state.power + h * h * power,
             seen=kept * state.seen + h * seen,
@@ -389,11 +387,11 @@ class InformationMetric(MetricRule[Information]):
 
     def _powers(self, force: Array) -> Array:
         """Return the squared norms of a force, in Q* and by the diagonal of G_Q."""
-        dual, own = force
-        return np.array([dual @ own, dual @ (dual / self.diagonal)])
+        dual, primal = force
+        return np.array([dual @ primal, dual @ (dual / self.diagonal)])
 
     def _renewed(self, state: Information, change: Array) -> Information:
-        """Return the state with an H that is new if the last one has aged."""
+        """Return the state, with a new H if the current H is outdated."""
         if not np.all(state.seen > 0.0):
             return state
         least = float((state.total / RESOLUTION).sum())
@@ -402,7 +400,7 @@ class InformationMetric(MetricRule[Information]):
         J = state.matrix.sum(axis=0)
         old, most = (state.spread, state.weighed), 1.0 + AGED
         if all(new / most <= last <= new * most for new, last in zip((S, total), old, strict=True)):
-            # The current H and the J of now are compared along the last step of q.
+            # J in the current H is compared with the latest J along the last step of q.
             prior = state.spread * float(change @ self.model.Q.dual(change))
             held, now = (self.pattern.compact(data) @ change @ change for data in (state.held, J))
             if prior + now <= (1.0 + STEEPER) * (prior + held):
@@ -411,14 +409,14 @@ class InformationMetric(MetricRule[Information]):
 
     def departure(self, state: Information, q: Array) -> float:
         """Return ||q - q0||_Q^2 over its critical value under the model, at the level `CHANCE`."""
-        away = q - state.origin
-        # k of the docstring of this module: at most m, and at most trace(G_Q^-1 J)/S.
-        told = float(self.model.Q.free.sum())
-        if state.given < told * state.spread:
-            told = state.given / state.spread
-        rare = -math.log(CHANCE)
-        most = told + 2.0 * math.sqrt(told * rare) + 2.0 * rare
-        return float(away @ self.model.Q.dual(away)) / most
+        shift = q - state.origin
+        # k of the module docstring: at most m, and at most trace(G_Q^-1 J)/S.
+        k = float(self.model.Q.free.sum())
+        if state.given < k * state.spread:
+            k = state.given / state.spread
+        s = -math.log(CHANCE)
+        most = k + 2.0 * math.sqrt(k * s) + 2.0 * s
+        return float(shift @ self.model.Q.dual(shift)) / most
 
     def doubt(self, state: Information, q: Array) -> str:
         ratio = self.departure(state, q) if state.samples else 0.0
@@ -442,18 +440,20 @@ class InformationMetric(MetricRule[Information]):
 class Gain:
     """Contribution of one sample to the normal equations, per unit of time."""
 
-    # A^T R D^{-1} R^T A of both kinds of rows, data in the pattern of J, shape (2, entries).
+    # For both kinds of rows: entries of A^T R D^{-1} R^T A in the pattern of J, (2, entries), and
+    # A^T R D^{-1} R^T y with y = A q - eps, shape (2, m).
     matrix: Array
-    right: Array  # A^T R D^{-1} R^T y of the same, y = A q - eps, shape (2, m)
+    right: Array
     force: Array  # A^T R D^{-1} R^T eps of all rows, shape (m,)
     trace: Array  # trace(G_Q^{-1} matrix), shape (2,)
 
 
 class SelectedRows:
-    """Sensors that select coefficients: D is diagonal and J as sparse as A^T A.
+    """Normal equations for sensors that select coefficients: J is as sparse as A^T A.
 
-    `pattern`: of A, shape (n, m). `inverse`: D^{-1} of the rows of both kinds, zero elsewhere,
-    shape (2, n). `free`: one for each free coefficient of q, shape (m,). `J`: pattern of J.
+    `pattern`: pattern of A, shape (n, m). `inverse`: diagonal of D^{-1} for each kind of rows, zero
+    in the other rows, shape (2, n). `free`: 1 for free and 0 for fixed coefficients of q, shape
+    (m,). `J`: pattern of J.
     """
 
     def __init__(self, pattern: Pattern, inverse: Array, free: Array, J: Pattern) -> None:
@@ -463,17 +463,17 @@ class SelectedRows:
         self.shape = (2, J.nnz)
         rows, cols = pattern.rows, pattern.indices
         whole = inverse.sum(axis=0)
-        # Each pair of entries of a row is a term of J; those above the diagonal are mirrored.
+        # Each pair of entries in a row of A is a term of J; terms above the diagonal are mirrored.
         entry = np.flatnonzero((whole[rows] > 0.0) & (free[cols] > 0.0))
-        # Each entry of A, numbered by `entry`, meets all of those in its row: `left` repeats it as
-        # often, and `right` counts through them from the first of the row.
-        own = rows[entry]
-        counts = np.bincount(own, minlength=pattern.shape[0])
-        first = (np.cumsum(counts) - counts)[own]
-        before = np.cumsum(counts[own]) - counts[own]
-        rank = np.arange(counts[own].sum()) - np.repeat(before, counts[own])
-        left = np.repeat(entry, counts[own])
-        right = entry[np.repeat(first, counts[own]) + rank]
+        # All pairs of entries in a row: `left` repeats each entry by their number in its row, and
+        # `right` enumerates the entries of the row.
+        row = rows[entry]
+        counts = np.bincount(row, minlength=pattern.shape[0])
+        first = (np.cumsum(counts) - counts)[row]
+        before = np.cumsum(counts[row]) - counts[row]
+        rank = np.arange(counts[row].sum()) - np.repeat(before, counts[row])
+        left = np.repeat(entry, counts[row])
+        right = entry[np.repeat(first, counts[row]) + rank]
         upper = cols[left] <= cols[right]
         left, right = left[upper], right[upper]
         kind = (inverse[1] > 0.0)[rows[left]].astype(np.intp)
@@ -489,7 +489,7 @@ class SelectedRows:
     def _matrix(self, A: Array) -> Array:
         data = np.zeros(self.shape)
         if len(self.starts):
-            # Terms are sorted by their place in J, so that each entry of J is the sum of a segment.
+            # Terms are sorted by position in J, so that each entry of J is the sum of a segment.
             terms = A[self.left]
             terms *= A[self.right]
             terms *= self.weights
@@ -513,12 +513,12 @@ class SelectedRows:
 
 
 class ProjectedRows:
-    """The same for other sensors: rows of a basis V of N(G)^perp, D = M, and J dense.
+    """Normal equations for other sensors: D = M, the rows belong to a basis V of N(G)^perp.
 
-    All of them see the unobserved part.
+    J is dense, and all rows depend on the unobserved part.
 
-    `pattern`: of A, shape (n, m). `basis`: V, shape (n, k). `mass`: M, shape (n, n). `free`,
-    `free_q`: one for each free coefficient of u and q.
+    `pattern`: pattern of A, shape (n, m). `basis`: V, shape (n, k). `mass`: M, shape (n, n).
+    `free`, `free_q`: 1 for free and 0 for fixed coefficients of u and q.
     """
 
     def __init__(
@@ -547,10 +547,10 @@ class ProjectedRows:
 
 
 def diagonal_bound(mass: sp.csr_array) -> Array:
-    """Return the diagonal D >= M of Gershgorin's circles, scaled to a unit diagonal of M."""
+    """Return a diagonal D >= M by Gershgorin's circles, after scaling M to a unit diagonal."""
     diagonal = mass.diagonal()
     root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     scale = sp.diags_array(1.0 / root)
     rows = abs(scale @ mass @ scale).sum(axis=1)
-    # diag(row sums) less the scaled M is diagonally dominant, and so has no negative eigenvalue.
+    # diag(row sums) minus the scaled M is diagonally dominant, so it has no negative eigenvalue.
     return np.where(diagonal > 0.0, root**2 * np.maximum(rows, 1.0), 0.0)

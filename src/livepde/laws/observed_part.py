@@ -1,31 +1,31 @@
 """The observed part u_alpha of the state over one interval: G^+ z, or G_alpha z (section 3.2).
 
-Noisy samples are smoothed for `GradientLaw(gain="auto")`, with no noise level given.
+For `GradientLaw(gain="auto")`, noisy samples are smoothed without a given noise level.
 
 The law differentiates the readings: noise of w and noise of B(w) are correlated, and the part that
-smoothing removes from B(w) moves with w. Neither averages out, and both look like a wrong q. So
-alpha is not the one of the best u_alpha, but the one where the two biases cancel. With z the data,
-n their noise, and L = (|.|^2)^{1/2}, second derivatives for `Tikhonov("V")`,
+smoothing removes from B(w) moves with w. Neither averages out, and both look like a wrong q.
+Therefore alpha does not minimise the error of u_alpha: it cancels the two biases. With data z,
+noise n, and L = (|.|^2)^{1/2}, second derivatives for `Tikhonov("V")`,
 
     E (u_alpha, L (u_alpha - u)) = 0,    that is    E (u_alpha, L (z - u_alpha)) = E (u_alpha, L n).
 
-Smoothing is Tikhonov's, iterated: u_j minimises ||G v - z||_Z^2 + alpha |v - u_{j-1}|^2. Its
-factors on the modes of G and |.| are 1 - f, f = (alpha k/(s + alpha k))^ORDER: the bias of smooth
-functions falls with the power, that of noise does not. Both sides of the balance are running means
-over the samples so far, for each alpha of a grid, and alpha is the first where they meet.
+The smoother is the iterated Tikhonov method: u_j minimises ||G v - z||_Z^2 + alpha |v - u_{j-1}|^2.
+Its factors on the modes of G and |.| are 1 - f, f = (alpha k/(s + alpha k))^ORDER: the bias of
+smooth functions decreases with ORDER, the bias of noise does not. Both sides of the balance are
+means over the samples so far for each alpha of a grid; alpha is their first intersection.
 
-The level of the noise is read from the rougher half of the modes, where a smooth state has next to
-none, and there from products of successive differences in time,
+The noise level is estimated from the rougher half of the modes, in which a smooth state has almost
+no component, by products of successive differences in time,
 
     E (z_k - z_{k-1}) (z_{k-1} - z_{k-2}) = -sigma^2:
 
-noise turns back, a motion goes on. The level is not taken larger than the observation states. Noise
-is independent from sensor to sensor with the standard deviations that the observation states, or
-white in Z if it states none.
+differences of noise change sign, differences of a motion do not. The noise level of the observation
+is an upper bound. Noise is independent between sensors with the standard deviations of the
+observation, or white in Z if the observation has none.
 
-Exact data turn back nowhere. The same products, of second derivatives of the data, detect this
-(`NoiseDetector`) before any mode is computed, since the modes are those of a dense matrix: then
-alpha is zero and a sample costs a few products with a sparse one.
+Differences of exact data do not change sign. `NoiseDetector` tests this with second derivatives of
+the data, before the modes of a dense matrix are computed. For exact data alpha is zero, and a
+sample costs a few products with a sparse matrix.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ from livepde.stepping import Interval
 
 ORDER = 4  # of the iterated Tikhonov method
 GRID = np.geomspace(1e-12, 1e8, 161)  # alpha in units of its scale
-LARGEST = 3000  # sensors: the modes are those of a dense matrix
+LARGEST = 3000  # maximum number of sensors, because the modes require a dense matrix
 ROUNDING = 1e-14  # of second derivatives, relative to the sum of their terms
-FEWEST = 8  # modes below which their rougher half says nothing about noise
-LARGEST_MEMO = 8  # smoothers kept for different sets of present sensors
+FEWEST = 8  # least number of modes for an estimate of the noise from the rougher half
+LARGEST_MEMO = 8  # capacity of the caches of detectors and smoothers, by sets of sensors
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,15 +61,15 @@ class Balance:
     """Running means over the samples."""
 
     left: Array  # (u_alpha, L (z - u_alpha)) for each alpha, shape (alphas,)
-    noise: Array  # E (u_alpha, L n) for noise of the stated level, or of level 1, shape (alphas,)
-    power: float  # square of the noise level, as a multiple of that
-    # Number of samples, and of those that told of the level.
+    noise: Array  # E (u_alpha, L n) for the configured noise level, or level 1, shape (alphas,)
+    power: float  # estimated noise variance, relative to the variance of `noise`
+    # Number of samples, and number of samples that contributed to `power`.
     samples: int
     pairs: int
     # The last two samples and the boundary values at their times, shapes (2, sensors), (2, n).
     z: Array
     boundary: Array
-    # Sum of the cosines by which samples have turned back so far; those of exact data go on.
+    # Sum of negative cosines between successive changes: positive for noise, negative otherwise.
     turned: float
 
     @classmethod
@@ -79,16 +79,16 @@ class Balance:
         return cls(left, left, 0.0, 0, 0, z, np.zeros((2, n)), 0.0)
 
     def followed(self, z: Array, boundary: Array) -> Balance:
-        """Return the same with one more sample, of which nothing else is taken."""
+        """Store a sample and its boundary values; the means are unchanged."""
         samples, known = np.stack([self.z[1], z]), np.stack([self.boundary[1], boundary])
         return replace(self, z=samples, boundary=known)
 
 
 def smooths(observed: Observed) -> bool:
-    """Return true if smoothing is chosen here: by default for samples of a function.
+    """Return True if samples are smoothed: observed coefficients without a `reconstruction`.
 
-    Averages are not differentiated, so noise of theirs needs no smoothing in space. Raises
-    `LawError` for noisy samples of which the law cannot say how to smooth them.
+    The law does not differentiate averages, so their noise needs no smoothing in space. Raises
+    `LawError` for noisy coefficients of a state that this smoother does not support.
     """
     observation = observed.observation
     if not observation.nodal or observation.reconstruction.regularises:
@@ -105,9 +105,9 @@ def smooths(observed: Observed) -> bool:
 
 
 class NoiseDetector:
-    """Distinguishes noisy samples of one set of present sensors from exact ones.
+    """Distinguishes noisy from exact samples for one set of present sensors.
 
-    Second derivatives of noise are large and turn back with the next sample.
+    Second derivatives of noise are large and change sign with the next sample.
     """
 
     def __init__(self, observed: Observed, split: Split) -> None:
@@ -120,7 +120,7 @@ class NoiseDetector:
         self.small = int(shown.sum()) < FEWEST
 
     def add(self, balance: Balance, z: Array, boundary: Array) -> tuple[Balance, bool]:
-        """Return the means with the noise products of a sample, and whether there is noise."""
+        """Return the updated `turned` of a balance, and whether the samples are noisy."""
         samples = np.stack([*balance.z, z])
         if np.isfinite(samples[:, self.split.present]).all():
             known = [*balance.boundary, boundary]
@@ -130,14 +130,14 @@ class NoiseDetector:
             size = math.sqrt(float((before**2 @ self.scale) * (now**2 @ self.scale)))
             rounding = abs(self.rows) @ np.abs(u).max(axis=0) * ROUNDING
             if size > float(rounding**2 @ self.scale):
-                # The cosine: each pair of changes counts the same, however large a start was.
+                # Cosines weight all pairs of changes equally, even a large initial transient.
                 turned = balance.turned - float(before @ (self.scale * now)) / size
                 balance = replace(balance, turned=turned)
         return balance, self.small or balance.turned > 0.0
 
 
 class SmoothingOperator:
-    """G_alpha for one set of present sensors, and the terms of a sample in the balance."""
+    """G_alpha for one set of present sensors, and the terms of the balance for a sample."""
 
     def __init__(self, observed: Observed, present: Array) -> None:
         self.spectral = filter_ = Spectral(Tikhonov("V"), observed, present)
@@ -146,22 +146,22 @@ class SmoothingOperator:
         if self.size == 0:
             return
         s, k = filter_.s, filter_.k
-        # Only Dirichlet values are in the boundary, so only their rows are ever asked for.
+        # Boundary values are zero except at Dirichlet coefficients: only these rows are needed.
         self.fixed = observed.X.fixed
         self.pulled = np.ascontiguousarray(filter_.pulled[self.fixed].T)
         self.G = sp.csr_array(filter_.G[:, self.fixed])
         stiff = k > 0.0
         self.inverse = np.where(stiff, 1.0 / np.where(stiff, k, 1.0), 0.0)
-        # s Var(n) of each mode: one for noise that is white in Z.
+        # s Var(n) of each mode, which is 1 for noise that is white in Z.
         if observed.noise is None:
             self.variance = np.ones(self.size)
         else:
             spread = filter_.fitted * observed.noise[present]
             self.variance = (spread**2).sum(axis=1) / s
         self.removed = self._removed(GRID[:, None] * filter_.rho)
-        # On the modes L is (k/s)^(1/2), and the inner product of Z weighs by s: (k s)^(1/2)
-        # together.
-        self.told = self.removed * (1.0 - self.removed)
+        # On the modes, L is (k/s)^(1/2) and the inner product of Z has the weight s: the product is
+        # (k s)^(1/2).
+        self.products = self.removed * (1.0 - self.removed)
         self.weight = np.sqrt(k * s)
         self.noise = (1.0 - self.removed) @ (np.sqrt(k / s) * self.variance)
 
@@ -170,9 +170,9 @@ class SmoothingOperator:
         return np.asarray((alpha * k / (s + alpha * k)) ** ORDER)
 
     def _rough(self, z: Array, boundary: Array) -> tuple[Array, Array]:
-        """Return the modes of the data, and those less the smooth continuation of the boundary.
+        """Return the modes of the data, and the modes minus the smooth extension of `boundary`.
 
-        For samples z of shape (samples, sensors), with boundary values of shape (samples, n).
+        `z`: samples, shape (samples, sensors). `boundary`: boundary values, shape (samples, n).
         """
         filter_, held = self.spectral, boundary[:, self.fixed].T
         known = z[:, filter_.present].T - self.G @ held
@@ -180,19 +180,19 @@ class SmoothingOperator:
         return modes, modes + (self.pulled @ held) * self.inverse[:, None]
 
     def add(self, balance: Balance, z: Array, boundary: Array) -> Balance:
-        """Return the means with one more sample, z of shape (sensors,)."""
+        """Return the means after a sample z of shape (sensors,)."""
         if self.size == 0 or not np.isfinite(z[self.spectral.present]).all():
             return balance
         pair = self.size >= FEWEST and np.isfinite(balance.z[:, self.spectral.present]).all()
         samples = np.vstack([z, balance.z]) if pair else z[None]
         e = self._rough(samples, np.vstack([boundary, balance.boundary])[: len(samples)])[1].T
-        left = self.told @ (self.weight * e[0] ** 2)
+        left = self.products @ (self.weight * e[0] ** 2)
         share = 1.0 / (balance.samples + 1)
         power, pairs = balance.power, balance.pairs
         if pair:
-            # e holds this sample, the one before the last, and the last one, in this order.
+            # The rows of e are samples k, k - 2 and k - 1, in this order.
             back = -self.spectral.s * (e[0] - e[2]) * (e[2] - e[1]) / self.variance
-            half = slice(0, self.size // 2)  # s ascends: the roughest come first
+            half = slice(0, self.size // 2)  # s ascends, so the roughest modes come first
             pairs += 1
             power += (float(back[half].mean()) - power) / pairs
         return replace(
@@ -205,7 +205,7 @@ class SmoothingOperator:
         )
 
     def alpha(self, balance: Balance) -> float:
-        """Return the first alpha where smoothing takes as much as noise has brought."""
+        """Return the smallest alpha at which the biases by smoothing and by noise balance."""
         if self.size == 0:
             return 0.0
         power = max(balance.power, 0.0)
@@ -220,7 +220,7 @@ class SmoothingOperator:
         first = int(above[0])
         if first == 0:
             return 0.0
-        # Between two alphas of the grid the excess is taken as linear in log(alpha).
+        # The excess is interpolated linearly in log(alpha) between grid points.
         low, high = excess[first - 1], excess[first]
         part = low / (low - high)
         return float(GRID[first - 1] ** (1 - part) * GRID[first] ** part * self.spectral.rho)
@@ -238,11 +238,11 @@ Find: TypeAlias = Callable[[Array, Array | None], Reconstructed]
 
 @dataclass(frozen=True, eq=False)
 class ObservedPath:
-    """u_alpha at any time of an interval, each found once."""
+    """u_alpha at any time of an interval, with a cache."""
 
     problem: Problem
     interval: Interval
-    find: Find  # from measurements, and Dirichlet values or None if all are zero
+    find: Find  # function of the readings, and of Dirichlet values or None if all are zero
     _found: dict[float, Reconstructed] = field(default_factory=dict)
 
     def at(self, t: float) -> Reconstructed:
@@ -255,9 +255,9 @@ class ObservedPath:
         return self._found[t]
 
     def diagnostics(self) -> Diagnostics[float]:
-        """Return smoothing and misfit at the end of the interval, as far as known."""
-        found = self.at(self.interval.t1)
-        return Diagnostics(alpha=found.alpha, misfit=found.misfit)
+        """Return alpha and the misfit at the end of the interval; NaN if not computed."""
+        end = self.at(self.interval.t1)
+        return Diagnostics(alpha=end.alpha, misfit=end.misfit)
 
 
 def exact(split: Split, z: Array, boundary: Array | None, alpha: float = np.nan) -> Reconstructed:
@@ -267,7 +267,7 @@ def exact(split: Split, z: Array, boundary: Array | None, alpha: float = np.nan)
 
 @dataclass(frozen=True, eq=False)
 class StatedReconstruction:
-    """u_alpha = G^+ z, or G_alpha z if the `reconstruction` of the observation regularises."""
+    """Rule u_alpha = G^+ z, or G_alpha z if the `reconstruction` of the observation regularises."""
 
     problem: Problem
 
@@ -290,7 +290,7 @@ class StatedReconstruction:
 
 
 class SelfChosenSmoothing:
-    """u_alpha smoothed as the noise of the samples requires."""
+    """Rule that smooths u_alpha according to the noise of the samples."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
@@ -318,7 +318,7 @@ class SelfChosenSmoothing:
                 make = partial(SmoothingOperator, self.problem.observed, split.present)
                 smoother = self._smoothers.get(key, make)
                 state = smoother.add(state, z, boundary)
-                # The alpha of the last sample serves all of the interval.
+                # The alpha of the last sample is used in the entire interval.
                 find = _smoothed(smoother, smoother.alpha(state), split, model.X.dim)
             else:
                 state = state.followed(z, boundary)
