@@ -1,11 +1,11 @@
-"""Answers of the process to errors of the model, along the stored samples.
+"""Responses of the process to model errors, along the stored samples.
 
-Errors of amplitude one are sources, losses, flows, conductivities that vary, boundary values, and
-unknowns that change. Their answers p follow by one implicit Euler step between two samples,
+The errors have amplitude one: sources, losses, flows, variable conductivities, boundary values, and
+changes of unknowns. Their responses p follow by one implicit Euler step between two samples,
 
     M (p' - p)/h + (B + A q)' p' = load(u),
 
-which is exact enough for an error of which neither place nor size is known.
+which is accurate enough for errors of unknown place and size.
 """
 
 from __future__ import annotations
@@ -35,48 +35,48 @@ from livepde.verdict.directions import (
     scaled_channel,
 )
 
-MOST_WORK = 1e8  # coefficients of answers that a pass may compute
-MOST_STEPS = 500  # Euler steps of an answer; with more of them intervals move by less than 2 %
-MOST_UNKNOWNS = 4  # that may jump or drift
-STARTS = (0.25, 0.5, 0.75)  # of the run, where something is switched on or changes
-PLACES = (0.2, 0.4, 0.6, 0.8)  # of the length, where a contact may resist
-STEP = 0.01  # of a difference: prior standard deviations of an unknown, share of a channel
-NARROW = 0.03  # of the length: a contact
-COMPARED = 4  # moments at which loads are compared
-ALIKE = 1e-3  # relative difference of loads that are the same
-ROUNDING = 1e-11  # share of its terms, below which an effect is none: it would be scaled to one
+MOST_WORK = 1e8  # maximum number of coefficients of responses in a pass
+MOST_STEPS = 500  # maximum number of Euler steps; more change intervals by less than 2 %
+MOST_UNKNOWNS = 4  # maximum number of unknowns that may jump or drift
+STARTS = (0.25, 0.5, 0.75)  # switching times, as fractions of the run
+PLACES = (0.2, 0.4, 0.6, 0.8)  # places of a contact resistance, as fractions of the length
+STEP = 0.01  # difference step: in prior standard deviations, or relative to a channel
+NARROW = 0.03  # least width of a contact, as a fraction of the length
+COMPARED = 4  # number of moments at which loads are compared
+ALIKE = 1e-3  # relative difference below which two loads are equal
+ROUNDING = 1e-11  # size of an effect, relative to its terms, below which it counts as zero
 
 
 class Answer(NamedTuple):
-    """A shape of error of the process, with columns that differ by their course in time."""
+    """Spatial shape of an error of the process; each column has a different course in time."""
 
-    # What it is: "source", "conductivity", "flow", "loss", "boundary", "late boundary", "flux",
-    # "transfer", "channel", "contact", "initial", "unknown"; and its channel, boundary or unknown.
+    # "source", "switched", "conductivity", "state", "layer", "contact", "flow", "steady flow",
+    # "loss", "boundary", "late boundary", "channel", "flux", "transfer", "initial" or "unknown"
     kind: str
-    subject: str = ""
-    mode: float = 0.0  # number of its shape in space
-    # Its load, its boundary values, and its value at the start, (n,); None for zero.
+    subject: str = ""  # channel, boundary, component, axis or unknown
+    mode: float = 0.0  # number of the shape in space
+    # Load, boundary values and initial value, shape (n,); None: zero.
     load: Load | Array | None = None
     lift: Load | Array | None = None
     start: Array | None = None
 
 
 class Course(NamedTuple):
-    """Courses in time of an answer: number of columns, and their values at a share of the run."""
+    """Courses in time of a response: number of columns, and values at a fraction of the run."""
 
     size: int
     at: Callable[[float], Array]
-    constant: Array | None = None  # the amplitudes with which they are constant; None: ones
+    constant: Array | None = None  # amplitudes whose sum is constant in time; None: ones
 
     def varying(self, columns: Array) -> Array:
-        """Return the columns, (..., columns), without the effect of constants."""
+        """Return columns, (..., columns), orthogonal to the constant course."""
         one = np.ones(self.size) if self.constant is None else self.constant
-        found: Array = columns - (columns @ one)[..., None] * one / (one @ one)
-        return found
+        rest: Array = columns - (columns @ one)[..., None] * one / (one @ one)
+        return rest
 
 
 def hats(count: int) -> Course:
-    """Return hat functions on the run."""
+    """Return hat functions in time over the run."""
     nodes = np.arange(count) / (count - 1)
     return Course(count, lambda s: np.maximum(1.0 - np.abs(s - nodes) * (count - 1), 0.0))
 
@@ -91,7 +91,7 @@ CHANGES = Course(1 + len(STARTS), lambda s: np.array([s, *(float(s > one) for on
 
 
 class _Numbers(NamedTuple):
-    """How many shapes in space and time the families have."""
+    """Numbers of shapes in space and time for each family, and of noise functions in time."""
 
     source: tuple[int, int]
     conductivity: tuple[int, int]
@@ -104,7 +104,7 @@ SMALL = _Numbers((4, 9), (3, 3), (2, 3), 9)
 
 
 class ErrorColumns:
-    """Errors that a model and its sensors can have."""
+    """Possible errors of a model, as columns of responses in the readings."""
 
     def __init__(self, samples: StoredSamples, numbers: _Numbers) -> None:
         self.samples, self.numbers = samples, numbers
@@ -116,43 +116,43 @@ class ErrorColumns:
         single = self.model.state_space.single and not len(self.model.algebraic)
         if single and not next(iter(self.model.state_space.fields.values())).vector:
             self.answers += [*self._operators(), *self._fluxes()]
-        # Number of the first column of each answer, and of all columns of the process.
+        # Number of the first column of each response, and number of all columns.
         sizes = (course.size for _, course in self.answers)
         *self.first, self.count = itertools.accumulate(sizes, initial=0)
 
     @cached_property
     def _powers(self) -> list[tuple[float, tuple[int, ...]]]:
-        """Half waves along each axis of the shapes, the longest waves first, with their number.
+        """Mode numbers and half waves along each axis, in order of decreasing wavelength.
 
-        Waves of one length have one number, their mean: it depends on no order of the axes.
+        Modes of equal wavelength share their mean number, which is independent of the axis order.
         """
         span, most = self.span, max(max(one) for one in self.numbers[:3])
-        some = [
+        waves = [
             (round(float(np.sum((np.array(one) * span.max() / span) ** 2)), 9), one)
             for one in itertools.product(range(most + 1), repeat=len(span))
         ]
-        some.sort(key=lambda one: (one[0], [-part for part in one[1]]))
-        found: list[tuple[float, tuple[int, ...]]] = []
-        for _, group in itertools.groupby(some, key=lambda one: one[0]):
+        waves.sort(key=lambda wave: (wave[0], [-part for part in wave[1]]))
+        modes: list[tuple[float, tuple[int, ...]]] = []
+        for _, group in itertools.groupby(waves, key=lambda wave: wave[0]):
             same = [powers for _, powers in group]
-            found += [(len(found) + 0.5 * (len(same) - 1), powers) for powers in same]
-        return found
+            modes += [(len(modes) + 0.5 * (len(same) - 1), powers) for powers in same]
+        return modes
 
     def _mode(self, number: int) -> Callable[[Any], Any]:
-        """Return a product of cosines over the box of the domain, the longest waves first."""
+        """Return a mode, a product of cosines over the bounding box of the domain."""
         mesh, (_, powers) = self.model.mesh, self._powers[number]
 
         def shape(x: Any) -> Any:
-            found: Any = 1.0
+            values: Any = 1.0
             for axis, power in enumerate(powers):
                 if power:
-                    found = found * np.cos(power * np.pi * shares(mesh, axis, x[axis]))
-            return found
+                    values = values * np.cos(power * np.pi * shares(mesh, axis, x[axis]))
+            return values
 
         return shape
 
     def _sources(self) -> Iterator[tuple[Answer, Course]]:
-        """Iterate over sources: of a family, and switched on at some time."""
+        """Iterate over sources: the modes of a family, and uniform sources that switch on."""
         model, (modes, times) = self.model, self.numbers.source
         for name, block in model.state_space.fields.items():
             if block.vector:
@@ -195,10 +195,10 @@ class ErrorColumns:
             yield Answer("unknown", label, load=load), CHANGES
 
     def _operators(self) -> Iterator[tuple[Answer, Course]]:
-        """Iterate over flows, losses, and conductivities that vary in space and with the state."""
+        """Iterate over flows, losses, contacts, and conductivities that vary in space or state."""
         model, (modes, times) = self.model, self.numbers.conductivity
-        # A contact stops what is conducted, not what a flow carries. A flow is looked for in linear
-        # equations only.
+        # A contact resists conduction, not advection. Equations that are linear but not symmetric
+        # may have advection: they get no contacts.
         stage = ForwardStage(model)
         places = PLACES if stage.symmetric or not stage.keeps else ()
 
@@ -220,7 +220,7 @@ class ErrorColumns:
                 yield Answer("contact", "xyz"[axis], load=_minus(matrix)), ALWAYS
         modes, times = self.numbers.flow
         axes = len(self.span)
-        for k in range(axes * math.ceil(modes / axes)):  # along each axis as many
+        for k in range(axes * math.ceil(modes / axes)):  # equally many along each axis
             axis, number = k % axes, k // axes
             load = _minus(self._flow(axis, self._mode(number)))
             yield Answer("flow", "", axes * self._powers[number][0], load), hats(times)
@@ -230,7 +230,7 @@ class ErrorColumns:
 
     @cached_property
     def _rest(self) -> float:
-        """State that has nothing to lose: the mean at the start."""
+        """Ambient value of losses: the mean initial state."""
         amount = np.asarray(self.model.mass @ self.model.state_space.interpolate(1.0))
         return float(amount @ self.samples.start.u[0] / amount.sum())
 
@@ -238,7 +238,7 @@ class ErrorColumns:
         return self.model.bilinear(lambda u, v, x: shape(x) * grad(u)[axis] * v)
 
     def _halves(self, axis: int) -> Callable[[Any], Any]:
-        """Return a shape that tells two layers apart, from either side with the same size."""
+        """Return a shape of two layers, -0.5 and 0.5 on the two halves along an axis."""
         mesh = self.model.mesh
         return lambda x: np.where(shares(mesh, axis, x[axis]) > 0.5, 0.5, -0.5)
 
@@ -247,7 +247,7 @@ class ErrorColumns:
         return lambda x: np.maximum(1.0 - np.abs(shares(mesh, axis, x[axis]) - place) / wide, 0.0)
 
     def followed(self, one: Passed) -> tuple[Array, list[Array], Array]:
-        """Return the readings of all answers, states at samples, and predicted readings.
+        """Return readings of all responses, states at samples, and predicted readings.
 
         Shapes (samples, sensors, columns), (n,) for each sample, and (samples, sensors).
         """
@@ -257,14 +257,14 @@ class ErrorColumns:
         work = steps * self.count * model.X.dim
         stride = max(math.ceil(work / MOST_WORK), math.ceil(steps / MOST_STEPS))
         begin, first, end = (float(t) for t in (spans[0].start, spans[0].t1, spans[-1].t1))
-        # Courses in time are those of the samples: the first may come long after t0.
+        # Courses in time begin with the samples, the first of which may be long after t0.
         late = max(begin, first - PAUSE * (end - first) / steps)
-        p = self._begun()
-        found = np.full((len(spans), self.observed.size, self.count), np.nan)
+        p = self._initial_values()
+        readings = np.full((len(spans), self.observed.size, self.count), np.nan)
         largest = np.abs(p).max(axis=1)
         states: list[Array] = []
-        predicted = np.empty(found.shape[:2])
-        last, seen = begin, list[Now]()
+        predicted = np.empty(readings.shape[:2])
+        last, nows = begin, list[Now]()
         for number, (x, span) in enumerate(zip(samples.along(one), spans, strict=True)):
             states.append(x.u[0])
             predicted[number] = samples.filter.sensors.observe(x, span.end)[0][0]
@@ -273,43 +273,43 @@ class ErrorColumns:
             if due:
                 moment = span.end.member(0)
                 now = Now(x.u[0], q, moment, rates=_rates(span))
-                seen.append(now)
+                nows.append(now)
                 if t > last:
                     share = max(0.5 * (t + last) - late, 0.0) / (end - late)
                     p = self._advanced(stage, p, now, t - last, share)
                     largest = np.maximum(largest, np.abs(p).max(axis=1))
                     last = t
                 H, _ = self.observed.jacobian(now.u, model.latent.value(q), moment)
-                found[number] = np.asarray(H @ p.T)
+                readings[number] = np.asarray(H @ p.T)
         times = np.array([float(span.t1) for span in spans])
-        # By symmetry some answers do not reach the sensors.
-        found = _filled(found, times)
+        # By symmetry some responses vanish at all sensors.
+        readings = _filled(readings, times)
         for column, most in enumerate(largest):
-            found[:, :, column] = beyond_rounding(found[:, :, column], most)
-        return self._without_unknowns(found, seen), states, predicted
+            readings[:, :, column] = beyond_rounding(readings[:, :, column], most)
+        return self._without_unknowns(readings, nows), states, predicted
 
-    def _begun(self) -> Array:
-        """Return the answers at the start, (columns, n)."""
+    def _initial_values(self) -> Array:
+        """Return the initial responses, shape (columns, n)."""
         p = np.zeros((self.count, self.model.X.dim))
         for column, (answer, _) in zip(self.first, self.answers, strict=True):
             if answer.start is not None:
                 p[column] = answer.start
         return p
 
-    def _without_unknowns(self, found: Array, nows: Sequence[Now]) -> Array:
-        """Return answers without the effect of an unknown, which is no error of the model."""
-        some = np.linspace(0, len(nows) - 1, min(COMPARED, len(nows))).astype(int)
-        for number in self._of_unknowns([nows[k] for k in some]):
+    def _without_unknowns(self, readings: Array, nows: Sequence[Now]) -> Array:
+        """Return readings of responses without effects of unknowns, which are not model errors."""
+        compared = np.linspace(0, len(nows) - 1, min(COMPARED, len(nows))).astype(int)
+        for number in self._of_unknowns([nows[k] for k in compared]):
             first, (_, course) = self.first[number], self.answers[number]
             own = slice(first, first + course.size)
-            found[:, :, own] = course.varying(found[:, :, own])
-        return found
+            readings[:, :, own] = course.varying(readings[:, :, own])
+        return readings
 
     def _of_unknowns(self, nows: Sequence[Now]) -> list[int]:
-        """Return the answers whose loads are those of changed constant unknowns, at some moments.
+        """Return the responses whose loads equal those of constant unknowns at these moments.
 
-        An error of that shape and a wrong value of the unknown are one thing, as a steady flow is
-        where the velocity is unknown.
+        Such an error cannot be distinguished from a wrong value of the unknown: for example, a
+        steady flow if the velocity is unknown.
         """
         reduction = self.samples.filter.reduction
         free = self.model.X.free * self.model.state_space.of_fields
@@ -323,7 +323,7 @@ class ErrorColumns:
         if not sizes.any():
             return []
         known = np.array(changes)[sizes > 0.0] / sizes[sizes > 0.0, None]
-        basis, found = scipy.linalg.orth(known.T), list[int]()
+        basis, numbers = scipy.linalg.orth(known.T), list[int]()
         for number, (answer, _) in enumerate(self.answers):
             if answer.load is None or answer.kind == "unknown":
                 continue
@@ -331,11 +331,11 @@ class ErrorColumns:
             size = float(np.linalg.norm(own))
             rest = float(np.linalg.norm(own - basis @ (basis.T @ own)))
             if size > 0.0 and rest <= ALIKE * size:
-                found.append(number)
-        return found
+                numbers.append(number)
+        return numbers
 
     def _advanced(self, stage: ForwardStage, p: Array, now: Now, h: float, share: float) -> Array:
-        """Return the answers a time h later, shape (columns, n)."""
+        """Return the responses after a time h, shape (columns, n); `share`: fraction of the run."""
         loads, lifts = np.zeros_like(p), np.zeros_like(p)
         for first, (answer, course) in zip(self.first, self.answers, strict=True):
             own, weights = slice(first, first + course.size), course.at(share)[:, None]
@@ -349,10 +349,10 @@ class ErrorColumns:
 
 
 def beyond_rounding(values: Array, terms: Array) -> Array:
-    """Return values, or zeros where all of them are rounding of the terms they are sums of.
+    """Return values, or zeros if all values are rounding errors of their terms.
 
-    The average over errors scales each column to the size of the noise: one of rounding alone, as
-    that of a flow across a state that does not vary along it, would count as an error.
+    The average over errors scales each column to the size of the noise. A column of rounding, such
+    as a flow along which the state is constant, would count as an error.
     """
     largest, of = (float(np.fmax.reduce(np.abs(one), axis=None)) for one in (values, terms))
     return np.zeros_like(values) if math.isfinite(of) and largest <= ROUNDING * of else values
@@ -364,7 +364,7 @@ def _minus(matrix: Any) -> Load:
 
 
 def _by_state(stiffness: Any) -> Load:
-    """Return the load of a conductivity that varies with the state about its mean."""
+    """Return the load of a conductivity that is linear in the state about its mean."""
     bent = _minus(0.5 * stiffness)
     return lambda now: bent(now._replace(u=(now.u - now.u.mean()) ** 2))
 
@@ -383,17 +383,17 @@ def _late(lift: Array, name: str) -> Load:
 
 
 def _scaled(model: Model, name: str) -> Load:
-    """Return the load of a channel that is larger by its own size."""
+    """Return the derivative of the load in a relative change of a channel."""
 
     def load(now: Now) -> Array:
-        more = scaled_channel(model, name, now, STEP) / STEP
-        return beyond_rounding(more, force(model, now) / STEP)
+        change = scaled_channel(model, name, now, STEP) / STEP
+        return beyond_rounding(change, force(model, now) / STEP)
 
     return load
 
 
 def _changed(model: Model, direction: Array) -> Load:
-    """Return the derivative of the load by a latent unknown."""
+    """Return the derivative of the load along a direction of the latent unknowns."""
 
     def load(now: Now) -> Array:
         driven = model.form_A.product("v", "q", direction, now.moment, q=now.q, u=now.u)
@@ -403,7 +403,7 @@ def _changed(model: Model, direction: Array) -> Load:
 
 
 def _rates(span: Any) -> dict[str, float]:
-    """Return the change of each input in a unit of time over an interval."""
+    """Return the rate of change of each input over an interval."""
     h = float(span.t1 - span.start)
     if not h > 0.0:
         return {}
@@ -412,7 +412,7 @@ def _rates(span: Any) -> dict[str, float]:
 
 
 def _filled(values: Array, times: Array) -> Array:
-    """Return values along axis 0 with straight lines where they are NaN."""
+    """Return values with NaN replaced by linear interpolation along axis 0."""
     known = np.isfinite(values[:, 0, 0]) if values.size else np.ones(len(values), dtype=bool)
     if known.all():
         return values
@@ -421,6 +421,6 @@ def _filled(values: Array, times: Array) -> Array:
     low = np.floor(places).astype(int)
     high = np.minimum(low + 1, known.sum() - 1)
     share = (places - low)[:, None]
-    some = flat[known]
-    found: Array = (1.0 - share) * some[low] + share * some[high]
-    return found.reshape(values.shape)
+    rows = flat[known]
+    filled: Array = (1.0 - share) * rows[low] + share * rows[high]
+    return filled.reshape(values.shape)

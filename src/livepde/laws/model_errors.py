@@ -1,10 +1,10 @@
-"""Intervals of the unknowns that allow for errors of the model.
+"""Intervals of the unknowns that allow for model errors.
 
-What errors would do to the readings makes the columns of a linear model: those of the process are
-answers to it (`livepde.laws.error_columns`), those of sensors are added here. Single causes have
-one column each, families many, with an amplitude for each shape in space and course in time. See
-`livepde.verdict.evidence` for the average over them. Where the stored samples cannot be fitted
-again, they are those of single causes on the innovations, from the sums of the verdict.
+The effects of errors on the readings are the columns of a linear model. Columns of process errors
+are responses of the process (`livepde.laws.error_columns`); columns of sensor errors are computed
+here. A single cause has one column; a family has an amplitude for each shape in space and course in
+time. `livepde.verdict.evidence` averages over them. If the stored samples cannot be refitted, the
+intervals follow from the effects of single causes on the innovations, from the sums of the verdict.
 """
 
 from __future__ import annotations
@@ -47,42 +47,42 @@ from livepde.verdict.evidence import (
 )
 from livepde.verdict.model_errors import USUAL, Allowed, ModelErrors
 
-MANY = 150  # samples that tell apart what the full list has
-MOST_COLUMNS = 250  # of the process in the full list
-MOST_SENSORS = 12  # with slow noise of their own
+MANY = 150  # least number of samples for the full list of errors, to distinguish its members
+MOST_COLUMNS = 250  # number of process columns in the full list, for an estimate of the work
+MOST_SENSORS = 12  # maximum number of sensors with separate slow noise
 CAUSE_SIZES = (1.0, 4.0, 16.0, 64.0, 256.0)  # standard deviations of the noise
 FAMILY_SIZES = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 JOINT_SIZES = (1.0, 10.0, 100.0)
 JOINT = (("source", "conductivity"), ("source", "sensors"), ("source", "sensors", "conductivity"))
-BESIDE_SIZES = (4.0, 64.0)  # of a family beside a single cause
+BESIDE_SIZES = (4.0, 64.0)  # sizes of a family in combination with a single cause
 BESIDE = (("source",), ("common",), ("sensors",))
 TIMES = (1.0 / 30.0, 1.0 / 6.0, 2.0, math.inf)  # correlation times over the length of the run
-MOST_GAIN = 0.3  # standard deviation of the scale of a sensor that is plausible
-FARTHEST = 0.1  # the same of its place, over the length of the domain
-RESPONSE = 1.0 / 30.0  # of the run: time constant of a slow sensor, as the shortest of `TIMES`
-FEWEST = 20  # readings
-SAME_ERROR = 1e-3  # relative difference of two errors of a sensor that are one
-NEAR = 0.03  # posterior standard deviations within which a trajectory is that of the best fit
-QUANTILE = 1.96  # standard deviations to the end of a 95 % interval
-SHRINK = 10.0  # pairs of readings that the stated noise counts
+MOST_GAIN = 0.3  # plausible standard deviation of the relative scale of a sensor
+FARTHEST = 0.1  # plausible standard deviation of a position, over the length of the domain
+RESPONSE = 1.0 / 30.0  # time constant of a slow sensor over the length of the run, as in `TIMES`
+FEWEST = 20  # least number of readings
+SAME_ERROR = 1e-3  # relative difference below which two errors of a sensor are equal
+NEAR = 0.03  # distance of a trajectory from the best fit that is negligible, in posterior std
+QUANTILE = 1.96  # half width of a 95 % interval in standard deviations
+SHRINK = 10.0  # weight of the configured noise variance, as a number of pairs of readings
 OVERFLOW = "the answers of the process to errors overflow"
-LEAST_LEVEL = 0.01  # least variance of the noise over the stated one that is believed
+LEAST_LEVEL = 0.01  # lower bound of an estimated noise variance over the configured variance
 
 
 def _sensor_columns(
     samples: StoredSamples, predicted: Array, states: Sequence[Array]
 ) -> Iterator[tuple[Array, float]]:
-    """Iterate over errors of single sensors, and of all: effect on readings, largest size.
+    """Iterate over errors of single sensors and of all sensors: effect on readings, largest size.
 
     Effects have shape (samples, sensors), in the unit of the readings. The largest size is a
-    standard deviation of the amplitude that is plausible.
+    plausible standard deviation of the amplitude.
     """
     times = samples.times
     share = (times - times[0]) / max(float(np.ptp(times)), 1e-300)
     count, sensors = predicted.shape
-    # A sensor that moves may have no place at first.
-    seen = np.isfinite(predicted)
-    change = predicted - predicted[seen.argmax(axis=0), np.arange(sensors)]
+    # The first positions of a moving sensor may be missing.
+    finite = np.isfinite(predicted)
+    change = predicted - predicted[finite.argmax(axis=0), np.arange(sensors)]
     change = _beyond_rounding(change, predicted)
     rate = np.gradient(change, times, axis=0) if count > 1 else np.zeros_like(predicted)
     problem = samples.filter.problem
@@ -112,21 +112,21 @@ def _sensor_columns(
 
 
 def _slow(times: Array, values: Array, constant: float) -> Array:
-    """Return values at times as sensors of first order with a time constant show them.
+    """Return the readings of first-order sensors with a time constant.
 
-    Between two samples, values are straight lines. NaN stays where it is.
+    Values are interpolated linearly between samples. NaN values remain NaN.
     """
-    found = values.copy()
+    readings = values.copy()
     for k in range(1, len(times)):
         h = (times[k] - times[k - 1]) / constant
         rise = (values[k] - values[k - 1]) / h
-        now = values[k] - rise + math.exp(-h) * (found[k - 1] - values[k - 1] + rise)
-        found[k] = np.where(np.isfinite(now), now, values[k])
-    return found
+        now = values[k] - rise + math.exp(-h) * (readings[k - 1] - values[k - 1] + rise)
+        readings[k] = np.where(np.isfinite(now), now, values[k])
+    return readings
 
 
 def _beyond_rounding(values: Array, terms: Array) -> Array:
-    """Return `beyond_rounding` of each column."""
+    """Apply `beyond_rounding` to each column."""
     each = zip(values.T, np.broadcast_to(terms, values.shape).T, strict=True)
     return np.column_stack([beyond_rounding(own, of) for own, of in each])
 
@@ -134,10 +134,10 @@ def _beyond_rounding(values: Array, terms: Array) -> Array:
 def _misplaced(
     problem: Problem, states: Sequence[Array]
 ) -> Iterator[tuple[Array, Array, tuple[Array, Array]]]:
-    """Iterate over the axes along which sensors may be off.
+    """Iterate over the axes along which sensors may be misplaced.
 
-    Slopes of the readings there, (samples, sensors), usual shifts, and depths from either end of
-    the domain, (sensors,).
+    Each item has slopes of the readings, (samples, sensors), usual shifts of the sensors, and their
+    distances to both ends of the domain, (sensors,).
     """
     positions = stated_positions(problem.observed)
     shifts, step = sensor_shifts(problem.model, problem.observed)
@@ -152,7 +152,7 @@ def _misplaced(
 
 
 def _slow_noise(times: Array, sensors: int, count: int) -> tuple[Array, Array]:
-    """Return slow noise common to all sensors, and of each, (samples, sensors, columns)."""
+    """Return slow noise, common to all sensors and of each sensor, (samples, sensors, columns)."""
     share = (times - times[0]) / max(float(np.ptp(times)), 1e-300)
     each = np.array([hats(count).at(s) for s in share.tolist()])
     together = np.repeat(each[:, None, :], sensors, axis=1)
@@ -163,16 +163,16 @@ def _slow_noise(times: Array, sensors: int, count: int) -> tuple[Array, Array]:
 def _root(modes: Array, count: int, time: float) -> Array:
     """Return a square root of the covariance of amplitudes of hat functions in time.
 
-    For each mode in space, with variance 1/(1 + mode)^2, an Ornstein-Uhlenbeck process, or a
-    constant.
+    Each mode in space is an Ornstein-Uhlenbeck process in time, or constant if `time` is infinite,
+    with variance 1/(1 + mode)^2.
     """
     nodes = np.arange(count) / max(count - 1, 1)
-    each = np.ones((count, count))
+    covariance = np.ones((count, count))
     if not math.isinf(time):
-        each = np.exp(-np.abs(nodes[:, None] - nodes) / time)
-    sizes, axes = np.linalg.eigh(each)
-    one = axes * np.sqrt(np.maximum(sizes, 0.0))
-    return np.kron(np.diag(1.0 / (1.0 + modes)), one)
+        covariance = np.exp(-np.abs(nodes[:, None] - nodes) / time)
+    sizes, axes = np.linalg.eigh(covariance)
+    root = axes * np.sqrt(np.maximum(sizes, 0.0))
+    return np.kron(np.diag(1.0 / (1.0 + modes)), root)
 
 
 Roots: TypeAlias = Callable[[float], Array]
@@ -193,34 +193,34 @@ def _families(known: Mapping[str, tuple[IntArray, Roots]]) -> Iterator[Family]:
 def model_errors(
     samples: StoredSamples, options: Refit, std: Array, shift: Array
 ) -> ModelErrors | str:
-    """Return misfit and intervals that allow for errors of the model, or why there are none.
+    """Return misfit and intervals that allow for model errors, or the reason why there are none.
 
     `std`, `shift`: reported standard deviations of the latent unknowns, and their shifts by the
     discretisation, (m,).
     """
-    found = _best(samples, options)
-    if found is None:
+    best = _best(samples, options)
+    if best is None:
         return "a step of the model fails at the best fit"
-    one, used = found
+    fit, used = best
     if used.sum() < FEWEST:
         return f"fewer than {FEWEST} readings are in use"
     start, reduction = samples.start, samples.filter.reduction
     T = reduction.Phi @ start.C[0].T
-    model, causes, families = linear_model(samples, one, used, T)
+    model, causes, families = linear_model(samples, fit, used, T)
     mixture = averaged(model, causes, families).widened(shift)
     low, high = mixture.interval
     if not np.isfinite([low, high]).all():
         return OVERFLOW
-    noise = _noise_of_each(one.residuals, used)
+    noise = _noise_of_each(fit.residuals, used)
     narrow = np.sqrt(model.asked[1] + shift**2)
     base = start.q[0]
     return ModelErrors(
-        misfit=_rms((one.residuals / noise)[used]),
-        of_signal=_of_signal(samples.readings, one.residuals, used),
+        misfit=_rms((fit.residuals / noise)[used]),
+        of_signal=_of_signal(samples.readings, fit.residuals, used),
         sensors={
             name: _rms(column[there]) / float(own)
             for name, column, there, own in zip(
-                samples.filter.problem.observed.names, one.residuals.T, used.T, noise, strict=True
+                samples.filter.problem.observed.names, fit.residuals.T, used.T, noise, strict=True
             )
             if there.any()
         },
@@ -234,10 +234,10 @@ def model_errors(
 def errors_of_innovations(
     filter_: Filter, x: FilterState, ranges: Array, std: Array, shift: Array
 ) -> ModelErrors | str:
-    """Return the same from the innovations of a run whose samples cannot be fitted again.
+    """Return misfit and intervals from the innovations of a run that cannot be refitted.
 
-    The average is over errors of single sensors and of the process that the verdict looks for, and
-    has no families. `ranges`: of the readings of each sensor, (sensors,).
+    The average is over the single causes of the verdict, of sensors and of the process, without
+    families. `ranges`: range of the readings of each sensor, (sensors,).
     """
     judge, ledger = filter_.judge, x.ledger
     if judge is None or not ledger.seen[0]:
@@ -247,7 +247,7 @@ def errors_of_innovations(
     count, squares = ledger.noise[0, 0], ledger.noise[2, 0]
     if count.sum() < FEWEST:
         return f"fewer than {FEWEST} readings are in use"
-    moved = Phi @ (x.C[0].T @ w[0])  # truth less estimate by each cause
+    moved = Phi @ (x.C[0].T @ w[0])  # truth minus estimate for each cause
     most = judge.dictionary.plausible(MOST_GAIN, FARTHEST)
     mixture = averaged_causes(ledger, moved, most, std).widened(shift)
     low, high = mixture.interval
@@ -256,11 +256,11 @@ def errors_of_innovations(
     there = count > 0.0
     count, squares, level = (part[there] for part in (count, squares, levels(ledger)[0]))
     known = filter_.estimate(x)[0]
-    # Noise that is larger than stated is no error of the model.
+    # Noise above its configured level is not a model error.
     typical = max(weighted_median(level, count), 1.0)
     plain = np.hypot(math.sqrt(typical) * np.linalg.norm(Phi @ x.C[0].T, axis=1), shift)
     span = ranges[there] / (np.sqrt(x.level[0]) * filter_.noise[there])
-    signal = math.sqrt((count * span**2).sum() / 12.0)  # of readings that fill their range
+    signal = math.sqrt((count * span**2).sum() / 12.0)  # if readings are uniform in their range
     each = np.sqrt(squares / count / level)
     names = np.array(filter_.problem.observed.names)[there].tolist()
     return ModelErrors(
@@ -272,20 +272,20 @@ def errors_of_innovations(
 
 
 def _best(samples: StoredSamples, options: Refit) -> tuple[Passed, Mask] | None:
-    """Return the samples about the best fit, and the readings in use; None if a step fails."""
-    one = samples.about(samples.reached)
-    if one is None:
+    """Return the pass about the best fit, and a mask of the readings in use; None if it fails."""
+    fit = samples.about(samples.reached)
+    if fit is None:
         return None
-    used = plausible(samples, options, one) & np.isfinite(one.residuals)
-    # Coordinates of an uncertain start are no unknowns: they are those of the linear model.
-    H, g = one.model(used)
+    used = plausible(samples, options, fit) & np.isfinite(fit.residuals)
+    # Coordinates of an uncertain start are not unknowns: the linear model determines them.
+    H, g = fit.model(used)
     sizes, axes = principal(H)
     step = axes @ (axes.T @ g / sizes)
     if not samples.start.U.any() or step @ H @ step < NEAR**2:
-        return one, used
-    better = samples.about(samples.within_bounds(one.xi + step))
-    if better is None or better.cost(used) > one.cost(used):
-        return one, used
+        return fit, used
+    better = samples.about(samples.within_bounds(fit.xi + step))
+    if better is None or better.cost(used) > fit.cost(used):
+        return fit, used
     return better, plausible(samples, options, better) & np.isfinite(better.residuals)
 
 
@@ -294,44 +294,44 @@ def _rms(values: Array) -> float:
 
 
 def _of_signal(readings: Array, residuals: Array, used: Mask) -> float:
-    """Return the misfit over the scatter of the readings of each sensor about their mean."""
+    """Return the misfit over the scatter of the readings about the mean of their sensor."""
     about = [column[there] - column[there].mean() for column, there in _columns(readings, used)]
     signal = _rms(np.concatenate(about))
     return _rms(residuals[used]) / signal if signal > 0.0 else math.inf
 
 
 def _columns(values: Array, used: Mask) -> Iterator[tuple[Array, Mask]]:
-    """Iterate over the sensors that have readings in use."""
+    """Iterate over the sensors with readings in use: values, and mask of the readings in use."""
     for column, there in zip(values.T, used.T, strict=True):
         if there.any():
             yield column, there
 
 
 def _read(model: Model) -> set[str]:
-    """Return the unknowns that equation or initial state read: the others are errors of sensors.
+    """Return the unknowns in the equation or initial state: the others are errors of sensors.
 
-    Probed at a drawn state, with all inputs one.
+    The derivatives are tested at a random state, with all inputs equal to 1.
     """
     rng = np.random.default_rng(0)
     latent, inputs = model.latent, Inputs(dict.fromkeys(model.channels, 1.0))
     moment, u = Moment(0.3, inputs), rng.uniform(0.5, 1.5, model.X.dim)
     q = latent.value(latent.prior + latent.deviations * rng.standard_normal(latent.dim))
-    with np.errstate(all="ignore"):  # what is not finite is read
+    with np.errstate(all="ignore"):  # an entry that is not finite counts as nonzero
         parts = [model.physical_A.matrix("v", "q", moment, u=u, q=q)]
         if (form := model.form_initial) is not None:
             parts.append(form.matrix("v", "q", moment, q=latent.prior))
-    fields = model.state_space.of_fields  # a slow sensor alone reads its time constant
-    found = np.sum([fields @ abs(part) for part in parts], axis=0)
-    return {name for name in latent.parts if found[model.parameter_space.part(name)].any()}
+    fields = model.state_space.of_fields  # only a slow sensor depends on its time constant
+    effect = np.sum([fields @ abs(part) for part in parts], axis=0)
+    return {name for name in latent.parts if effect[model.parameter_space.part(name)].any()}
 
 
 def _allowed(
     filter_: Filter, x: FilterState, ends: tuple[Array, Array], narrow: Array, std: Array
 ) -> Iterator[Allowed]:
-    """Iterate over the unknowns, with intervals that allow for errors of the model.
+    """Iterate over the unknowns with intervals that allow for model errors.
 
-    `ends`: of these, of the latent unknowns. `narrow`, `std`: standard deviations by the noise
-    alone, and those that are reported.
+    `ends`: ends of the intervals of the latent unknowns. `narrow`, `std`: standard deviations from
+    the noise alone, and reported standard deviations.
     """
     problem, reduction = filter_.problem, filter_.reduction
     latent = problem.model.latent
@@ -339,15 +339,15 @@ def _allowed(
     corrections = {name for name, unknown in scalars.items() if unknown.corrects}  # of inputs
     own = (latent.parts.keys() - _read(problem.model)) | corrections
     known = reduction.bounded(filter_.estimate(x)[0])
-    # An interval about a value beyond a bound is one about the bound: the half within it is left.
+    # An interval whose centre violates a bound is shifted to the bound, and clipped there.
     middle = 0.5 * (ends[0] + ends[1])
     beyond = reduction.bounded(middle) - middle
     wide = (ends[0] + beyond, ends[1] + beyond)
     both = (known, *wide, known - QUANTILE * std, known + QUANTILE * std)
     value, low_end, high_end, plain_low, plain_high = (
-        latent.value(reduction.bounded(one)) for one in both
+        latent.value(reduction.bounded(point)) for point in both
     )
-    # The plain interval is wider where innovations follow each other: it is a part of this one.
+    # Correlated innovations widen the reported interval: the result contains it in any case.
     ends = np.minimum(low_end, plain_low), np.maximum(high_end, plain_high)
     widths = 2.0 * QUANTILE * narrow
     wider = (both[2] - both[1]) / np.where(widths > 0.0, widths, np.inf)
@@ -356,29 +356,30 @@ def _allowed(
         labels = item.block.labels(name)
         prior, unit = item.unknown.prior, item.unknown.unit
         usual = USUAL * float(prior.latent_std) if prior.symmetric else 0.0
-        shown = [one[part] for one in (value, *ends, plain_low, plain_high)]
-        every = np.array([*shown, wider[item.part][: item.size]])  # of harmonics, the constant
+        rows = [values[part] for values in (value, *ends, plain_low, plain_high)]
+        table = np.array([*rows, wider[item.part][: item.size]])  # harmonics: the constant part
         if len(labels) != item.size:  # a field
-            labels, every = [name], _root_mean_squares(every)[:, None]
-        for label, numbers in zip(labels, every.T.tolist(), strict=True):
+            labels, table = [name], _root_mean_squares(table)[:, None]
+        for label, numbers in zip(labels, table.T.tolist(), strict=True):
             yield Allowed.of(label, unit, numbers, usual=usual, of_sensor=name in own)
 
 
 def _root_mean_squares(every: Array) -> Array:
-    """Return size, ends of both intervals and their ratio of a field, from those of its numbers."""
+    """Return the root mean squares over a field of value, interval ends and width ratio."""
     value, *ends, wider = every
-    size, ratio = (float(np.sqrt((one**2).mean())) for one in (value, wider))
-    off = [float(np.sqrt(((end - value) ** 2).mean())) for end in ends]
-    return np.array([size, size - off[0], size + off[1], size - off[2], size + off[3], ratio])
+    size, ratio = (float(np.sqrt((values**2).mean())) for values in (value, wider))
+    widths = [float(np.sqrt(((end - value) ** 2).mean())) for end in ends]
+    low, high, plain_low, plain_high = widths
+    return np.array([size, size - low, size + high, size - plain_low, size + plain_high, ratio])
 
 
 def linear_model(
     samples: StoredSamples, one: Passed, used: Mask, T: Array
 ) -> tuple[LinearModel, Causes, list[Family]]:
-    """Return the readings in use as a linear model, and what may be wrong.
+    """Return a linear model of the readings in use, and the possible errors.
 
-    `one`, `used`: the best fit, and the readings that it uses. `T`: what is asked for, as rows on
-    the coordinates xi, (numbers, r).
+    `one`, `used`: best fit, and readings in use. `T`: linear map from the coordinates xi to the
+    requested numbers, (numbers, r).
     """
     work = len(samples) * samples.filter.problem.model.X.dim
     fine = len(samples) >= MANY and work * MOST_COLUMNS < MOST_WORK
@@ -400,9 +401,8 @@ def linear_model(
         return np.arange(place - flat.shape[1], place)
 
     own = add(answers)
-    columns_of = zip(errors.first, errors.answers, strict=True)
     family: dict[str, list[tuple[float, IntArray, int]]] = {}
-    for first, (answer, course) in columns_of:
+    for first, (answer, course) in zip(errors.first, errors.answers, strict=True):
         columns = own[first : first + course.size]
         if answer.kind in ("source", "conductivity", "flow"):
             family.setdefault(answer.kind, []).append((answer.mode, columns, course.size))
@@ -425,7 +425,7 @@ def linear_model(
     J = J[used]
     z = (one.residuals / level)[used] + J @ one.xi
     Z = np.concatenate(parts, axis=1)
-    # Beside a missing position of a sensor that moves, rates are not known.
+    # Rates are unknown next to a missing position of a moving sensor.
     known = np.isfinite(Z).all(axis=1)
     J, z, Z = J[known], z[known], Z[known]
     columns, most = map(np.array, zip(*causes, strict=True))
@@ -434,9 +434,9 @@ def linear_model(
 
 
 def _basis_of_sensors(samples: StoredSamples, J: Array) -> Array:
-    """Return an orthonormal basis of what unknowns of sensors do to the readings, (readings, k).
+    """Return an orthonormal basis of the effects of sensor unknowns on readings, (readings, k).
 
-    `J`: derivatives of these by the coordinates xi, (readings, r).
+    `J`: derivatives of the readings in the coordinates xi, (readings, r).
     """
     filter_ = samples.filter
     model, own = filter_.problem.model, np.zeros(filter_.reduction.size, dtype=bool)
@@ -446,17 +446,17 @@ def _basis_of_sensors(samples: StoredSamples, J: Array) -> Array:
     if not own.any():
         return np.zeros((len(J), 0))
     by_unknown = J @ np.linalg.pinv(samples.start.C[0].T)
-    some = by_unknown[:, own]
-    some[~np.isfinite(some).all(axis=1)] = 0.0
-    sizes = np.linalg.norm(some, axis=0)
-    found: Array = scipy.linalg.orth(some / np.where(sizes > 0.0, sizes, 1.0))
-    return found
+    effects = by_unknown[:, own]
+    effects[~np.isfinite(effects).all(axis=1)] = 0.0
+    sizes = np.linalg.norm(effects, axis=0)
+    basis: Array = scipy.linalg.orth(effects / np.where(sizes > 0.0, sizes, 1.0))
+    return basis
 
 
 def _beyond(effect: Array, basis: Array) -> Array:
-    """Return an effect, (readings, 1), or zeros if it is that of an unknown of a sensor.
+    """Return an effect, (readings, 1), or zeros if it equals the effect of a sensor unknown.
 
-    An error that is an unknown is no error of the model: its prior says how large it may be.
+    An unknown is not a model error: its prior determines its size.
     """
     known = np.where(np.isfinite(effect), effect, 0.0)
     rest = known - basis @ (basis.T @ known)
@@ -465,27 +465,27 @@ def _beyond(effect: Array, basis: Array) -> Array:
 
 
 def _level(residuals: Array, used: Mask) -> float:
-    """Return the noise that successive residuals show, over the noise that is stated.
+    """Return the noise estimated from successive residuals, over the configured noise.
 
-    That of the median reading: so the weights of the sensors stay those of the estimate, and one
-    that has hardly a reading counts for little.
+    The result is the median over all readings. The relative weights of the sensors remain those of
+    the estimate, and sensors with few readings have little influence.
     """
-    found = [(_variance(column[there]), there.sum()) for column, there in _columns(residuals, used)]
-    return math.sqrt(weighted_median(*np.transpose(found)))
+    each = [(_variance(column[there]), there.sum()) for column, there in _columns(residuals, used)]
+    return math.sqrt(weighted_median(*np.transpose(each)))
 
 
 def _noise_of_each(residuals: Array, used: Mask) -> Array:
-    """Return the noise that successive residuals of each sensor show, over the stated one.
+    """Return the noise of each sensor from successive residuals, over the configured noise.
 
-    Few readings are taken to have the noise of the others. NaN for a sensor without one.
+    The estimate of a sensor with few readings is close to `_level`; without readings it is NaN.
     """
-    usual, found = _level(residuals, used) ** 2, np.full(residuals.shape[1], np.nan)
+    usual, noise = _level(residuals, used) ** 2, np.full(residuals.shape[1], np.nan)
     for k in np.flatnonzero(used.any(axis=0)):
-        found[k] = math.sqrt(_variance(residuals[used[:, k], k], usual))
-    return found
+        noise[k] = math.sqrt(_variance(residuals[used[:, k], k], usual))
+    return noise
 
 
 def _variance(residuals: Array, usual: float = 1.0) -> float:
-    """Return the variance that successive residuals of a sensor show, over the stated one."""
+    """Return the variance of successive residuals over the configured one, shrunk to `usual`."""
     squares = 0.5 * float((np.diff(residuals) ** 2).sum())
     return max((squares + SHRINK * usual) / (len(residuals) - 1 + SHRINK), LEAST_LEVEL)
