@@ -1,4 +1,4 @@
-"""Errors that a column of the data may have, in words, and the settings of a case against them."""
+"""Errors of columns of the data: units, sentences, and the case settings that correct them."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ TEMPERATURES = ("degC", "degF", "K")
 
 
 class Unit(NamedTuple):
-    """A unit that a column may have."""
+    """A unit that a column may have instead of its expected unit."""
 
-    # The unit, and the expected one; empty if they are not known.
+    # Actual and expected unit; empty if unknown.
     name: str
     expected: str
-    # Of the conversion of its values.
+    # Conversion of values to the expected unit: factor times value plus constant.
     factor: float
     constant: float
-    # How many times too large or too small its values are; NaN where only their sign is turned.
+    # Ratio, > 1, by which values are too large or too small; NaN for other conversions.
     times: float = np.nan
 
 
@@ -32,7 +32,7 @@ UNITS: tuple[Unit, ...] = (
     Unit("degC", "degF", 1.8, 32.0),
     Unit("K", "degC", 1.0, -273.15),
     Unit("degC", "K", 1.0, 273.15),
-    Unit("", "", -1.0, 0.0),  # counted in the other direction
+    Unit("", "", -1.0, 0.0),  # opposite sign
     *(
         Unit("", "", power, 0.0, times)
         for times in (10.0, 100.0, 1000.0, 60.0, 3600.0, 3.6)
@@ -42,9 +42,9 @@ UNITS: tuple[Unit, ...] = (
 
 
 def units_of(expected: str, *, scaled: bool) -> list[int]:
-    """Return the numbers of the units in which a quantity may be; its unit is empty if not known.
+    """Return the numbers in `UNITS` of the possible units; `expected` is empty if unknown.
 
-    `scaled`: whether a temperature may be counted in tenths, say, or with the opposite sign.
+    `scaled`: whether a temperature may have another factor, such as tenths, or the opposite sign.
     """
     temperature = expected in TEMPERATURES
 
@@ -56,28 +56,28 @@ def units_of(expected: str, *, scaled: bool) -> list[int]:
 
 @dataclass(frozen=True)
 class Error:
-    """An error of a column, or of two."""
+    """An error of one column, or an exchange of two columns."""
 
     kind: str  # "offset", "gain", "lag", "unit" or "exchange"
-    names: tuple[str, ...]  # the columns
-    # Of an offset in the unit of the column, of a gain as a factor less one, of a lag in time.
+    names: tuple[str, ...]  # names of the columns
+    # Offset in the unit of the column, gain as a factor minus one, or lag in time.
     size: float = 0.0
     unit: int = 0  # number in `UNITS`
 
     @property
     def numbers(self) -> int:
-        """How many numbers of it are free."""
+        """Number of free parameters."""
         return int(self.kind in ("offset", "gain", "lag"))
 
     @property
     def correction(self) -> tuple[float, float]:
-        """Factor and constant with which the values of a gain, or in a unit, are right."""
+        """Factor and constant that correct the values of a gain or unit error."""
         unit = UNITS[self.unit]
         return (1.0 / (1.0 + self.size), 0.0) if self.numbers else (unit.factor, unit.constant)
 
 
 def cause_of(error: Error, share: float, unit: str, time_unit: str, *, of_sensor: bool) -> Cause:
-    """Return an error that explains a share of a misfit as a cause; `unit`: of its column."""
+    """Return the cause of a share of the misfit for an error; `unit`: unit of the column."""
     kind, first, size, (factor, _) = error.kind, error.names[0], error.size, error.correction
     variant, positive = kind, size > 0
     more: dict[str, object] = {"other": error.names[-1], "table": table_of(first)}
@@ -97,7 +97,7 @@ def cause_of(error: Error, share: float, unit: str, time_unit: str, *, of_sensor
 
 
 def _setting(error: Error, variant: str, time_unit: str, *, of_sensor: bool) -> str:
-    """Return the settings of a case that correct a column; empty if there are none."""
+    """Return the case settings that correct a column; empty if no setting does."""
     first, size, factor = error.names[0], error.size, f"{error.correction[0]:.6g}"
     if error.kind == "exchange":
         pairs = (error.names, error.names[::-1])
@@ -115,7 +115,7 @@ def _setting(error: Error, variant: str, time_unit: str, *, of_sensor: bool) -> 
 
 
 def _unit_variant(error: Error) -> str:
-    """Return whether a column is in a unit that is known, has another sign, or another factor."""
+    """Return the variant of a unit error: "unit" if the unit is known, "sign" or "factor"."""
     if UNITS[error.unit].name:
         return "unit"
     return "sign" if error.correction[0] < 0.0 else "factor"

@@ -1,13 +1,13 @@
-"""Whether one column of the data explains a misfit: late, off, scaled, turned, exchanged ...
+"""Search for an error of one column that explains a misfit: lag, offset, gain, unit, exchange.
 
-An error of a column is tried on the stored samples themselves: the column is corrected, and the
-model is fitted again. So inputs and sensors are compared alike, and lags and units are exact.
-An error of one size theta, which changes the residuals by g, first gets the size where the linear
-model of the samples has its minimum. With H = I + J^T J and h = J^T g at the best fit,
+Each candidate error is corrected in the stored samples, and the model is refitted. So inputs and
+sensors are treated alike, and lags and units are exact. The initial size theta of an error, which
+changes the residuals by g per unit, minimises the linear model of the samples. With
+H = I + J^T J and h = J^T g at the best fit,
 
     theta = -g r / (g g - h H^-1 h),
 
-and the cost falls by (g r)^2 / (2 (g g - h H^-1 h)). The most promising errors are fitted.
+and the cost decreases by (g r)^2 / (2 (g g - h H^-1 h)). The most promising errors are fitted.
 """
 
 from __future__ import annotations
@@ -34,45 +34,45 @@ from livepde.verdict import Cause
 from livepde.verdict.directions import boundary_lifts
 
 FEWEST_ROWS, FEWEST_READINGS = 20, 40
-MOST_WORK = 4e8  # coefficients of states that all passes may compute
-PASSES = 6  # over the samples that a fit may take
-ROUNDS = 4  # fits of an error whose size changes from one to the next
-# Errors of each kind that are fitted, at most; and what the linear model must promise of a further
-# one, over the first: an early boundary looks like a late sensor next to it.
+MOST_WORK = 4e8  # maximum number of coefficients of states in all passes
+PASSES = 6  # maximum number of passes over the samples in a fit
+ROUNDS = 4  # maximum number of fits to improve the size of an error
+# Maximum number of fitted errors of each kind, and least predicted decrease of the cost for another
+# error, relative to the first: an early boundary resembles a late sensor next to it.
 TRIED = {"unit": 1, "exchange": 2, "offset": 1, "gain": 2, "lag": 2}
 RIVAL = 0.8
-STEP = 0.02  # of the range of a column, or of its size: the error of which g is taken
-LONGEST = 0.2  # of the samples, by which a column may be late
-PLAIN = 0.02  # range of a column over its size below which it is constant
-SAME = 1e-6  # of an interval: times that are the same but for rounding
-SETTLED = 0.02  # relative change of a size that is none
-# Of the misfit, and of the noise: within the smaller one nothing is left to explain, and the error
-# with fewer numbers is likelier.
+STEP = 0.02  # error for the difference quotient g, relative to the range or size of a column
+LONGEST = 0.2  # longest lag of a column, as a fraction of the number of samples
+PLAIN = 0.02  # range of a column, relative to its size, below which it is constant
+SAME = 1e-6  # difference of times, relative to an interval, that is rounding
+SETTLED = 0.02  # relative change of the size of an error at which it has converged
+# Shares of the misfit and of the noise: the smaller value is a negligible misfit. Within it, the
+# error with fewer free parameters is preferred.
 CLOSE, SLIGHT = 0.05, 0.2
-# Where unknowns move: samples that a filter follows in a pass, and in all passes; the share of a
-# misfit that is worth a word, and how many such errors are named.
+# If unknowns move: maximum number of samples in a filter pass, and of steps in all passes; least
+# share of the misfit of a reported error, and maximum number of reported errors.
 MOST_FOLLOWED, MOST_STEPS = 300, 20_000
 SOME, NAMED = 0.1, 3
-LAGS = 16  # passes of a search for a longer lag, at most
-SLIGHT_LAG = 0.02  # share that a lag of one sample has to explain before longer ones are tried
+LAGS = 16  # maximum number of passes in a search for a longer lag
+SLIGHT_LAG = 0.02  # least share explained by a lag of one sample before longer lags are tried
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """The stored samples of one member as columns that may be wrong."""
+    """The stored samples of one member, whose columns may have errors."""
 
     # Parts of the law without gate, and the member with the first samples of its window.
     work: SensitivityWork
     state: SensitivityState
-    places: dict[str, int]  # column of the log of each sensor and each input
+    places: dict[str, int]  # column of each sensor and each input in the log
     inputs: tuple[str, ...]  # names of the inputs
-    options: Refit  # those of a fit
+    options: Refit  # options of a fit
 
     @classmethod
     def of(cls, work: SensitivityWork, state: SensitivityState) -> Columns | str:
-        """Return the columns of one member, or why they cannot be looked at."""
+        """Return the columns of one member, or the reason why they cannot be tested."""
         why, options = work.unstored(state), work.refit
-        if work.tried and state.trial.shape[1]:  # noise of inputs is that of the readings here
+        if work.tried and state.trial.shape[1]:  # input noise is treated as noise of readings
             why, state = "", work.tried_samples(state)
         if why or options is None:
             return why
@@ -97,7 +97,7 @@ class Columns:
 
     @property
     def _without_wild(self) -> Columns:
-        """The same without readings that are far off all others."""
+        """The columns without outliers among the readings."""
         samples = StoredSamples.of(self.work, self.state)
         wild = ~(near_neighbours(samples.readings, WILD) & near_most(samples.readings, WILD))
         log, first = self.state.log.copy(), self.state.log.shape[1] - len(wild)
@@ -107,7 +107,7 @@ class Columns:
     def samples(self, error: Error | None = None, *, from_prior: bool = False) -> StoredSamples:
         """Return the samples, with the columns of an error corrected.
 
-        A fit of them begins at the last fit, or at the prior mean.
+        A fit of these samples starts at the last fit, or at the prior mean if `from_prior`.
         """
         state = self.state if error is None else self.corrected(error)
         begun = changed(state, now=self.state.start) if from_prior else state
@@ -122,11 +122,11 @@ class Columns:
             for k, name in enumerate(names):
                 if name not in self.inputs:
                     continue
-                # A sensor has no reading where the stored samples begin; an input needs a value.
+                # An input requires values in all rows, a sensor has none at the first row.
                 known = np.flatnonzero(np.isfinite(values[:, k]))
                 last = np.searchsorted(known, np.arange(len(values)), side="right") - 1
                 values[:, k] = values[known[np.maximum(last, 0)], k]
-            if not set(names) & set(self.inputs):  # the noise of a reading goes with it
+            if not set(names) & set(self.inputs):  # the noise of readings is exchanged, too
                 noise = [place + len(self.work.filter.noise) for place in at]
                 log[0][:, noise] = log[0][:, noise[::-1]]
         elif error.kind == "offset":
@@ -136,29 +136,29 @@ class Columns:
         else:
             factor, constant = error.correction
             values = factor * values + constant
-            if names[0] not in self.inputs:  # else readings that shrink to nothing would fit best
+            if names[0] not in self.inputs:  # otherwise readings scaled to zero would fit best
                 log[0][:, at[0] + len(self.work.filter.noise)] *= abs(factor)
         log[0][:, at] = values
         return changed(self.state, log=log, start=self._start(log, names))
 
     def _start(self, log: Array, names: Sequence[str]) -> FilterState:
-        """Return the start with other columns: an initial state that is made of readings moves."""
-        start, made = self.state.start, self.work.filter.problem.initial_readings
+        """Return the start for a corrected log: readings may determine the initial state."""
+        start, initial = self.state.start, self.work.filter.problem.initial_readings
         if not self.state.opening[0]:
             return start
-        for name in set(names) & set(made):
+        for name in set(names) & set(initial):
             old, new = (rows[0][:, self.places[name]] for rows in (self.state.log, log))
             there = np.isfinite(old) & np.isfinite(new)
             shift = (new - old)[there][:1].sum()
-            start = changed(start, u=start.u + shift * made[name].weight)
+            start = changed(start, u=start.u + shift * initial[name].weight)
         return start
 
     def _later(self, name: str, values: Array, by: float) -> Array:
-        """Return the values of a column that come later by a time; NaN stays where it is."""
+        """Return a column evaluated at times later by `by`; NaN values remain NaN."""
         t, held = self.state.log[0, :, 0], self.work.filter.problem.control.held
         seen = np.isfinite(values)
         known, times, asked = values[seen], t[seen], t + by
-        near = SAME * self.interval  # late by whole samples, a row is met but for rounding
+        near = SAME * self.interval  # a lag of whole samples meets a row up to rounding
         if name in held.last:
             place = np.searchsorted(times, asked + near, side="right") - 1
         elif name in held.next:
@@ -168,19 +168,19 @@ class Columns:
         return np.where(seen, known[np.clip(place, 0, len(known) - 1)], np.nan)
 
     def whole(self, name: str) -> bool:
-        """Whether a column can only be late by whole samples.
+        """Return whether the lag of a column must be a whole number of samples.
 
-        Readings between two samples would have less noise, and what is held changes with a row.
+        Readings interpolated between samples would have less noise; held inputs change with a row.
         """
         return name not in self.inputs or name in self.work.filter.problem.control.held
 
     def column(self, name: str) -> Array:
-        """Return the values of a column that are there."""
+        """Return the finite values of a column."""
         values: Array = self.state.log[0, :, self.places[name]]
         return values[np.isfinite(values)]
 
     def unit(self, name: str) -> str:
-        """Return the unit of a sensor or an input, of the state for its boundary values; or ""."""
+        """Return the unit of a column, or ""; a boundary value has the unit of the state."""
         problem = self.work.filter.problem
         observed, single = problem.observed, problem.model.state_space.single
         if single and name in self.inputs and name in boundary_lifts(problem.model):
@@ -189,14 +189,14 @@ class Columns:
         return (problem.model.channel_units | sensors).get(name, "")
 
     def cause(self, error: Error, share: float) -> Cause:
-        """Return an error that explains a share of the misfit as a cause."""
+        """Return the cause for an error that explains a share of the misfit."""
         problem, first = self.work.filter.problem, error.names[0]
         of_sensor, time_unit = first in problem.observed.names, problem.model.time_unit
         return cause_of(error, share, self.unit(first), time_unit, of_sensor=of_sensor)
 
     @property
     def pairs(self) -> Iterator[tuple[str, str]]:
-        """Columns that may have been exchanged: of another kind they have nothing in common."""
+        """Pairs of columns that may be exchanged: both of the state, or with overlapping ranges."""
         boundary = self.work.filter.problem.model.boundary_values
         states = set(self.places) - set(self.inputs)
         states |= {value.name for value in boundary if isinstance(value, Channel)}
@@ -210,7 +210,7 @@ class Columns:
 
     @property
     def without_size(self) -> Iterator[Error]:
-        """Errors that have no size: other units that are known, and exchanges."""
+        """Errors without a size: known units instead of the expected ones, and exchanges."""
         for name in self.places:
             expected = self.unit(name)
             for number, unit in enumerate(UNITS):
@@ -221,12 +221,12 @@ class Columns:
 
     @property
     def interval(self) -> float:
-        """The usual time between samples."""
+        """The median time between samples."""
         return float(np.median(np.diff(self.state.log[0, :, 0])))
 
 
 def _lacking(log: Array, sensors: int, most: int) -> str:
-    """Return why so few rows of samples tell nothing of a column; empty if they are enough."""
+    """Return the reason why there are too few rows to test columns; empty if there are enough."""
     if most < FEWEST_ROWS:
         return "the mesh is too large, or the columns are too many, to try each"
     if np.isfinite(log[0, :, 1 : 1 + sensors]).sum() < FEWEST_READINGS:
@@ -235,11 +235,11 @@ def _lacking(log: Array, sensors: int, most: int) -> str:
 
 
 def _most_rows(work: SensitivityWork, columns: int, inputs: int) -> int:
-    """Return how many samples all passes can afford, with so many columns and inputs of them."""
-    # At two places: errors of each input, a search for its lag, and all exchanges with an input.
+    """Return the maximum number of samples for the work of all passes; `inputs` of `columns`."""
+    # At two fits: errors of each input, a search for its lag, and exchanges with an input.
     passes = 2 * inputs * (3 + columns + LAGS) + PASSES * ROUNDS * sum(TRIED.values())
     most = MOST_TRIED
-    if work.filter.moves:  # units, exchanges, and lags of one sample and of more
+    if work.filter.moves:  # units, exchanges, lags of one sample and longer lags
         passes = columns * (5 + columns // 2) + LAGS * TRIED["lag"]
         most = min(MOST_FOLLOWED, MOST_STEPS // passes)
     each = work.filter.problem.model.X.dim * (1 + work.filter.reduction.size)
@@ -248,7 +248,7 @@ def _most_rows(work: SensitivityWork, columns: int, inputs: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """The quadratic model of the cost about a trajectory, and its minimum."""
+    """Quadratic model of the cost about a trajectory, and its minimum."""
 
     one: Passed
     columns: Array
@@ -267,7 +267,7 @@ class _Fit:
         return cls(one, one.slopes[used], np.asarray(inverse), step, cost)
 
     def freed(self, g: Array) -> tuple[float, float]:
-        """Return by how much the cost falls if residuals may change along g, and the size."""
+        """Return the decrease of the cost by a change of the residuals along g, and its size."""
         there = np.isfinite(self.one.residuals)
         along = np.where(np.isfinite(g), g, 0.0)[there]
         r = self.one.residuals[there] - self.columns @ self.step
@@ -279,27 +279,27 @@ class _Fit:
         return 0.5 * num**2 / den, -num / den
 
 
-@nonfinite_allowed()  # such an error explains nothing
+@nonfinite_allowed()  # a fit that overflows explains nothing
 def likely_columns(columns: Columns, least: float) -> list[Cause]:
     """Return the errors of columns that explain most of the misfit, the likeliest first.
 
-    None where the misfit is less than `least` times the noise.
+    The list is empty if the misfit is less than `least` times the noise.
     """
     if columns.work.filter.moves:
         return _likely_filtered(columns, least)
     samples, search = columns.samples(), _Trials(columns)
-    found = search.refitted(samples)
-    if found is None:
+    fit = search.refitted(samples)
+    if fit is None:
         return []
-    base = _Fit.about(found.best)
-    noise = _noise(found.best.residuals)
+    base = _Fit.about(fit.best)
+    noise = _noise(fit.best.residuals)
     misfit = 2.0 * base.cost - noise
     if not misfit > least * noise:
         return []
-    # Where a column is grossly wrong the best fit is no place to ask what is.
-    prior = samples.about(0.0 * found.best.xi)
-    places = [base] if prior is None else [base, _Fit.about(prior)]
-    promising = [item for at in places for item in search.promising(at, base.cost)]
+    # With a gross error the best fit is biased: errors are linearised about the prior mean, too.
+    prior = samples.about(0.0 * fit.best.xi)
+    points = [base] if prior is None else [base, _Fit.about(prior)]
+    promising = [item for at in points for item in search.promising(at, base.cost)]
     tried = _varied(sorted(promising, key=lambda item: -item[0]))
     close = min(CLOSE, SLIGHT * noise / misfit)
     kept = search.explaining(tried, close, lambda cost: 1.0 - (2.0 * cost - noise) / misfit)
@@ -308,7 +308,7 @@ def likely_columns(columns: Columns, least: float) -> list[Cause]:
 
 
 class _Trials:
-    """The errors of some columns, and the misfit that each explains."""
+    """Candidate errors of columns, and the share of the misfit that each explains."""
 
     def __init__(self, columns: Columns) -> None:
         self.columns = columns
@@ -317,30 +317,30 @@ class _Trials:
         self.vain = len(self.base) if columns.state.fit.screened[0] else 0
 
     def refitted(self, samples: StoredSamples) -> Found | None:
-        """Return the end of a search; it begins at no other points where that was no use before."""
-        found = refitted(samples, self.options, last=False, screened=self.vain)
-        if found is not None and found.screened:
+        """Return the fit of samples; further starting points are skipped if they failed before."""
+        fit = refitted(samples, self.options, last=False, screened=self.vain)
+        if fit is not None and fit.screened:
             self.vain = len(samples)
-        return found
+        return fit
 
     def explaining(
         self, tried: Sequence[Error], close: float, share_of: Callable[[float], float]
     ) -> list[tuple[float, Error]]:
-        """Return errors as they were fitted, and the share of the misfit that each explains.
+        """Return the fitted errors, and the share of the misfit that each explains.
 
-        `close`: a share that is nothing. `share_of`: the share, from the cost of a fit.
+        `close`: negligible share. `share_of`: function from the cost of a fit to the share.
         """
         kept: list[tuple[float, Error]] = []
         for error in tried:
-            if any(share >= 1.0 - close and one.numbers <= error.numbers for share, one in kept):
-                continue  # nothing is left to explain
+            if any(share >= 1.0 - close and e.numbers <= error.numbers for share, e in kept):
+                continue  # a simpler error explains the misfit
             end = self.fitted(error)
             if end is not None:
                 kept.append((share_of(end[0]), end[1]))
         return kept
 
     def promising(self, at: _Fit, cost: float) -> Iterator[tuple[float, Error]]:
-        """Iterate over errors, and by how much they lower a cost by the model about a fit."""
+        """Iterate over errors, and the decrease of the cost in the linear model about a fit."""
         each = [*(self._of_one(at, name) for name in self.columns.places), self._exchanged(at)]
         for gained, error in chain(*each):
             yield cost - at.cost + gained, error
@@ -360,14 +360,14 @@ class _Trials:
                 continue
             slopes[kind] = g / step
             gained, theta = base.freed(slopes[kind])
-            # Correcting by theta changes the residuals by theta g: so the column is off by theta.
+            # A correction by theta changes the residuals by theta g: the error has the size theta.
             yield gained, Error(kind, (name,), self._bounded(kind, name, theta))
         if steps.keys() - slopes.keys() <= {"lag"}:
             units = self._units(base, name, slopes) if driving else self._sensor_units(base, name)
             yield from units
 
     def _steps(self, values: Array) -> dict[str, float]:
-        """Return kind -> size of the errors whose slopes are taken; of a constant, the offset."""
+        """Return kind -> size of the difference quotients; a constant column has only an offset."""
         span, size = float(np.ptp(values)), float(np.abs(values).max())
         steps = {"offset": STEP * (span if span > 0.0 else max(size, 1.0))}
         if span > PLAIN * size:
@@ -375,9 +375,9 @@ class _Trials:
         return steps
 
     def _switched_late(self, base: _Fit, name: str) -> tuple[float, Error]:
-        """Return how late an input is that is held, and by how much that lowers the cost.
+        """Return the decrease of the cost by the best lag of a held input, and the lag.
 
-        A switch has no derivative in time that would say how far it is to go.
+        The lag is searched, because a switch has no derivative in time.
         """
         columns = self.columns
 
@@ -402,17 +402,17 @@ class _Trials:
     def _units(
         self, base: _Fit, name: str, slopes: dict[str, Array]
     ) -> Iterator[tuple[float, Error]]:
-        """Iterate over units that a column may be in, by the linear model of offset and gain."""
+        """Iterate over possible units of an input, by the linear model of offset and gain."""
         values = self.columns.column(name)
         middle = float(values.mean())
         there = np.isfinite(base.one.residuals)
         for number in units_of(self.columns.unit(name), scaled=True):
             _, _, factor, constant, _ = UNITS[number]
-            # values - offset, then divided by 1 + gain: to first order in the change of the column.
+            # The conversion is an offset at the middle and a gain about it, to first order.
             change = (factor * middle + constant) - middle
             g = -change * slopes["offset"]
             if "gain" in slopes:
-                # slopes["gain"] is the change by -values; about the middle it is that of the rest.
+                # slopes["gain"] belongs to a change by -values: subtract its value at the middle.
                 about_middle = slopes["gain"] - middle * slopes["offset"]
                 g = g - (factor - 1.0) * about_middle
             r = (base.one.residuals + np.where(np.isfinite(g), g, 0.0))[there]
@@ -422,14 +422,14 @@ class _Trials:
             yield base.cost - cost, Error("unit", (name,), unit=number)
 
     def _sensor_units(self, base: _Fit, name: str) -> Iterator[tuple[float, Error]]:
-        """Iterate over the same of a sensor: the trajectory is the same."""
-        # A case may have stated the wrong one of two units of temperature.
+        """Iterate over possible units of a sensor, which do not change the trajectory."""
+        # The configured unit of a temperature may be wrong.
         for number in units_of(self.columns.unit(name), scaled=False):
             error = Error("unit", (name,), unit=number)
             yield base.cost - _Fit.about(self._seen(base, error)).cost, error
 
     def _seen(self, base: _Fit, error: Error) -> Passed:
-        """Return the same trajectory as other sensors show it, with the noise of their columns."""
+        """Return the trajectory with residuals and noise for corrected columns of sensors."""
         new, one = self.columns.samples(error), base.one
         ratio = self.base.noise / new.noise
         residuals = new.readings - (self.base.readings - one.residuals) * ratio
@@ -447,7 +447,7 @@ class _Trials:
                 yield base.cost - _Fit.about(one).cost, error
 
     def _change(self, base: _Fit, error: Error) -> Array | None:
-        """Return by how much the correction of a column changes the residuals."""
+        """Return the change of residuals by the correction of a column; None if a step fails."""
         if self._only_sensors(error):
             if error.kind == "lag":
                 return self._lagged(self.base, base.one, error.names[0], error.size)
@@ -456,9 +456,9 @@ class _Trials:
         return None if r is None else r - base.one.residuals
 
     def _lagged(self, samples: StoredSamples, one: Passed, name: str, by: float) -> Array:
-        """Return by how much residuals change if predictions of a sensor come later by a time.
+        """Return the change of the residuals if the predictions of a sensor are delayed by `by`.
 
-        Shifted readings would change by their noise, too, which hides a slow signal.
+        A shift of the readings would also shift their noise, which hides a slow signal.
         """
         predicted, place = samples.readings - one.residuals, self.columns.places[name] - 1
         t, h = samples.times, predicted[:, place]
@@ -470,15 +470,15 @@ class _Trials:
         return not set(error.names) & set(self.columns.inputs)
 
     def _end(self, error: Error, *, from_prior: bool) -> _Fit | None:
-        """Return where a fit with a corrected column ends."""
-        found = self.refitted(self.columns.samples(error, from_prior=from_prior))
-        return None if found is None else _Fit.about(found.best)
+        """Return the fit with a corrected column; None if it fails."""
+        fit = self.refitted(self.columns.samples(error, from_prior=from_prior))
+        return None if fit is None else _Fit.about(fit.best)
 
     def fitted(self, error: Error) -> tuple[float, Error] | None:
-        """Return the cost of a fit with a corrected column, and the error, its size improved.
+        """Return the cost of a fit with a corrected column, and the error with improved size.
 
-        It begins at the last fit, which may be far off with the right columns, or at the prior
-        mean, whichever ends better.
+        The fit starts at the last fit or the prior mean, whichever reaches the lower cost: with
+        correct columns, the last fit may be a poor start.
         """
         ends = {prior: self._end(error, from_prior=prior) for prior in (False, True)}
         costs = {prior: np.inf if end is None else end.cost for prior, end in ends.items()}
@@ -491,32 +491,32 @@ class _Trials:
             cost, used = fit.cost, error
             if not error.numbers:
                 break
-            again = self._improved(fit, error)
-            if again is None or abs(again.size - error.size) <= SETTLED * abs(again.size):
+            improved = self._improved(fit, error)
+            if improved is None or abs(improved.size - error.size) <= SETTLED * abs(improved.size):
                 break
-            error = again
+            error = improved
         return cost, used
 
     def _improved(self, fit: _Fit, error: Error) -> Error | None:
-        """Return an error with the size where the linear model about it has its minimum."""
+        """Return an error with the size at the minimum of the linear model about it."""
         columns, values = self.columns, self.columns.column(error.names[0])
         step = {"offset": STEP * max(float(np.ptp(values)), 1e-12), "gain": STEP}
         h = step.get(error.kind, columns.interval)
         if error.kind == "lag" and self._only_sensors(error):
             change = self._lagged(columns.samples(error), fit.one, error.names[0], h)
         else:
-            more = columns.samples(replace(error, size=error.size + h)).residuals(fit.one.xi)
-            if more is None:
+            shifted = columns.samples(replace(error, size=error.size + h)).residuals(fit.one.xi)
+            if shifted is None:
                 return None
-            change = more - fit.one.residuals
+            change = shifted - fit.one.residuals
         _, theta = fit.freed(change / h)
         return replace(error, size=self._bounded(error.kind, error.names[0], error.size + theta))
 
 
 def _likely_filtered(columns: Columns, least: float) -> list[Cause]:
-    """Return the same where unknowns move, so that a filter has to follow the samples.
+    """Return the likely errors if unknowns move, by filter passes over the samples.
 
-    Offsets and gains are known from the innovations. A lag is looked for in steps that double.
+    Offsets and gains follow from the innovations: only units, exchanges and lags are searched.
     """
     e = _innovations(columns, columns.state)
     if e is None:
@@ -527,46 +527,46 @@ def _likely_filtered(columns: Columns, least: float) -> list[Cause]:
         return []
 
     def share(error: Error) -> float:
-        found = _innovations(columns, columns.corrected(error))
-        return -np.inf if found is None else 1.0 - (float(np.nansum(found**2)) - noise) / misfit
+        new = _innovations(columns, columns.corrected(error))
+        return -np.inf if new is None else 1.0 - (float(np.nansum(new**2)) - noise) / misfit
 
     kept = [(share(error), error) for error in columns.without_size]
     longest = int(LONGEST * columns.state.log.shape[1])
     lags = [_Lag(name, columns.interval, longest, share) for name in columns.places]
     lags = sorted(lags, key=lambda lag: -lag.of(lag.first))[: TRIED["lag"]]
     kept += [lag.best for lag in lags if lag.of(lag.first) > SLIGHT_LAG]
-    kept = sorted((one for one in kept if one[0] > SOME), key=lambda one: -one[0])[:NAMED]
-    return [columns.cause(error, found) for found, error in kept]
+    kept = sorted((item for item in kept if item[0] > SOME), key=lambda item: -item[0])[:NAMED]
+    return [columns.cause(error, explained) for explained, error in kept]
 
 
 @dataclass(frozen=True, eq=False)
 class _Lag:
-    """How late a column may be, in whole samples."""
+    """Search for the lag of a column, in whole samples."""
 
     name: str
     interval: float
-    longest: int  # samples
-    share: Callable[[Error], float]  # of the misfit that an error explains
+    longest: int  # maximum number of samples
+    share: Callable[[Error], float]  # objective to maximise, such as the explained share
     known: dict[int, float] = field(default_factory=dict)
 
     def error(self, count: int) -> Error:
-        """Return the error of a column that is so many samples late."""
+        """Return the error of a column with a lag of `count` samples."""
         return Error("lag", (self.name,), count * self.interval)
 
     def of(self, count: int) -> float:
-        """Return the share that such an error explains."""
+        """Return the objective for a lag of `count` samples."""
         if count not in self.known:
             self.known[count] = self.share(self.error(count)) if count else 0.0
         return self.known[count]
 
     @property
     def first(self) -> int:
-        """One sample, late or early, whichever explains more."""
+        """The better lag of -1 and 1 samples."""
         return max((-1, 1), key=self.of)
 
     @property
     def best(self) -> tuple[float, Error]:
-        """The error that explains most, looked for in steps that double, and then halve."""
+        """Objective and error of the best lag, by a search with doubling, then halving steps."""
         best = self.first
         while abs(2 * best) <= self.longest and self.of(2 * best) > self.of(best):
             best *= 2
@@ -579,28 +579,28 @@ class _Lag:
 
 def _innovations(columns: Columns, state: SensitivityState) -> Array | None:
     """Return normalised innovations of stored samples, (samples, sensors); None if a step fails."""
-    # A noise that is found would grow with a misfit, and hide it.
+    # An adaptive noise level would grow with a misfit, and hide it.
     work = replace(
         columns.work.unaccompanied, options=replace(columns.work.options, adaptive=False)
     )
-    x, found = unaccompanied(state.start), []
+    x, rows = unaccompanied(state.start), []
     for interval in intervals_since(state.log, work.filter.problem.channels):
         x, report = filtered(work, x, interval)
         if not report.status.ok:
             return None
         x = work.filter.relinearised(x)
         measured = np.isfinite(interval.z1)
-        found.append(np.where(measured, x.innovations.newest[0], np.nan))
-    return np.array(found)
+        rows.append(np.where(measured, x.innovations.newest[0], np.nan))
+    return np.array(rows)
 
 
 def _varied(tried: Sequence[tuple[float, Error]]) -> list[Error]:
-    """Return the most promising errors of each kind, those without free numbers first."""
+    """Return the most promising errors of each kind, errors without free parameters first."""
     kept: list[Error] = []
     first: dict[str, float] = {}
     for gained, error in tried:
         same = [other for other in kept if other.kind == error.kind]
-        new = all((one.names, one.unit) != (error.names, error.unit) for one in same)
+        new = all((other.names, other.unit) != (error.names, error.unit) for other in same)
         promises = gained > 0.0 and gained >= RIVAL * first.setdefault(error.kind, gained)
         if promises and new and len(same) < TRIED[error.kind]:
             kept.append(error)
@@ -608,7 +608,7 @@ def _varied(tried: Sequence[tuple[float, Error]]) -> list[Error]:
 
 
 def _noise(residuals: Array) -> float:
-    """Return the sum of squares of the noise, as successive differences show it."""
+    """Return the sum of squares of the noise, estimated from successive differences."""
     total = 0.0
     for column in residuals.T:
         r = column[np.isfinite(column)]
