@@ -157,14 +157,14 @@ class Columns:
         """Return a column evaluated at times later by `by`; NaN values remain NaN."""
         t, held = self.state.log[0, :, 0], self.work.filter.problem.control.held
         seen = np.isfinite(values)
-        known, times, asked = values[seen], t[seen], t + by
+        known, times, later = values[seen], t[seen], t + by
         near = SAME * self.interval  # a lag of whole samples meets a row up to rounding
         if name in held.last:
-            place = np.searchsorted(times, asked + near, side="right") - 1
+            place = np.searchsorted(times, later + near, side="right") - 1
         elif name in held.next:
-            place = np.searchsorted(times, asked - near, side="left")
+            place = np.searchsorted(times, later - near, side="left")
         else:
-            return np.where(seen, np.interp(asked, times, known), np.nan)
+            return np.where(seen, np.interp(later, times, known), np.nan)
         return np.where(seen, known[np.clip(place, 0, len(known) - 1)], np.nan)
 
     def whole(self, name: str) -> bool:
@@ -250,28 +250,28 @@ def _most_rows(work: SensitivityWork, columns: int, inputs: int) -> int:
 class _Fit:
     """Quadratic model of the cost about a trajectory, and its minimum."""
 
-    one: Passed
-    columns: Array
+    passed: Passed
+    slopes: Array
     inverse: Array
     step: Array
     cost: float
 
     @classmethod
-    def about(cls, one: Passed) -> _Fit:
-        used = np.isfinite(one.residuals)
-        H, g = one.model(used)
+    def about(cls, passed: Passed) -> _Fit:
+        used = np.isfinite(passed.residuals)
+        H, g = passed.model(used)
         sizes, axes = principal(H)
         inverse = (axes / sizes) @ axes.T
         step = inverse @ g
-        cost = one.cost(used) - 0.5 * float(g @ step)
-        return cls(one, one.slopes[used], np.asarray(inverse), step, cost)
+        cost = passed.cost(used) - 0.5 * float(g @ step)
+        return cls(passed, passed.slopes[used], np.asarray(inverse), step, cost)
 
     def freed(self, g: Array) -> tuple[float, float]:
         """Return the decrease of the cost by a change of the residuals along g, and its size."""
-        there = np.isfinite(self.one.residuals)
+        there = np.isfinite(self.passed.residuals)
         along = np.where(np.isfinite(g), g, 0.0)[there]
-        r = self.one.residuals[there] - self.columns @ self.step
-        h = self.columns.T @ along
+        r = self.passed.residuals[there] - self.slopes @ self.step
+        h = self.slopes.T @ along
         den = float(along @ along - h @ self.inverse @ h)
         if not den > 1e-9 * float(along @ along):
             return 0.0, 0.0
@@ -300,7 +300,7 @@ def likely_columns(columns: Columns, least: float) -> list[Cause]:
     prior = samples.about(0.0 * fit.best.xi)
     points = [base] if prior is None else [base, _Fit.about(prior)]
     promising = [item for at in points for item in search.promising(at, base.cost)]
-    tried = _varied(sorted(promising, key=lambda item: -item[0]))
+    tried = _selected(sorted(promising, key=lambda item: -item[0]))
     close = min(CLOSE, SLIGHT * noise / misfit)
     kept = search.explaining(tried, close, lambda cost: 1.0 - (2.0 * cost - noise) / misfit)
     kept.sort(key=lambda item: close * item[1].numbers - item[0])
@@ -314,13 +314,13 @@ class _Trials:
         self.columns = columns
         self.options = replace(columns.options, passes=min(columns.options.passes, PASSES))
         self.base = columns.samples()
-        self.vain = len(self.base) if columns.state.fit.screened[0] else 0
+        self.screened = len(self.base) if columns.state.fit.screened[0] else 0
 
     def refitted(self, samples: StoredSamples) -> Found | None:
         """Return the fit of samples; further starting points are skipped if they failed before."""
-        fit = refitted(samples, self.options, last=False, screened=self.vain)
+        fit = refitted(samples, self.options, last=False, screened=self.screened)
         if fit is not None and fit.screened:
-            self.vain = len(samples)
+            self.screened = len(samples)
         return fit
 
     def explaining(
@@ -341,11 +341,11 @@ class _Trials:
 
     def promising(self, at: _Fit, cost: float) -> Iterator[tuple[float, Error]]:
         """Iterate over errors, and the decrease of the cost in the linear model about a fit."""
-        each = [*(self._of_one(at, name) for name in self.columns.places), self._exchanged(at)]
+        each = [*(self._candidates(at, name) for name in self.columns.places), self._exchanged(at)]
         for gained, error in chain(*each):
             yield cost - at.cost + gained, error
 
-    def _of_one(self, base: _Fit, name: str) -> Iterator[tuple[float, Error]]:
+    def _candidates(self, base: _Fit, name: str) -> Iterator[tuple[float, Error]]:
         columns, values = self.columns, self.columns.column(name)
         if len(values) < FEWEST_ROWS // 2:
             return
@@ -382,8 +382,8 @@ class _Trials:
         columns = self.columns
 
         def gained(error: Error) -> float:
-            one = columns.samples(error).about(base.one.xi)
-            return -np.inf if one is None else base.cost - _Fit.about(one).cost
+            passed = columns.samples(error).about(base.passed.xi)
+            return -np.inf if passed is None else base.cost - _Fit.about(passed).cost
 
         longest = int(LONGEST * columns.state.log.shape[1])
         return _Lag(name, columns.interval, longest, gained).best
@@ -405,7 +405,7 @@ class _Trials:
         """Iterate over possible units of an input, by the linear model of offset and gain."""
         values = self.columns.column(name)
         middle = float(values.mean())
-        there = np.isfinite(base.one.residuals)
+        there = np.isfinite(base.passed.residuals)
         for number in units_of(self.columns.unit(name), scaled=True):
             _, _, factor, constant, _ = UNITS[number]
             # The conversion is an offset at the middle and a gain about it, to first order.
@@ -415,8 +415,8 @@ class _Trials:
                 # slopes["gain"] belongs to a change by -values: subtract its value at the middle.
                 about_middle = slopes["gain"] - middle * slopes["offset"]
                 g = g - (factor - 1.0) * about_middle
-            r = (base.one.residuals + np.where(np.isfinite(g), g, 0.0))[there]
-            J, xi = base.columns, base.one.xi
+            r = (base.passed.residuals + np.where(np.isfinite(g), g, 0.0))[there]
+            J, xi = base.slopes, base.passed.xi
             slope = J.T @ r - xi
             cost = 0.5 * float(r @ r + xi @ xi - slope @ base.inverse @ slope)
             yield base.cost - cost, Error("unit", (name,), unit=number)
@@ -426,41 +426,41 @@ class _Trials:
         # The configured unit of a temperature may be wrong.
         for number in units_of(self.columns.unit(name), scaled=False):
             error = Error("unit", (name,), unit=number)
-            yield base.cost - _Fit.about(self._seen(base, error)).cost, error
+            yield base.cost - _Fit.about(self._corrected(base, error)).cost, error
 
-    def _seen(self, base: _Fit, error: Error) -> Passed:
+    def _corrected(self, base: _Fit, error: Error) -> Passed:
         """Return the trajectory with residuals and noise for corrected columns of sensors."""
-        new, one = self.columns.samples(error), base.one
+        new, passed = self.columns.samples(error), base.passed
         ratio = self.base.noise / new.noise
-        residuals = new.readings - (self.base.readings - one.residuals) * ratio
-        return replace(one, residuals=residuals, slopes=one.slopes * ratio[:, :, None])
+        residuals = new.readings - (self.base.readings - passed.residuals) * ratio
+        return replace(passed, residuals=residuals, slopes=passed.slopes * ratio[:, :, None])
 
     def _exchanged(self, base: _Fit) -> Iterator[tuple[float, Error]]:
         columns = self.columns
         for pair in columns.pairs:
             error = Error("exchange", pair)
             if self._only_sensors(error):
-                one: Passed | None = self._seen(base, error)
+                passed: Passed | None = self._corrected(base, error)
             else:
-                one = columns.samples(error).about(base.one.xi)
-            if one is not None:
-                yield base.cost - _Fit.about(one).cost, error
+                passed = columns.samples(error).about(base.passed.xi)
+            if passed is not None:
+                yield base.cost - _Fit.about(passed).cost, error
 
     def _change(self, base: _Fit, error: Error) -> Array | None:
         """Return the change of residuals by the correction of a column; None if a step fails."""
         if self._only_sensors(error):
             if error.kind == "lag":
-                return self._lagged(self.base, base.one, error.names[0], error.size)
-            return self._seen(base, error).residuals - base.one.residuals
-        r = self.columns.samples(error).residuals(base.one.xi)
-        return None if r is None else r - base.one.residuals
+                return self._lagged(self.base, base.passed, error.names[0], error.size)
+            return self._corrected(base, error).residuals - base.passed.residuals
+        r = self.columns.samples(error).residuals(base.passed.xi)
+        return None if r is None else r - base.passed.residuals
 
-    def _lagged(self, samples: StoredSamples, one: Passed, name: str, by: float) -> Array:
+    def _lagged(self, samples: StoredSamples, passed: Passed, name: str, by: float) -> Array:
         """Return the change of the residuals if the predictions of a sensor are delayed by `by`.
 
         A shift of the readings would also shift their noise, which hides a slow signal.
         """
-        predicted, place = samples.readings - one.residuals, self.columns.places[name] - 1
+        predicted, place = samples.readings - passed.residuals, self.columns.places[name] - 1
         t, h = samples.times, predicted[:, place]
         there, change = np.isfinite(h), np.zeros_like(predicted)
         change[:, place] = h - np.interp(t - by, t[there], h[there])
@@ -503,12 +503,12 @@ class _Trials:
         step = {"offset": STEP * max(float(np.ptp(values)), 1e-12), "gain": STEP}
         h = step.get(error.kind, columns.interval)
         if error.kind == "lag" and self._only_sensors(error):
-            change = self._lagged(columns.samples(error), fit.one, error.names[0], h)
+            change = self._lagged(columns.samples(error), fit.passed, error.names[0], h)
         else:
-            shifted = columns.samples(replace(error, size=error.size + h)).residuals(fit.one.xi)
+            shifted = columns.samples(replace(error, size=error.size + h)).residuals(fit.passed.xi)
             if shifted is None:
                 return None
-            change = shifted - fit.one.residuals
+            change = shifted - fit.passed.residuals
         _, theta = fit.freed(change / h)
         return replace(error, size=self._bounded(error.kind, error.names[0], error.size + theta))
 
@@ -594,7 +594,7 @@ def _innovations(columns: Columns, state: SensitivityState) -> Array | None:
     return np.array(rows)
 
 
-def _varied(tried: Sequence[tuple[float, Error]]) -> list[Error]:
+def _selected(tried: Sequence[tuple[float, Error]]) -> list[Error]:
     """Return the most promising errors of each kind, errors without free parameters first."""
     kept: list[Error] = []
     first: dict[str, float] = {}

@@ -12,9 +12,9 @@ the prior (G_Q is divided by the square of `std`). Then the best q given all dat
 
     S ||q - q0||_Q^2 + int ||R^T eps(q)||^2_{D^{-1}} dt.
 
-The recursion of this minimum, recursive least squares for a field, is the second equation of the
-method in the metric of the information, H = S G_Q + J instead of G_Q/gain, with
-J = int A^T R D^{-1} R^T A dt. With M_op = M and theta = PULL/h, r is about -h M^{-1} eps/PULL and
+Recursive least squares compute this minimum: they are the second equation of the method in the
+metric of the information, H = S G_Q + J instead of G_Q/gain. J is the integral of
+A^T R D^{-1} R^T A over time. With M_op = M and theta = PULL/h, r is about -h M^{-1} eps/PULL, and
 depends on the current step alone. The stage solves
 
     H (q - c)/PULL = A(w)^T r + (b - J c - S G_Q (c - q0))/PULL
@@ -50,8 +50,8 @@ grown by more than `STEEPER`. Between updates a step is a quasi-Newton step with
 
 All constants are ratios of equal units: they depend neither on the mesh nor on the sampling rate.
 
-Under these assumptions ||q - q0||_Q^2 is a sum of chi-squares with weights of at most 1, whose sum
-k is at most m and at most trace(G_Q^{-1} J)/S, with J without forgetting. It exceeds
+Under these assumptions ||q - q0||_Q^2 is a sum of chi-squares with weights of at most 1. The sum k
+of the weights is at most m and at most trace(G_Q^{-1} J)/S, J without forgetting. The sum exceeds
 k + 2 sqrt(k s) + 2 s with a probability below exp(-s) (Laurent and Massart 2000). Beyond this
 bound the step holds q and reports "departed"; J, b and S are updated as usual. S does not contain a
 bias that q absorbs, such as the bias of too strong smoothing (`livepde.laws.observed_part`).

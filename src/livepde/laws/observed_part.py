@@ -14,8 +14,8 @@ Its factors on the modes of G and |.| are 1 - f, f = (alpha k/(s + alpha k))^ORD
 smooth functions decreases with ORDER, the bias of noise does not. Both sides of the balance are
 means over the samples so far for each alpha of a grid; alpha is their first intersection.
 
-The noise level is estimated from the rougher half of the modes, in which a smooth state has almost
-no component, by products of successive differences in time,
+The rougher half of the modes, in which a smooth state has almost no component, determines the noise
+level by products of successive differences in time,
 
     E (z_k - z_{k-1}) (z_{k-1} - z_{k-2}) = -sigma^2:
 
@@ -243,16 +243,16 @@ class ObservedPath:
     problem: Problem
     interval: Interval
     find: Find  # function of the readings, and of Dirichlet values or None if all are zero
-    _found: dict[float, Reconstructed] = field(default_factory=dict)
+    _cache: dict[float, Reconstructed] = field(default_factory=dict)
 
     def at(self, t: float) -> Reconstructed:
         """Return u_alpha at a time."""
-        if t not in self._found:
+        if t not in self._cache:
             model, known = self.problem.model, None
             if not model.homogeneous:
                 known = model.impose(np.zeros(model.X.dim), self.interval.at(t))
-            self._found[t] = self.find(self.interval.z(t), known)
-        return self._found[t]
+            self._cache[t] = self.find(self.interval.z(t), known)
+        return self._cache[t]
 
     def diagnostics(self) -> Diagnostics[float]:
         """Return alpha and the misfit at the end of the interval; NaN if not computed."""

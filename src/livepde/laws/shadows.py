@@ -136,21 +136,21 @@ class ShadowSet:
     ) -> ShadowSet:
         process = MeanProcess(problem.control, stage, reduction, moves)
         refused = refusal(problem, options.largest) if options.mesh else "mesh = false"
-        found: list[Shadow] = []
+        shadows: list[Shadow] = []
         if options.step:
-            found.append(StepShadow.of(process, StepTolerance(problem, rows, noise)))
+            shadows.append(StepShadow.of(process, StepTolerance(problem, rows, noise)))
         if not refused:
             # Without a halved mesh the identification continues, and reports the reason as a note.
             try:
-                found.append(MeshShadow.of(process, problem))
+                shadows.append(MeshShadow.of(process, problem))
             except LivepdeError as error:
                 refused = f"there is no halved mesh: {str(error).rstrip('.')}"
         if options.inputs and problem.model.channels:
-            found += input_shadows(process, problem)
+            shadows += input_shadows(process, problem)
         # Steps are divided only if a step shadow estimates their error and the step control allows
         # shorter steps (halvings).
         most = options.parts if options.step and problem.control.halvings else 1
-        return cls(problem, reduction, rows, tuple(found), refused, most)
+        return cls(problem, reduction, rows, tuple(shadows), refused, most)
 
     @property
     def unfollowed(self) -> str:

@@ -10,8 +10,8 @@ solve
 as one system, so that with full data the two terms with A cancel in the energy, as in the paper
 (align:neplusnr). Over omega, w is the data; elsewhere it is the estimate. `StageSolver.evaluate`
 computes both equations, and `Metric` lists further terms of the second equation.
-The residual of the previous stage, times the ratio of its step to the current step, is subtracted
-from both right-hand sides, so that the residuals of consecutive stages do not accumulate.
+Both right-hand sides subtract the residual of the previous stage, times the ratio of its step to
+the current step. So the residuals of consecutive stages do not accumulate.
 
 theta depends on all of r: its derivative is a rank-one term of the Jacobian. If A is nonlinear in
 q, A(w) in the second equation is the derivative in q.
@@ -413,7 +413,7 @@ class StageTerms:
     def limited(self, data: StageData, at: StageIterate, allowed: float) -> bool:
         """Return True if the residual of each equation is within `allowed` or its rounding error.
 
-        Each equation has its own rounding error: the rounding of one must not excuse the other.
+        The bounds are separate: a large rounding error in one must not relax the other.
         """
         left = (at.residual[part] for part in self.parts)
         own = [self.duals([line], part)[0] for line, part in zip(left, self.parts, strict=True)]
@@ -481,7 +481,7 @@ class StageSolver(ABC):
     def evaluate(self, data: StageData, y: Array) -> StageIterate:
         """Return the stage at y = (u, q): (est_exact_u), (est_exact_q), or (noisy_u), (noisy_q).
 
-        The method is defined here alone; `inside`, `outside` and `source` compute A, B and F.
+        Only this function defines the method; `inside`, `outside` and `source` compute A, B and F.
         """
         terms, forms, stage, n = self.terms, self.terms.forms, data.problem, self.terms.n
         u, q = y[:n], y[n:]
