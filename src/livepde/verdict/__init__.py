@@ -1,4 +1,4 @@
-"""Verdict of a run on itself: its level, with the findings against it."""
+"""Verdict on a run: its level, and findings against the estimates."""
 
 from livepde.verdict.assess import REFUSED, Position, assess
 from livepde.verdict.directions import Dictionary, ScoreDirection

@@ -60,49 +60,49 @@ from livepde.verdict.sentences import (
     width,
 )
 
-PRIOR = 1e-4  # probability of an estimate as far from its prior, drawn from it
-LARGER = 1.5  # times the stated noise that is worth a note
-SMALLER = 0.5
-NOISIER = 3.0  # times the noise of the other sensors
-FAR = 3.0  # standard deviations between a sensor that stands still and its prediction
-REFUSED = 0.02  # share of the readings that a gate refuses
-MENDED = 128  # samples of a new window after which a fault may count as mended
-BRIEF = 10  # readings that contradict the model after a pause, say
-STANDS = 10  # equal readings in a row
-MOVES = 1.0  # standard deviations of a shift from which an estimate is not to be trusted
-EXPLAINED = 0.5  # share of the misfit that the first cause explains, else it is not understood
-FACTOR = 2.0  # by which the scale of a sensor or an input may be wrong
-LONGEST = 0.25  # of the run: how late a sensor may be
-SEEN = 4.0  # standard errors of an amplitude from which it shows
-BEYOND = 2.0  # standard deviations of a shift beyond an interval
-UNSEEN = 3  # sentences on errors that no sensor shows
+PRIOR = 1e-4  # p-value of the distance from the prior mean below which there is a finding
+LARGER = 1.5  # residual scatter over the configured noise above which there is a note, and ...
+SMALLER = 0.5  # ... below which there is one
+NOISIER = 3.0  # scatter of a sensor over the typical scatter above which there is a note
+FAR = 3.0  # standard deviations of the noise between a stuck sensor and its prediction
+REFUSED = 0.02  # share of rejected readings above which there is a finding
+MENDED = 128  # samples without evidence after which an earlier fault counts as past
+BRIEF = 10  # most contradicting readings of a short disturbance, such as after a pause
+STANDS = 10  # equal readings in a row of a stuck sensor
+MOVES = 1.0  # shift, in standard deviations, from which an estimate is not usable
+EXPLAINED = 0.5  # share of the misfit from which its first cause accounts for it
+FACTOR = 2.0  # largest plausible error of the scale of a sensor or an input
+LONGEST = 0.25  # largest plausible delay of a sensor, as a share of the run
+SEEN = 4.0  # standard errors from which an amplitude is detectable
+BEYOND = 2.0  # shift, in standard deviations, that exceeds the interval
+UNSEEN = 3  # most sentences on undetectable errors
 
 
 @dataclass(frozen=True, eq=False)
 class Position:
-    """Data on the estimates of one member, for its verdict."""
+    """Estimates of one member, and the data on which its verdict is based."""
 
-    ledger: Ledger  # the ledger of the member: see `Ledger.of_member`
-    # Truth less estimate by each direction of each window, in reported standard deviations:
-    # unknown -> (windows, directions)
+    ledger: Ledger  # ledger of the member, see `Ledger.of_member`
+    # Unknown -> truth minus estimate for a unit amplitude of each direction in each window, in
+    # reported standard deviations, (windows, directions)
     moved: dict[str, Array]
-    # Squared distance of the estimate from the prior mean, chi-square under the model, and its
-    # degrees of freedom
+    # Squared distance of the estimate from the prior mean in the directions that data determine,
+    # chi-square under the model, and its degrees of freedom
     distance: tuple[float, int]
     sensors: Sequence[str]  # names of the sensors
-    noise: Array  # standard deviation of each, as stated
-    # unit, time_unit: of the sensors and of the time
+    noise: Array  # standard deviation of the noise of each sensor that the filter uses
+    # unit, time_unit: units of the readings and of time
     unit: str
     time_unit: str
-    unknowns: Sequence[str]  # label of each reduced unknown that stays
-    moving: bool  # whether unknowns move
-    # Sensors that are set aside: name -> (since when, last reading minus prediction)
+    unknowns: Sequence[str]  # label of each constant reduced unknown
+    moving: bool  # whether unknowns vary in time
+    # Excluded sensors: name -> (time of exclusion, last reading minus prediction)
     aside: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    # apart, strain: how many sensors correct the state but not the unknowns, and the number of
-    # readings of one sensor that did so, since a disturbance began
+    # apart, strain: number of sensors that correct the state but not the unknowns, and number of
+    # readings of one sensor that did so since the disturbance began
     apart: int = 0
     strain: int = 0
-    start_uncertain: bool = False  # whether the initial state has an uncertainty of its own
+    start_uncertain: bool = False  # whether the initial state has its own uncertainty
 
 
 def assess(dictionary: Dictionary, at: Position) -> Verdict:
@@ -120,19 +120,19 @@ def assess(dictionary: Dictionary, at: Position) -> Verdict:
 
 
 def _unseen(dictionary: Dictionary, at: Position) -> list[str]:
-    """Return which errors of sensors would not show, and move an estimate beyond its interval.
+    """Return sentences on undetectable sensor errors that would shift an estimate significantly.
 
-    An error of less than `SEEN` standard errors is not seen, and none is taken larger than the
-    amplitude of its direction, which is a usual size.
+    An error below `SEEN` standard errors is undetectable. Its size is limited to the amplitude of
+    its direction, which is a typical size.
     """
-    # sum g g, the information on each amplitude: its standard error is one over the root.
+    # The information on each amplitude, sum g g, is the inverse square of its standard error.
     den = at.ledger.sums[1, 0].sum(axis=1)
     hidden = np.minimum(SEEN / np.sqrt(np.maximum(den, 1e-300)), 1.0)
     found = []
     for d, direction in enumerate(dictionary.directions):
         if direction.kind not in ("offset", "gain", "lag", "position"):
             continue
-        if f"{direction.kind}[{direction.subject}]" in at.moved:  # it is an unknown itself
+        if f"{direction.kind}[{direction.subject}]" in at.moved:  # it is an estimated unknown
             continue
         for name, moved in at.moved.items():
             shift = float(hidden[d] * abs(moved[0, d]))
@@ -149,8 +149,8 @@ def _unseen(dictionary: Dictionary, at: Position) -> list[str]:
 
 
 def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
-    """Return whether innovations go with a cause more than chance allows."""
-    # By Ville's inequality the mean e-value exceeds 1/alpha with a probability of at most alpha.
+    """Yield the finding on innovations that correlate with a possible cause or with each other."""
+    # By Ville's inequality, the mean e-value exceeds 1/alpha with a probability of at most alpha.
     limit = -math.log(CAUSES)
     recent = _mended(at, evidence)
     if evidence.total < limit:
@@ -162,7 +162,7 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
         text, _ = FINDINGS["past"].filled(count=count)
         yield Finding("past", "note", text, evidence=float(count))
         return
-    # Slow noise alone would look so: no cause may be named, but the intervals have to be wider.
+    # Autocorrelated noise explains the evidence: no cause is named, but the intervals are wider.
     if evidence.whitened < limit:
         worst = float(evidence.correlation.max(initial=0.0))
         text, _ = FINDINGS["following, causes"].filled(correlation=worst)
@@ -180,7 +180,7 @@ def _explained(
     order: Sequence[tuple[int, int]],
     recent: bool,
 ) -> Finding:
-    """Return the finding on a misfit with its possible causes, the likeliest first."""
+    """Return the finding on a misfit, with its plausible causes in order of likelihood."""
     p, e_value = significance(evidence.whitened), _e_value(evidence.whitened)
     if not order:
         text, _ = FINDINGS["misfit, no cause"].filled(p=p)
@@ -188,11 +188,10 @@ def _explained(
     causes = tuple(_cause(dictionary.directions[d], w, evidence, at, d) for w, d in order[:NAMED])
     w, d = order[0]
     shift = _shift(at, evidence, w, d)
-    # A misfit whose cause is understood and moves no unknown leaves the estimate usable.
+    # If the cause of a misfit is understood and shifts no unknown, the estimate remains usable.
     grave = max(map(abs, shift.values()), default=math.inf) >= MOVES
     understood = evidence.share[w, d] >= EXPLAINED
-    # The state forgets where it began, so that later readings determine the unknowns without it.
-    # What they show has another cause, and is no matter of the start.
+    # The effect of the initial state decays, so evidence in later windows has another cause.
     later = evidence.log_e[at.ledger.age < at.ledger.age[0]]
     forgotten = recent or (understood and unsuspicious(later))
     if causes[0].kind == "initial" and not grave and forgotten:
@@ -209,10 +208,10 @@ def _e_value(log_e: float) -> float:
 
 
 def _mended(at: Position, evidence: CauseEvidence) -> bool:
-    """Return whether the evidence against the model is long past.
+    """Return whether only old data contradict the model.
 
-    There is none in the restarted windows: neither in the current ones nor, as long as the longest
-    of them is young, in the one before it.
+    The current restarted windows must be free of evidence. While the longest of them has fewer than
+    `MENDED` samples, so must its predecessor.
     """
     ledger = at.ledger
     if not ledger.epoch[-1] or not (ledger.sound or ledger.age[-1] >= MENDED):
@@ -221,22 +220,22 @@ def _mended(at: Position, evidence: CauseEvidence) -> bool:
 
 
 def _recovered(at: Position, evidence: CauseEvidence, order: Sequence[tuple[int, int]]) -> bool:
-    """Return whether no likely cause has left the estimate off by a standard deviation."""
+    """Return whether no likely cause shifts the current estimate by a standard deviation."""
     limit = -math.log(CAUSES)
     likely = [(w, d) for w, d in order if evidence.log_e[w, d] > limit] or list(order[:NAMED])
     return all(abs(size) < MOVES for w, d in likely for size in _shift(at, evidence, w, d).values())
 
 
 def _shift(at: Position, evidence: CauseEvidence, window: int, number: int) -> dict[str, float]:
-    """Return unknown -> its shift by a direction of the size that was found, in deviations."""
+    """Return unknown -> shift due to a direction with its fitted amplitude, in deviations."""
     size = evidence.size[window, number]
     return {name: float(moved[window, number] * size) for name, moved in at.moved.items()}
 
 
 def _ranked(evidence: CauseEvidence) -> list[tuple[int, int]]:
-    """Return window and number of the directions with evidence, the best first, each once.
+    """Return (window, direction) of each direction with evidence, by decreasing evidence.
 
-    Windows of different length are compared by the share of the whole run's evidence.
+    Each direction is listed once, with the window in which its e-value is largest.
     """
     windows, directions = evidence.log_e.shape
     best: dict[int, tuple[float, int]] = {}
@@ -252,15 +251,12 @@ def _ranked(evidence: CauseEvidence) -> list[tuple[int, int]]:
 def _possible(
     direction: ScoreDirection, window: int, number: int, evidence: CauseEvidence, at: Position
 ) -> bool:
-    """Return whether equation and sensor can have a cause of the size that was found."""
+    """Return whether the fitted amplitude of a cause is physically plausible."""
     size = float(evidence.size[window, number])
     amount = _amount(direction, size, at)
-    if direction.kind in (
-        "loss",
-        "transfer",
-    ):  # one that is known is an unknown of the model, and has no cause
+    if direction.kind in ("loss", "transfer"):  # a missing loss or exchange is positive
         return size > 0.0
-    if direction.kind == "averaging":  # over a length that is positive
+    if direction.kind == "averaging":  # the length is positive
         return size > 0.0 and amount <= direction.most
     if direction.kind in ("gain", "channel"):
         return 1.0 / FACTOR <= 1.0 + amount <= FACTOR
@@ -282,7 +278,7 @@ def _cause(
 
 
 def _amount(direction: ScoreDirection, size: float, at: Position) -> float:
-    """Return how large a cause is, as `Cause.size` has it."""
+    """Return the size of a cause, in the unit of `Cause.size`."""
     interval, typical = float(at.ledger.times[1]), float(np.median(at.noise))
     process = {
         "source": OFFSET * typical / (REACH * interval),
@@ -296,17 +292,17 @@ def _amount(direction: ScoreDirection, size: float, at: Position) -> float:
     }
     if direction.kind in process:
         return size * process[direction.kind]
-    if direction.kind == "averaging":  # what it does grows with the square of the length
+    if direction.kind == "averaging":  # the effect grows with the square of the length
         return math.sqrt(max(size, 0.0)) * direction.size
-    if direction.kind in ("offset", "drift"):  # by the noise that was found, where that is so
+    if direction.kind in ("offset", "drift"):
         return size * OFFSET * float(at.noise[list(at.sensors).index(direction.subject)])
     return size * direction.size
 
 
 def _setting(direction: ScoreDirection, size: float, at: Position) -> str:
-    """Return the setting of a case that frees or corrects a cause of a size; empty if none does.
+    """Return the case setting that estimates or corrects a cause of a size; empty if none does.
 
-    The freed unknown has a prior standard deviation of twice the size.
+    An estimated error has a prior standard deviation of twice the size.
     """
     keys = {"offset": "offset", "gain": "gain", "position": "at_std"}
     if direction.kind in keys:
@@ -335,12 +331,12 @@ def _setting(direction: ScoreDirection, size: float, at: Position) -> str:
 
 
 def _jump(label: str) -> str:
-    """Return the setting of a case that lets an unknown jump."""
+    """Return the case setting that allows an unknown to jump."""
     return f"law.jumps={json.dumps([label.partition('[')[0]])}"
 
 
 def _words(direction: ScoreDirection, size: float, at: Position) -> Sentence:
-    """Return a cause of a size, and its remedy, in words."""
+    """Return a sentence on a cause of a size, with its remedy."""
     name, kind, amount = direction.subject, direction.kind, _amount(direction, size, at)
     unit, positive, more = direction.unit, size > 0.0, dict[str, str]()
     if kind == "lag":
@@ -361,7 +357,7 @@ def _words(direction: ScoreDirection, size: float, at: Position) -> Sentence:
 
 
 def _displaced(direction: ScoreDirection, amount: float) -> str:
-    """Return on which side of its stated place a sensor may be, in words."""
+    """Return a phrase for the displacement of a sensor from its configured position."""
     axis, end = "xyz"[direction.axis], direction.at + amount
     if direction.at * end >= 0.0:
         side = "closer to" if abs(end) < abs(direction.at) else "farther from"
@@ -370,7 +366,7 @@ def _displaced(direction: ScoreDirection, amount: float) -> str:
 
 
 def _following(at: Position, window: int) -> Iterator[Finding]:
-    """Return whether successive errors of a sensor are correlated though no cause explains it."""
+    """Yield the finding on a sensor whose innovations are autocorrelated without a cause."""
     found = following(at.ledger, window)
     if found is None:
         return
@@ -386,9 +382,9 @@ def _following(at: Position, window: int) -> Iterator[Finding]:
 
 
 def _records(at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
-    """Return whether the unknowns changed, and whether sensors disagree on them."""
+    """Yield findings if the unknowns changed, or if sensors imply different values of them."""
     rho = float(evidence.correlation.max(initial=0.0))
-    # Variance of a mean of AR(1) errors over that of independent ones.
+    # Ratio of the variance of a mean of AR(1) errors to that of independent errors.
     wider = (1.0 + rho) / (1.0 - rho)
     severity: Severity = "caution" if _mended(at, evidence) else "do not trust"
     change = constancy(at.ledger, wider)
@@ -408,7 +404,7 @@ def _records(at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
 
 
 def _noise(at: Position) -> Iterator[Finding]:
-    """Return notes on noise that is not as stated: intervals and tests do not depend on it."""
+    """Yield notes on noise that differs from the noise in use: the tests estimate their own."""
     ratio = np.sqrt(levels(at.ledger)[0])
     count = at.ledger.noise[0, 0]
     if not count.any():
@@ -428,7 +424,7 @@ def _noise(at: Position) -> Iterator[Finding]:
 
 def _stuck(at: Position) -> Iterator[Finding]:
     ledger = at.ledger
-    # A steady process repeats readings rightly: a sensor is stuck if the model expects another
+    # Readings of a steady process repeat. A sensor is stuck if the model also predicts another
     # value.
     off = np.abs(ledger.value - ledger.last) / at.noise
     for i in np.flatnonzero((ledger.stuck >= STANDS - 1) & (off > FAR)):
@@ -443,7 +439,7 @@ def _stuck(at: Position) -> Iterator[Finding]:
 
 
 def _aside(at: Position) -> Iterator[Finding]:
-    """Return which sensors are not used, because their readings contradict all else."""
+    """Yield a finding for each excluded sensor."""
     for name, (since, off) in at.aside.items():
         text, remedy = FINDINGS["aside"].filled(
             name=name,
@@ -456,17 +452,17 @@ def _aside(at: Position) -> Iterator[Finding]:
 
 
 def _disturbed(at: Position) -> Iterator[Finding]:
-    """Return whether most readings contradict the model, or did so until a short while ago."""
+    """Yield a finding if most readings contradict the model, or did so until recently."""
     if not at.strain:
         return
     text, remedy = FINDINGS["changed"]
-    # A few readings correct a state that is wrong after a pause: unknowns may stay well.
+    # After a pause, a few readings suffice to correct the state, so the unknowns remain usable.
     severity: Severity = "do not trust" if at.apart or at.strain > BRIEF else "caution"
     yield Finding("changed", severity, text, evidence=float(at.strain), remedy=remedy)
 
 
 def _refused(at: Position) -> Iterator[Finding]:
-    """Return whether the gate refuses more readings than a mishap now and then."""
+    """Yield a finding if the gate rejects more than the share `REFUSED` of the readings."""
     shown, refused = at.ledger.shown
     share = refused.sum() / max(int(shown.sum()), 1)
     if share <= REFUSED:

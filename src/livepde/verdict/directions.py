@@ -1,9 +1,9 @@
-"""Dictionary of causes of misfit: errors of sensors and of the process that the model lacks.
+"""Dictionary of causes of misfit: sensor errors, and terms that are missing in the model.
 
-The free response p of the state to a term that the model lacks (a source, a loss, a boundary
-value), M p' + (B + A q)' p = load, is computed by implicit Euler steps over several samples, and
-its effect on the sensors is interpolated between these steps. The response is needed to a tenth of
-its size, to distinguish causes, and so costs a fraction of a step.
+A term such as a source, a loss or a boundary value changes the state by the free response p, which
+satisfies M p' + (B + A q)' p = load. It is computed by implicit Euler steps that span several
+samples, and its effect on the sensors is interpolated in between. To distinguish causes, 10 %
+accuracy suffices, so that a response costs a fraction of a step.
 """
 
 from __future__ import annotations
@@ -26,35 +26,36 @@ from livepde.observation import CombinedObserved, Observed, Points
 from livepde.stepping import ForwardStage
 from livepde.verdict.ledger import WINDOWS
 
-FIXED = "the fixed boundary"  # constants of the model, which may be wrong as well
+FIXED = "the fixed boundary"  # boundary values that are constants of the model
 
-REACH = 64.0  # samples in which a source of amplitude one moves the state by three times the noise
-DEVIATIONS = 3.0
-SCALED = 0.1  # of a channel of a source or flux
-LOSS = 0.1  # in `REACH` samples
-MOST_STRIDE = 16  # samples of one step
-MOST_ENDS = 4  # boundaries of the mesh that are looked at
-OFFSET = 3.0  # standard deviations of the noise: a direction of amplitude one, for ...
-DRIFT = 64.0  # ... a drift in so many samples
-GAIN = 0.1  # of the change of a sensor since the start
+# Effects of causes of unit amplitude, and limits.
+REACH = 64.0  # samples in which a unit source changes the state by ...
+DEVIATIONS = 3.0  # ... this multiple of the noise
+SCALED = 0.1  # relative error of a channel of a source or flux
+LOSS = 0.1  # share of the state that is lost in `REACH` samples
+MOST_STRIDE = 16  # samples that one step spans at most
+MOST_ENDS = 4  # boundaries of the mesh that are tested
+OFFSET = 3.0  # standard deviations of the noise, as an offset or ...
+DRIFT = 64.0  # ... as a drift within this number of samples
+GAIN = 0.1  # share of the change of a prediction since the start
 LAG = 3.0  # samples
-SHIFT = 0.02  # of the length of the domain, as the cells near a sensor measure it
-AVERAGED = 0.04  # of the length of the domain: a sensor that averages over it, as a long probe
-LONGEST_AVERAGE = 0.2  # of the length of the domain, over which a sensor may average
-POINTS = 8  # of the average
+SHIFT = 0.02  # displacement of a sensor over the local length of the domain, from `lengths`
+AVERAGED = 0.04  # length over which a sensor, such as a long probe, averages, over the domain's
+LONGEST_AVERAGE = 0.2  # largest plausible such length, over the domain's
+POINTS = 8  # quadrature points of the average
 JUMP = 0.3  # prior standard deviations of an unknown
-MOST_JUMPS = 8  # coordinates of unknowns that may jump
-MOST_SUMS = 12_000  # numbers in one kind of sum
+MOST_JUMPS = 8  # coordinates of the unknowns that are tested for jumps
+MOST_SUMS = 12_000  # numbers in each kind of sum
 
 
 class Now(NamedTuple):
-    """Point of a response: state, latent parameter, time, inputs, and the arguments of a load."""
+    """Linearisation point of a response: state, latent parameter, time, inputs, load arguments."""
 
     u: Array
     q: Array
     moment: Moment
     unit: float = 1.0  # usual time between samples
-    rest: float = 0.0  # state that has nothing to lose: the mean of the sensors at the start
+    rest: float = 0.0  # equilibrium state without loss: the mean of the sensors at the start
     rates: Mapping[str, float] = MappingProxyType({})  # changes of inputs per unit of time
 
 
@@ -62,23 +63,23 @@ Load: TypeAlias = Callable[[Now], Array]
 
 
 class Term(NamedTuple):
-    """A term that a model may lack or have wrong, with an amplitude of one."""
+    """A term of unit amplitude that may be missing or wrong in a model."""
 
     # "boundary", "source", "loss", "flux", "transfer" (an exchange at a boundary), "channel" (its
     # gain), or "initial" state
     kind: str
     subject: str = ""  # boundary or channel; empty for the whole domain
-    # load, lift: function that returns its load, and boundary values of its response, (n,); None
+    # load, lift: function that returns the load, and boundary values of the response, (n,); None
     # for zero
     load: Load | None = None
     lift: Array | None = None
 
 
 class Process:
-    """Responses of a model of one component to the terms that it may lack.
+    """Responses of a single-component model to terms that may be missing in it.
 
-    `model`, `observed`, `level`: the process, its sensors, and their noise, by which amplitudes are
-    counted.
+    `model`, `observed`: the process and its sensors.
+    `level`: standard deviation of the noise, the unit of the amplitudes.
     """
 
     def __init__(self, model: Model, observed: Observed, level: float) -> None:
@@ -91,7 +92,7 @@ class Process:
             lifts = boundary_lifts(model).items()
             self.terms += [Term("boundary", name, lift=self.level * lift) for name, lift in lifts]
             self.terms += [*self._domain(), *self._fluxes()]
-            # A gain of each channel that drives the model other than as a boundary value.
+            # Add a gain for each channel of the model that is not a boundary value.
             taken = {term.subject for term in self.terms}
             others = [name for name in model.channels if name not in taken]
             self.terms += [Term("channel", name, load=_gain(model, name)) for name in others]
@@ -100,7 +101,7 @@ class Process:
 
     @staticmethod
     def refused(model: Model) -> str:
-        """Return why a model has no such terms; empty if it has."""
+        """Return why responses of a model are not available; empty if they are."""
         if not model.state_space.single or len(model.algebraic):
             return "the state has several components"
         block = next(iter(model.state_space.fields.values()))
@@ -108,7 +109,7 @@ class Process:
 
     @cached_property
     def _whole(self) -> Array:
-        """Load of a source of one in the whole domain."""
+        """Load of a unit source in the whole domain."""
         return np.asarray(self.model.mass @ self.model.state_space.interpolate(1.0))
 
     def _domain(self) -> Iterator[Term]:
@@ -122,22 +123,22 @@ class Process:
         yield Term("initial")
 
     def _fluxes(self) -> Iterator[Term]:
-        """Iterate over a flux and an exchange at each boundary where the model states no value."""
-        # Each costs a solve with every answer of the process.
+        """Iterate over a flux and an exchange at each boundary without a Dirichlet value."""
+        # `MOST_ENDS` limits their number, because each requires a solve in every step.
         for name, load in flux_loads(self.model, MOST_ENDS).items():
-            # As much as the source of amplitude one brings into the whole domain.
+            # The total flux equals the total of the unit source in the domain.
             shape = load * (self._whole.sum() / load.sum())
             yield Term("flux", name, load=_constant(shape, self.level))
             yield Term("transfer", name, load=_exchanged(shape))
 
     def start(self) -> Array:
-        """Return the responses at the start, (terms, n): that to another initial state."""
+        """Return the responses at the start, (terms, n): lifts, and another initial state."""
         p: Array = self._lifts.copy()
         p[[term.kind == "initial" for term in self.terms]] = self.level * self.model.X.free
         return p
 
     def advance(self, p: Array, now: Now, h: float) -> Array:
-        """Return the responses a time h later, shape (terms, n)."""
+        """Return the responses after a step of length h, shape (terms, n)."""
         loads = np.zeros_like(p)
         for k, term in enumerate(self.terms):
             if term.load is not None:
@@ -152,10 +153,10 @@ class Process:
 
 
 def later(stage: ForwardStage, p: Array, now: Now, h: float, loads: Array, lifts: Array) -> Array:
-    """Return responses p of a process a time h later; p, loads and lifts: (responses, n).
+    """Return responses p of a process after a step h; p, loads and lifts: (responses, n).
 
-    M (p+ - p)/h + S_u p+ = load, with p+ = lift on the boundary. A response that has not begun
-    stays zero, and takes no solve. Loads act on the fields, not on the states of sensors.
+    The step solves M (p+ - p)/h + S_u p+ = load with p+ = lift on the boundary. Responses that are
+    zero without load or lift are not solved for. Loads act on fields, not on states of sensors.
     """
     loads = loads * stage.model.state_space.of_fields
     lifted = lifts.any(axis=1)
@@ -179,26 +180,26 @@ def later(stage: ForwardStage, p: Array, now: Now, h: float, loads: Array, lifts
 
 
 def _constant(shape: Array, level: float) -> Load:
-    """Return a load that is constant but for the usual interval between samples."""
+    """Return a constant load, scaled to the usual interval between samples."""
     return lambda now: level / (REACH * now.unit) * shape
 
 
 def _exchanged(shape: Array) -> Load:
-    """Return the load of an exchange with surroundings where the state is at rest."""
+    """Return the load of a linear exchange with surroundings at the equilibrium state."""
     return lambda now: -LOSS / (REACH * now.unit) * shape * (now.u - now.rest)
 
 
 def _gain(model: Model, name: str) -> Load:
-    """Return the load of a channel that is larger by `SCALED` than the model takes it for."""
+    """Return the change of the force if a channel is larger by the share `SCALED`."""
     return lambda now: scaled_channel(model, name, now, SCALED)
 
 
 def boundary_lifts(model: Model) -> dict[str, Array]:
-    """Return channel -> change of the boundary values by a unit of it, (n,), if it drives any.
+    """Return channel -> derivative of the boundary values by it, (n,), if it is not zero.
 
-    Boundary values that no channel moves are one more, of size one.
+    Boundary values that depend on no channel form the additional entry `FIXED`, a unit change.
     """
-    # Boundary values are affine in the inputs: the difference of two states is a lift.
+    # Boundary values are affine in the inputs, so the difference of two states is a lift.
     zero, known = np.zeros(model.X.dim), dict.fromkeys(model.channels, 0.0)
     rest, fixed = model.impose(zero, Moment(0.0, Inputs(known))), model.X.free == 0.0
     found = {}
@@ -212,7 +213,7 @@ def boundary_lifts(model: Model) -> dict[str, Array]:
 
 
 def flux_loads(model: Model, most: int | None = None) -> dict[str, Array]:
-    """Return loads of a flux of one, (n,), through those of `most` boundaries without a value."""
+    """Return loads, (n,), of a unit flux through the first `most` boundaries, if they are free."""
     ones, found = model.state_space.interpolate(1.0), {}
     for name in [str(one) for one in model.mesh.boundaries or {}][:most]:
         load = model.bilinear(On(name, mass_form)) @ ones
@@ -229,47 +230,46 @@ def force(model: Model, now: Now) -> Array:
 
 
 def scaled_channel(model: Model, name: str, now: Now, share: float) -> Array:
-    """Return the change of the force with a channel that is larger by a share of it, (n,)."""
+    """Return the change of the force if a channel is larger by a share of its value, (n,)."""
     inputs = now.moment.inputs
     more = Moment(now.moment.t, Inputs({**inputs, name: (1.0 + share) * inputs[name]}))
     return force(model, now._replace(moment=more)) - force(model, now)
 
 
 def stride(seen: int) -> int:
-    """Return over how many samples a step goes: short ones while the process is young."""
+    """Return how many samples a step spans: few at the start of the run."""
     return min(max(seen // 8, 1), MOST_STRIDE)
 
 
 @dataclass(frozen=True)
 class ScoreDirection:
-    """A possible cause with an amplitude of one."""
+    """A possible cause of unit amplitude."""
 
-    # "offset", "drift", "gain", "lag", "position", "averaging", "jump", or that of a `Term`
+    # "offset", "drift", "gain", "lag", "position", "averaging", "jump", or the kind of a `Term`
     kind: str
     subject: str = ""  # name of the sensor, channel, boundary or unknown
-    size: float = np.nan  # the amplitude in its unit; NaN where that is not known beforehand
-    unit: str = ""  # of the size
+    size: float = np.nan  # unit amplitude in the unit below; NaN if it depends on the run
+    unit: str = ""  # unit of the size
     axis: int = 0  # coordinate of a position
-    # least, most: bounds of the amount in its unit: a sensor is inside the body, and not beyond the
-    # next one
+    # least, most: bounds of the amplitude in its unit: a displaced sensor remains in the domain and
+    # does not pass its neighbour
     least: float = -np.inf
     most: float = np.inf
-    at: float = np.nan  # coordinate of the sensor along the axis; NaN if it does not matter
+    at: float = np.nan  # coordinate of the sensor along the axis; NaN if not needed
 
 
-# Amplitudes of errors of sensors that are the same at each sample, in units of the noise
+# Unit amplitudes of sensor errors whose effect does not depend on the sample, in noise units
 CONSTANT = {"offset": OFFSET, "drift": OFFSET / DRIFT}
 
 
 class Dictionary:
     """All directions of a model and its sensors.
 
-    Those of the sensors come first, each seen by its own sensor only; then jumps of unknowns, and
-    missing terms of the process.
+    Errors of single sensors come first, then jumps of unknowns, then missing terms of the process.
 
-    `noise`: standard deviation of each sensor.
-    `unknowns`: labels of the coordinates that may jump, each with its place.
-    `dearer`: with the directions that cost solves: terms that the process may lack.
+    `noise`: standard deviation of the noise of each sensor.
+    `unknowns`: label and index of each coordinate that may jump.
+    `dearer`: whether to include missing terms, which require linear solves.
     """
 
     def __init__(
@@ -291,30 +291,29 @@ class Dictionary:
         jumps = unknowns[:MOST_JUMPS]
         self.directions: list[ScoreDirection] = []
         self.parts: dict[str, slice] = {}
-        # Every direction is a row and a column of sums of products, kept for each window.
+        # Sums are stored for each direction, window and sensor.
         room = MOST_SUMS // (len(WINDOWS) * observed.size) - len(jumps) - len(terms)
         self._add_sensors(model, observed, noise, room)
         self.jumps = [place for _, place in jumps]
         self._add("jump", [ScoreDirection("jump", label, JUMP) for label, _ in jumps])
         self._add("process", [ScoreDirection(term.kind, term.subject) for term in terms])
-        # Offsets and drifts, in units of the noise, are the same at each sample.
+        # Effects of offsets and drifts, in units of the noise, do not depend on the sample.
         self._constant = np.zeros((observed.size, len(self)))
-        for kind in CONSTANT.keys() & self.parts:  # many sensors leave out kinds
+        for kind in CONSTANT.keys() & self.parts:  # with many sensors, kinds are left out
             self._constant[:, self.parts[kind]] = CONSTANT[kind] * np.eye(observed.size)
 
     @cached_property
     def _changing(self) -> IntArray:
-        """Places of the directions of sensors whose signals change from sample to sample."""
+        """Indices of the sensor errors whose effect depends on the sample."""
         places = [self._places(kind) for kind in self.kinds if kind not in CONSTANT]
         return np.concatenate([*places, np.zeros(0, dtype=np.int64)])
 
     def _amplitudes(
         self, model: Model, observed: Observed, noise: Array, room: int, shifts: int, step: Array
     ) -> dict[str, tuple[Array, Sequence[str], int]]:
-        """Return the amplitudes of the kinds of errors of sensors that there is room for.
+        """Return kind of sensor error -> (amplitude of each sensor, units, number of axes).
 
-        Those of each sensor, their units, and along how many axes there is one. Where room is short
-        the last kinds are left out first.
+        If there are more than `room` directions, the last kinds are left out first.
         """
         sensors, units = observed.size, observed.units
         none = ("",) * sensors
@@ -336,7 +335,7 @@ class Dictionary:
         return amplitudes
 
     def _add_sensors(self, model: Model, observed: Observed, noise: Array, room: int) -> None:
-        """Append the directions of single sensors, as many kinds as there is room for."""
+        """Append as many kinds of errors of single sensors as there is room for."""
         shifts, step = sensor_shifts(model, observed)
         amplitudes = self._amplitudes(model, observed, noise, room, len(shifts), step)
         self.kinds = tuple(amplitudes)
@@ -352,24 +351,24 @@ class Dictionary:
                 found = _inside(model, observed, found)
             self._add(kind, found)
         self.own: IntArray = np.arange(len(self.directions)) % observed.size  # sensors
-        # Axes along which sensors may be off, and one more on which they may average.
+        # Axes along which sensors may be displaced, and one more for averaging.
         places = shifts if "position" in amplitudes else []
         self.shifted = observed.size * len(places)
         if "averaging" in amplitudes:
             places = [*places, sensor_averages(model, observed)]
         self.axes = len(places)
         if self.axes:
-            # The coefficients of the state that matter, and the matrices of all axes on them.
+            # Restrict the matrices of all axes to the coefficients of the state that they use.
             rows = sp.csc_array(sp.vstack(places))
             self._used = np.flatnonzero(np.diff(rows.indptr))
             self._moved = row_product(sp.csr_array(rows[:, self._used]))
 
     def moved(self, u: Array) -> Array:
-        """Return changes of readings by shifts and averages, (members, axes * sensors)."""
+        """Return changes of readings due to shifts and averages, (members, axes * sensors)."""
         return self._moved(u.take(self._used, axis=1))
 
     def _add(self, part: str, directions: list[ScoreDirection]) -> None:
-        """Append directions, and note their places."""
+        """Append directions and record their indices."""
         start = len(self.directions)
         self.directions += directions
         self.parts[part] = slice(start, len(self.directions))
@@ -383,8 +382,8 @@ class Dictionary:
     def plausible(self, gain: float, reach: float) -> Array:
         """Return the largest plausible amplitude of each direction, (directions,).
 
-        `gain`: of the scale of a sensor. `reach`: of its place, over the length of the domain. A
-        jump is at most a prior standard deviation.
+        `gain`: largest relative error of the scale of a sensor. `reach`: largest displacement, over
+        the length of the domain. A jump is at most one prior standard deviation.
         """
         found = np.full(len(self), np.inf)
         each = {"gain": gain / GAIN, "position": reach / SHIFT, "jump": 1.0 / JUMP}
@@ -396,22 +395,22 @@ class Dictionary:
     def effects(
         self, noise: Array, change: Array, late: Array, moved: Array, answers: Array
     ) -> Array:
-        """Return the change of readings along each direction, in units of their noise.
+        """Return the effect of each direction on the readings, in units of their noise.
 
-        Shape (members, samples, sensors, directions). That of a drift is its slope.
+        Shape (members, samples, sensors, directions). A drift is represented by its slope.
 
-        `noise`: shape (members, samples, sensors).
-        `change`, `late`: predictions less the first ones, and predictions a sample earlier less
-        those of now, (members, samples, sensors).
-        `moved`: changes by shifts and averages, (members, samples, axes * sensors).
-        `answers`: readings due to missing terms, (members, samples, terms, sensors).
+        `noise`: standard deviations, (members, samples, sensors).
+        `change`: predictions minus the first predictions, (members, samples, sensors).
+        `late`: predictions one sample earlier minus predictions, (members, samples, sensors).
+        `moved`: changes due to shifts and averages, (members, samples, axes * sensors).
+        `answers`: readings of responses to missing terms, (members, samples, terms, sensors).
         """
         found = np.empty((*noise.shape, len(self)))
         found[...] = self._constant
         each = {"lag": LAG * late, "gain": GAIN * change}
         each |= {"position": moved[..., : self.shifted], "averaging": moved[..., self.shifted :]}
         if self._changing.size:
-            own = self.own[self._changing]  # each changes the readings of one sensor
+            own = self.own[self._changing]  # each affects only the readings of its own sensor
             parts = [each[kind] for kind in self.kinds if kind in each]
             signals = np.concatenate(parts, axis=2) / noise[:, :, own]
             found[:, :, own, self._changing] = signals
@@ -422,14 +421,14 @@ class Dictionary:
 def _within_reach(
     model: Model, observed: Observed, found: list[ScoreDirection]
 ) -> list[ScoreDirection]:
-    """Return the directions of positions, bounded by the body and by the nearest other sensor."""
+    """Return position directions, bounded by the domain and by the nearest other sensor."""
     at = stated_positions(observed)
     if at is None:
         return found
     vertices = np.asarray(model.mesh.p)
     low, high = vertices.min(axis=1), vertices.max(axis=1)
     apart = np.linalg.norm(at[:, None] - at[None], axis=2)
-    apart[apart == 0.0] = np.inf  # itself, and sensors at the same place
+    apart[apart == 0.0] = np.inf  # the sensor itself, and sensors at the same position
     reach = np.fmin.reduce(apart, axis=1, initial=np.inf)
     bounded = []
     for number, one in enumerate(found):
@@ -444,7 +443,7 @@ def _within_reach(
 
 
 def _inside(model: Model, observed: Observed, found: list[ScoreDirection]) -> list[ScoreDirection]:
-    """Return the directions of averages on a line, bounded by its ends."""
+    """Return the averaging directions on an interval, bounded by its ends."""
     at, (vertices,) = stated_positions(observed), np.asarray(model.mesh.p)
     if at is None:
         return found
@@ -455,17 +454,17 @@ def _inside(model: Model, observed: Observed, found: list[ScoreDirection]) -> li
 
 
 def _leaves(observed: Observed) -> list[Observed]:
-    """Return the observations that an observation is made of, in the order of its sensors."""
+    """Return the elementary parts of an observation, in the order of its sensors."""
     if isinstance(observed, CombinedObserved):
         return [leaf for part in observed.parts for leaf in _leaves(part)]
     return [observed]
 
 
 def _stated(observed: Observed) -> Points | None:
-    """Return the sensors of an observation if each has a position that is not estimated anyway.
+    """Return an observation as points if its positions are known and not estimated, else None.
 
-    Sensors that all depend directly on the parameter read another quantity than the state at a
-    place, such as the fluid of a borehole.
+    If all its sensors depend directly on the parameter, they do not measure the state at a point.
+    An example is the fluid temperature of a borehole.
     """
     observation = observed.observation
     if not isinstance(observation, Points) or observation.position_std is not None:
@@ -474,7 +473,7 @@ def _stated(observed: Observed) -> Points | None:
 
 
 def stated_positions(observed: Observed) -> Array | None:
-    """Return the stated positions of sensors, (sensors, d); NaN for those without; None if all."""
+    """Return the configured positions, (sensors, d), NaN if unknown; None if all are unknown."""
     leaves = [(leaf.size, _stated(leaf)) for leaf in _leaves(observed)]
     known = [points.positions for _, points in leaves if points is not None]
     if not known:
@@ -485,7 +484,7 @@ def stated_positions(observed: Observed) -> Array | None:
 
 
 def _rows_at(observed: Observed, at: Array) -> sp.csr_array:
-    """Return the matrix of the values at other places; zero for sensors without a position."""
+    """Return the matrix of values at displaced positions; zero for sensors without a position."""
     rows, first = [], 0
     for leaf in _leaves(observed):
         points, own = _stated(leaf), at[first : first + leaf.size]
@@ -496,16 +495,15 @@ def _rows_at(observed: Observed, at: Array) -> sp.csr_array:
 
 
 def usual_shifts(model: Model, at: Array) -> Array:
-    """Return by how much sensors at places (sensors, d) may well be off, (sensors,)."""
+    """Return typical position errors, (sensors,), of sensors at positions (sensors, d)."""
     each = [lengths(model.mesh, axis, column) for axis, column in enumerate(at.T)]
     return np.asarray(SHIFT * np.max(each, axis=0))
 
 
 def sensor_shifts(model: Model, observed: Observed) -> tuple[list[sp.csr_array], Array]:
-    """Return how readings change if sensors are shifted along each axis, and by how much, (n,).
+    """Return the change of readings per axis if sensors are displaced, and the displacement.
 
-    No axes if no sensor has a position, or only uncertain ones that are estimated anyway; zero for
-    single ones.
+    Displacements have shape (sensors,). There are no axes if no sensor has a known position.
     """
     at = stated_positions(observed)
     if at is None:
@@ -516,13 +514,13 @@ def sensor_shifts(model: Model, observed: Observed) -> tuple[list[sp.csr_array],
     found = []
     for axis in range(at.shape[1]):
         ends, width = [], np.zeros(len(at))
-        # Central differences; at the edge of the box they are one-sided, and `width` is shorter.
+        # Central differences, one-sided at the edge of the bounding box, where `width` is smaller.
         for sign in (-1.0, 1.0):
             moved = at.copy()
             moved[:, axis] = np.clip(moved[:, axis] + sign * step, low[axis], high[axis])
             try:
                 ends.append(_rows_at(observed, moved))
-            except ObservationError:  # outside of a mesh that is no box
+            except ObservationError:  # inside the bounding box, but outside the mesh
                 moved = at.copy()
                 ends.append(_rows_at(observed, moved))
             width += sign * moved[:, axis]
@@ -532,17 +530,17 @@ def sensor_shifts(model: Model, observed: Observed) -> tuple[list[sp.csr_array],
 
 
 def averages_on_line(model: Model) -> bool:
-    """Return whether a sensor may average along the mesh.
+    """Return whether averaging of sensors along the mesh is tested: only on an interval.
 
-    Elsewhere nobody knows over which direction; along a radius none does, as wells do not.
+    In more dimensions its direction is unknown, and along a radius, wells do not average.
     """
     return model.mesh.dim() == 1 and model.state_space.weight is unweighted
 
 
 def sensor_averages(model: Model, observed: Observed) -> sp.csr_array:
-    """Return how readings on a line change if sensors average over `AVERAGED` of it, (k, n).
+    """Return the change of readings if sensors average over `AVERAGED` of an interval, (k, n).
 
-    The change grows with the square of the length. Zero for sensors without a position.
+    It is proportional to the square of the length, and zero for sensors without a position.
     """
     at = stated_positions(observed)
     if at is None:
@@ -550,7 +548,7 @@ def sensor_averages(model: Model, observed: Observed) -> sp.csr_array:
     (vertices,) = np.asarray(model.mesh.p)
     low, high = float(vertices.min()), float(vertices.max())
     off = AVERAGED * (high - low) * ((np.arange(POINTS) + 0.5) / POINTS - 0.5)
-    # At an end the average is over a shorter length.
+    # Near an end of the interval, the average covers a shorter length.
     half = np.minimum(at - low, high - at)
     rows = [_rows_at(observed, at + np.clip(x, -half, half)) for x in off.tolist()]
     return sp.csr_array(sum(rows[1:], rows[0]) / POINTS - _rows_at(observed, at))

@@ -1,17 +1,17 @@
-"""Evidence in a ledger: e-values of causes, and tests whose statistics are chi-square.
+"""Evidence in a ledger: e-values of causes, chi-square tests, and averages over hypotheses.
 
-Ledgers are those of one member here: see `Ledger.of_member`.
+All functions take the ledger of one member: see `Ledger.of_member`.
 
-The e-value of a direction is the Bayes factor of its amplitude, free with a normal prior of size
-one, against zero, with the noise level integrated out. Under white errors of any size it is a
-martingale that begins at one, and so is a mean of several: the probability that it ever exceeds
+The e-value of a direction is the Bayes factor of an amplitude with a standard normal prior against
+an amplitude of zero, with the noise level integrated out. Under white errors of any level it is a
+martingale that starts at one, and so is a mean of e-values. The probability that it ever exceeds
 1/alpha is at most alpha, for any number of looks (Ville 1939; Robbins 1970; Vovk and Wang 2021).
 
-Intervals that allow for unknown errors average over hypotheses. One adds columns Z with normal
-amplitudes b ~ N(0, L L^T) to the linearised model of the readings, z = J xi + Z b + noise, with
-xi ~ N(0, I) and the noise level integrated out. With strong data one wrong hypothesis would take
-all the weight. So the evidence e is tempered: weights are those of e^eta, with eta such that none
-exceeds that of "nothing is wrong" by more than e^TEMPER (Grünwald 2012; Miller and Dunson 2019).
+Intervals that allow for unknown errors average over hypotheses. A hypothesis adds columns Z with
+normal amplitudes b ~ N(0, L L^T) to the linearised model of the readings: z = J xi + Z b + noise,
+with xi ~ N(0, I) and the noise level integrated out. With strong data, a single wrong hypothesis
+would receive all the weight. Therefore the evidence e is tempered: weights use e^eta, with eta such
+that no ratio to "nothing is wrong" exceeds e^TEMPER (Grünwald 2012; Miller and Dunson 2019).
 """
 
 from __future__ import annotations
@@ -29,58 +29,58 @@ from livepde.linalg import Array, IntArray
 from livepde.verdict.ledger import BLOCKS, Ledger, chance
 
 NU = 10.0  # degrees of freedom of the prior of the noise level
-SAME = 1e-10  # standard deviations: quantiles that are the same
-NEGLIGIBLE = 1e-15  # weight of a hypothesis, one of some thousands, that moves no quantile
-TEMPER = 8.0  # logarithm of the largest ratio of evidences: 3 to 8 do much the same
+SAME = 1e-10  # tolerance of quantiles, in standard deviations
+NEGLIGIBLE = 1e-15  # weight below which a hypothesis, one of thousands, affects no quantile
+TEMPER = 8.0  # logarithm of the largest ratio of evidences; values from 3 to 8 act similarly
 AMPLITUDES = (1.0 / 3.0, 4.0 / 3.0, 16.0 / 3.0, 64.0 / 3.0)  # prior sizes of a direction
-NOTHING = 0.5  # prior mass on "nothing is wrong"; the rest on single causes and on families alike
-LEVEL = 0.95
+NOTHING = 0.5  # prior mass of "nothing is wrong"; single causes and families share the rest equally
+LEVEL = 0.95  # probability of the intervals
 ALPHA = 0.01  # probability of a false alarm in a run, shared by the tests
-CAUSES = 0.5 * ALPHA  # for the e-value of all directions
-RECORD = 0.05 * ALPHA  # for each test of the record of the unknowns, and of following errors
-FOLLOWING = 0.2  # correlation of successive errors that is worth a word
-TRUSTED_LEVEL = 20.0  # samples for which the level of all of the run counts in a window
-MOST_CORRELATED = 0.98
-LEAST = 0.05  # share of the information on each side of a change that is looked for
-LEAST_SHARE = 1e-6  # of the information in the largest direction, below which nothing is told
+CAUSES = 0.5 * ALPHA  # share of the e-value of all directions
+RECORD = 0.05 * ALPHA  # share of each test for constancy, disagreement and autocorrelation
+FOLLOWING = 0.2  # smallest autocorrelation that is reported
+TRUSTED_LEVEL = 20.0  # samples as which the noise level of the whole run counts in a window
+MOST_CORRELATED = 0.98  # upper bound of an estimated autocorrelation
+LEAST = 0.05  # share of the information that each side of a change must have
+LEAST_SHARE = 1e-6  # share of the largest eigenvalue below which information counts as zero
 
 
 class Family(NamedTuple):
     """A random error with many amplitudes."""
 
-    # Columns, and a square root L of the covariance of their amplitudes, (columns, k); several of
-    # them have the same effect on the readings
+    # Columns, and a square root L of the covariance of their amplitudes, (columns, k). Parts are
+    # scaled to equal root mean square effects on the readings.
     parts: tuple[tuple[IntArray, Array], ...]
-    # Prior sizes that are tried: the root mean square of what it does to a reading, in standard
-    # deviations of the noise
+    # Candidate prior sizes: root mean square effect on a reading, in standard deviations of the
+    # noise
     sizes: tuple[float, ...]
-    # Sizes that are tried with each single cause of the same size beside it
+    # Candidate sizes in combination with a single cause of the same size
     beside: tuple[float, ...] = ()
 
 
 class Causes(NamedTuple):
-    """Single causes, a column each."""
+    """Single causes with one column each."""
 
-    columns: IntArray  # their columns, (causes,)
-    # Largest standard deviation of each amplitude that is plausible, in its own unit, (causes,)
+    columns: IntArray  # index of the column of each cause, (causes,)
+    # Largest plausible standard deviation of each amplitude, in its own unit, (causes,)
     most: Array
-    sizes: tuple[float, ...]  # as of a family
+    sizes: tuple[float, ...]  # candidate prior sizes, see `Family`
 
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
-    """Readings, in units of the noise, linear in the unknowns and in what may be wrong."""
+    """Linearised model of the readings, in units of the noise: z = J xi + Z b + noise."""
 
-    # J, Z, z: derivatives by the coordinates xi, effects of the errors, and readings less the prior
-    # prediction, (readings, p), (readings, columns), (readings,)
+    # J, Z, z: derivatives with respect to the coordinates xi, (readings, p), effects of the errors,
+    # (readings, columns), and readings minus the prior prediction, (readings,)
     J: Array
     Z: Array
     z: Array
-    T: Array  # wanted numbers, as rows on xi, (numbers, p)
+    T: Array  # quantities of interest as linear functions of xi, (numbers, p)
 
     @cached_property
     def _known(self) -> tuple[Array, Array]:
-        """A^(-1/2) J^T Z and A^(-1/2) J^T z, with A = 1 + J^T J = R^T R."""
+        """R^(-T) J^T [Z z] and R^(-T) T^T, with R^T R = 1 + J^T J."""
         R = scipy.linalg.cholesky(np.eye(self.J.shape[1]) + self.J.T @ self.J)
         both = self.J.T @ np.column_stack([self.Z, self.z])
         left = scipy.linalg.solve_triangular(R, both, trans="T")
@@ -94,7 +94,7 @@ class LinearModel:
 
     @cached_property
     def left(self) -> tuple[Array, Array, float]:
-        """Products of Z and z with the unknowns taken out: Z^T P Z, Z^T P z and z^T P z."""
+        """Products Z^T P Z, Z^T P z and z^T P z, with P = (1 + J J^T)^-1: unknowns eliminated."""
         both, _ = self._known
         taken, rest = both[:, :-1], both[:, -1]
         S = self.squares - taken.T @ taken
@@ -103,38 +103,38 @@ class LinearModel:
 
     @cached_property
     def asked(self) -> tuple[Array, Array, Array]:
-        """Mean and variance of the numbers if nothing is wrong, and their shifts by errors."""
+        """Mean and variance of the numbers if nothing is wrong, and their shift per error."""
         both, right = self._known
         shifts: Array = right.T @ both[:, :-1]
         mean: Array = right.T @ both[:, -1]
         return mean, (right**2).sum(axis=0), shifts
 
     def usual(self, columns: IntArray, root: Array) -> float:
-        """Return the root mean square of what amplitudes with a covariance do to a reading."""
+        """Return the root mean square effect on a reading of amplitudes with a covariance."""
         own = self.squares[np.ix_(columns, columns)]
         return math.sqrt(max(float(((own @ root) * root).sum()), 0.0) / len(self.z))
 
 
 class Mixture(NamedTuple):
-    """Normal components of numbers."""
+    """Mixture of normal distributions, for several numbers."""
 
     weights: Array  # (components,)
     means: Array  # (components, numbers)
     deviations: Array  # (components, numbers)
 
     def widened(self, shift: Array) -> Mixture:
-        """Return the same numbers with an error of a known size besides, (numbers,)."""
+        """Return the mixture with an additional error of standard deviation `shift`, (numbers,)."""
         return self._replace(deviations=np.hypot(self.deviations, shift))
 
     def quantile(self, share: float) -> Array:
-        """Return a quantile of each number.
+        """Return a quantile of each number, shape (numbers,).
 
-        Newton's method for x -> ndtri(F(x)), which is a line for a single component, and halves of
-        the interval where it would leave it.
+        Newton's method for x -> ndtri(F(x)), which is linear for a single component, with bisection
+        if an iterate leaves the bracket.
         """
         target = scipy.special.ndtri(share)
         ends = self.means + target * self.deviations
-        low, high = ends.min(axis=0), ends.max(axis=0)  # that of each component is between them
+        low, high = ends.min(axis=0), ends.max(axis=0)  # bracket of the quantile of the mixture
         x = self.weights @ ends
         for _ in range(60):
             away = (x - self.means) / self.deviations
@@ -150,19 +150,19 @@ class Mixture(NamedTuple):
 
     @property
     def interval(self) -> tuple[Array, Array]:
-        """The interval that holds 95 % of each number."""
+        """Lower and upper end of the central 95 % interval of each number."""
         return self.quantile(0.5 - 0.5 * LEVEL), self.quantile(0.5 + 0.5 * LEVEL)
 
 
 class _Axes(NamedTuple):
-    """A family in the principal axes of its effect, with a size of one."""
+    """A family of unit size in the principal axes of its effect on the readings."""
 
-    # effect, along: squared effect on the readings, and product with the residuals, of each axis,
-    # (k,)
+    # effect, along: squared effect of each axis on the readings, and its product with the
+    # residuals, (k,)
     effect: Array
     along: Array
-    moved: Array  # shift of each number by each axis, (numbers, k)
-    shared: Array  # products of each axis with single causes, (k, causes)
+    moved: Array  # shift of each number per axis, (numbers, k)
+    shared: Array  # products of each axis with each single cause, (k, causes)
 
     @classmethod
     def of(cls, model: LinearModel, family: Family, columns: IntArray) -> _Axes:
@@ -184,13 +184,13 @@ class _Axes(NamedTuple):
 
 
 class _Tried(NamedTuple):
-    """Hypotheses, and what each says of the numbers."""
+    """Evidence of hypotheses, and their effects on the numbers."""
 
-    # Sum of squares that is left, and half the logarithm of a determinant, (hypotheses,)
+    # Residual sum of squares, and half of the log-determinant, (hypotheses,)
     squares: Array
     volume: Array
-    # Numbers of some hypotheses -> their shifts and variances, both (some, numbers). Most of them
-    # have no weight, and the numbers of a field are many.
+    # Indices of hypotheses -> shifts and added variances of the numbers, (indices, numbers). They
+    # are evaluated only for hypotheses with weight, since a field has many numbers.
     moves: Callable[[IntArray], tuple[Array, Array]]
 
 
@@ -210,13 +210,13 @@ def _alone(model: LinearModel, axes: _Axes, size: float) -> _Tried:
 
 
 def _beside(model: LinearModel, axes: _Axes, causes: Causes, asked: float) -> _Tried:
-    """Return a family of a size together with each of the causes."""
+    """Return the hypotheses of a family of size `asked` combined with each single cause."""
     S, s, _ = model.left
     usual = np.sqrt(np.diag(model.squares)[causes.columns] / len(model.z))
     some = np.flatnonzero(usual > 0.0)
     columns, usual = causes.columns[some], usual[some]
     size = np.minimum(asked, causes.most[some] * usual) / usual
-    # The cause is one row more of the matrix, which is diagonal for the family.
+    # The cause borders the matrix of the family, which is diagonal, by one row and column.
     alone, D = _alone(model, axes, asked), 1.0 + asked**2 * axes.effect
     u = asked**2 * axes.shared[:, some] / D[:, None]
     rest = np.maximum(np.diag(S)[columns] - (u * axes.shared[:, some]).sum(axis=0), 0.0)
@@ -240,7 +240,7 @@ NO_FAMILY = Family((), ())
 def averaged(model: LinearModel, causes: Causes, families: Sequence[Family]) -> Mixture:
     """Return the tempered average over "nothing is wrong", single causes and families.
 
-    Hypotheses without weight are left out.
+    Hypotheses with negligible weight are left out.
     """
     total, (mean, variance, _) = model.left[2], model.asked
     n, groups = len(model.z), _hypotheses(model, causes, families)
@@ -262,7 +262,7 @@ def averaged(model: LinearModel, causes: Causes, families: Sequence[Family]) -> 
 def _hypotheses(
     model: LinearModel, causes: Causes, families: Sequence[Family]
 ) -> list[list[list[_Tried]]]:
-    """Return "nothing is wrong", single causes, and families, each with one block a size."""
+    """Return blocks of hypotheses: group ("nothing", causes, families) -> variant -> size."""
     none = _Axes.of(model, NO_FAMILY, causes.columns)
     single = [_beside(model, none, causes, size) for size in causes.sizes]
     several: list[list[_Tried]] = []
@@ -274,7 +274,7 @@ def _hypotheses(
 
 
 def _kinds(groups: Sequence[Sequence[Sequence[_Tried]]]) -> tuple[IntArray, list[int]]:
-    """Return the kind of each hypothesis, and how many kinds each group has."""
+    """Return the kind of each hypothesis, and the number of kinds in each group."""
     kinds, counts = list[IntArray](), [0] * len(groups)
     for number, group in enumerate(groups):
         for sizes in filter(None, group):
@@ -287,13 +287,13 @@ def _kinds(groups: Sequence[Sequence[Sequence[_Tried]]]) -> tuple[IntArray, list
 def _tempered(
     told: Array, kinds: IntArray, shares: Sequence[float], counts: Sequence[int]
 ) -> Array:
-    """Return the weights of hypotheses with logarithms of their evidence; the first is "nothing".
+    """Return the weights of hypotheses with log-evidence `told`; the first is "nothing".
 
-    Which size is right the data tell; which kind only after tempering, since the right one may be
-    missing.
+    The evidence of sizes within a kind is not tempered. The evidence of kinds is, because the right
+    kind may be missing.
 
-    `kinds`: the kind of each. `shares`, `counts`: of groups of kinds, their share of the prior
-    mass, and how many kinds they have.
+    `kinds`: kind of each hypothesis. `shares`, `counts`: prior mass and number of kinds of each
+    group.
     """
     masses = zip(shares, counts, strict=True)
     prior = np.concatenate([np.full(n, math.log(share / max(n, 1))) for share, n in masses])
@@ -309,13 +309,13 @@ def _tempered(
 def averaged_causes(ledger: Ledger, moved: Array, most: Array, std: Array) -> Mixture:
     """Return the tempered average over "nothing is wrong" and the directions of a ledger.
 
-    The numbers are truth less estimate. `moved`: that by each direction of each window, (numbers,
-    windows * directions). `most`: largest amplitude of each direction that is plausible,
-    (directions,). `std`: standard deviations of the numbers if nothing is wrong, (numbers,).
+    The numbers are truth minus estimate. `moved`: their shift per direction and window, (numbers,
+    windows * directions). `most`: largest plausible amplitude of each direction, (directions,).
+    `std`: standard deviations of the numbers if nothing is wrong, (numbers,).
     """
     sums, noise, spread = ledger.sums, ledger.noise, levels(ledger)
     log_e, size, _ = _tested(sums, noise, spread, np.zeros_like(spread))
-    # Slow errors explain what they can: a cause has the rest.
+    # Causes are tested on innovations from which autocorrelation is removed.
     rho, left = _left(sums, noise, log_e, size)
     score, information = _regression(sums, left, rho)
     none = np.zeros((1, len(std)))
@@ -338,42 +338,41 @@ def averaged_causes(ledger: Ledger, moved: Array, most: Array, std: Array) -> Mi
 class CauseEvidence:
     """Evidence of every direction in every window, shapes (windows, directions)."""
 
-    # log_e, size: logarithm of the e-value, and the amplitude that fits best
+    # log_e, size: logarithm of the e-value, and best-fitting amplitude
     log_e: Array
     size: Array
-    share: Array  # part of the misfit beyond the noise that the direction explains
-    # total, whitened: logarithm of the mean e-value, as it is, and with errors that follow each
-    # other taken out
+    share: Array  # share of the misfit beyond the noise that the direction explains
+    # total, whitened: logarithm of the mean e-value under white errors, and its minimum with the
+    # value under autocorrelated errors
     total: float
     whitened: float
-    # Of successive errors of each sensor, once the largest direction is free, (sensors,)
+    # Autocorrelation of each sensor after the direction with most evidence is fitted, (sensors,)
     correlation: Array
 
 
 def levels(ledger: Ledger) -> Array:
-    """Return the variance of each sensor's noise in each window, in units of the stated one.
+    """Return the variance of the noise over the assumed one, (windows, sensors).
 
-    From successive differences of the whitened innovations (von Neumann 1941), so that slow misfit
-    does not count: shape (windows, sensors).
+    It is estimated from successive differences of the whitened innovations (von Neumann 1941),
+    which slow misfit does not affect.
     """
     _, _, squares, products, pairs = ledger.noise
-    # Half of the squared differences: the ends of a window hardly count.
-    # sum (r_k - r_(k-1))^2 / 2 = sum r r - sum r_k r_(k-1), up to the ends.
+    # sum (r_k - r_(k-1))^2 / 2 = sum r r - sum r_k r_(k-1), up to the ends of the window.
     differences = np.maximum(squares - products, 0.0)
-    # Short windows lean on the level of the whole run, and that on the stated one.
+    # Short windows are shrunk towards the level of the run, and that towards the assumed level.
     whole = (differences[0] + NU) / (pairs[0] + NU)
     return np.asarray((differences + TRUSTED_LEVEL * whole) / (pairs + TRUSTED_LEVEL))
 
 
 def weighted_median(values: Array, weights: Array) -> float:
-    """Return the median of values that count as often as their weights say."""
+    """Return the weighted median of values."""
     order = np.argsort(values)
     share = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(share, 0.5 * share[-1])])
 
 
 def mean_squares(ledger: Ledger) -> Array:
-    """Return mean squares of the whitened innovations, 1 if as stated, (windows, sensors)."""
+    """Return mean squares of whitened innovations, expected to be 1, (windows, sensors)."""
     count, _, squares, *_ = ledger.noise
     return np.asarray(squares / np.maximum(count, 1.0))
 
@@ -384,8 +383,8 @@ def causes_of(ledger: Ledger) -> CauseEvidence:
     log_e, size, share = _tested(sums, noise, spread, np.zeros_like(spread))
     weights = _weights(ledger, log_e.shape[1])
     total = float(scipy.special.logsumexp(log_e + weights)) if log_e.size else 0.0
-    # The same test once more with first-order autoregressive errors: what slow noise explains as
-    # well is no evidence for a cause. The smaller one counts.
+    # Repeat the test with AR(1) errors, and use the smaller e-value: misfit that slow noise
+    # explains as well is not evidence for a cause.
     rho, left = _left(sums, noise, log_e, size)
     white, _, _ = _tested(sums, noise, left, rho)
     whitened = float(scipy.special.logsumexp(white + weights)) if white.size else 0.0
@@ -393,7 +392,7 @@ def causes_of(ledger: Ledger) -> CauseEvidence:
 
 
 class Following(NamedTuple):
-    """Sensor whose successive errors follow each other: its number, their correlation, p-value."""
+    """Sensor with autocorrelated innovations: its index, the correlation and its p-value."""
 
     sensor: int
     correlation: float
@@ -401,7 +400,7 @@ class Following(NamedTuple):
 
 
 def following(ledger: Ledger, window: int) -> Following | None:
-    """Return the sensor whose successive errors are correlated most, None if by chance."""
+    """Return the sensor with the most significant autocorrelation; None if not significant."""
     _, _, squares, products, pairs = ledger.noise[:, window]
     rho = products / np.maximum(squares, 1e-300)
     # Under white errors the correlation of n pairs is normal with the variance 1/n.
@@ -414,7 +413,7 @@ def following(ledger: Ledger, window: int) -> Following | None:
 
 
 def quiet(ledger: Ledger, log_e: Array) -> bool:
-    """Return whether windows that restart have no evidence; log_e: (windows, directions)."""
+    """Return whether restarting windows are free of evidence; log_e: (windows, directions)."""
     return unsuspicious(log_e[1:]) and following(ledger, -1) is None
 
 
@@ -429,10 +428,10 @@ def unsuspicious(log_e: Array) -> bool:
 def _tested(
     sums: Array, noise: Array, spread: Array, rho: Array, prior: Array | float = 1.0
 ) -> tuple[Array, Array, Array]:
-    """Return log e-values, sizes and shares of misfit of all directions.
+    """Return log e-values, amplitudes and shares of the misfit, each (windows, directions).
 
-    `spread`, `rho`: variance and correlation of successive errors, (windows, sensors).
-    `prior`: standard deviation of the amplitude of each direction, (directions,).
+    `spread`, `rho`: variance and autocorrelation of the errors, (windows, sensors).
+    `prior`: prior standard deviation of the amplitude of each direction, (directions,).
     """
     count, _, squares, products, _ = noise
     num, den = _regression(sums, spread, rho)
@@ -445,7 +444,7 @@ def _tested(
     log_e = 0.5 * np.log(k) - 0.5 * (NU + total) * np.log1p(-gained)
     log_e = np.where(np.isfinite(log_e), log_e, 0.0)
     size = num / np.where(den > 0.0, den, np.inf)
-    # Misfit beyond the noise; a cause cannot explain more than all of it.
+    # Misfit beyond the noise, bounded below so that no share exceeds one.
     excess = np.maximum(rss - total, num * size)
     share = num * size / np.where(excess > 0.0, excess, np.inf)
     return log_e, size, share
@@ -454,8 +453,7 @@ def _tested(
 def _regression(sums: Array, spread: Array, rho: Array) -> tuple[Array, Array]:
     """Return score and information of the amplitude of each direction, (windows, directions).
 
-    Generalised least squares for the AR(1) errors e_k - rho e_(k-1), from the sums of both
-    products.
+    Generalised least squares with AR(1) errors, from sums of products at lags 0 and 1.
     """
     num, den, cross, lagged = sums
     now, before = ((1.0 + rho**2) / spread)[:, None], (rho / spread)[:, None]
@@ -464,14 +462,14 @@ def _regression(sums: Array, spread: Array, rho: Array) -> tuple[Array, Array]:
 
 
 def _left(sums: Array, noise: Array, log_e: Array, size: Array) -> tuple[Array, Array]:
-    """Return correlation and variance of the residuals of the largest direction of each window."""
+    """Return autocorrelation and variance after the fit of each window's best direction."""
     _, _, squares, products, pairs = noise
     count = noise[0]
     if log_e.size:
         rows, best = np.arange(len(log_e)), log_e.argmax(axis=1)
         theta = size[rows, best][:, None]
         num, den, cross, lagged = (part[rows, best] for part in sums)
-        # Sums of squares of r - theta g, and of its neighbours.
+        # Sums of squares of r - theta g, and of its products at lag 1.
         squares = np.maximum(squares - 2.0 * theta * num + theta**2 * den, 0.0)
         products = products - theta * cross + theta**2 * lagged
     rho = (products / np.maximum(squares, 1e-300)) * pairs / (pairs + NU)
@@ -483,8 +481,8 @@ def _left(sums: Array, noise: Array, log_e: Array, size: Array) -> tuple[Array, 
 def _weights(ledger: Ledger, directions: int) -> Array:
     """Return logarithms of the prior weights of all directions, (windows, directions).
 
-    Half for the window of all samples; the other windows share the rest, and each spends of it the
-    less the more often it has begun anew, 1/((n + 1)(n + 2)), so that the sum is one at most.
+    The window of all samples has half of the mass, and the other windows share the rest. After n
+    restarts a window uses 1/((n + 1)(n + 2)) of its share, so that all weights sum to at most one.
     """
     epoch = ledger.epoch.astype(float)
     windows = len(epoch)
@@ -497,23 +495,22 @@ def _weights(ledger: Ledger, directions: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Constancy:
-    """Test of whether the unknowns stayed: sup-LM on the cumulated scores (Andrews 1993)."""
+    """Test of constant unknowns: sup-LM on the cumulative scores (Andrews 1993)."""
 
-    p_value: float  # at most that, by the union bound over the places of the change
+    p_value: float  # upper bound, from the union bound over the candidate changes
     after: float  # share of the samples before the most likely change
-    # How far the unknowns are apart on both sides of it, in prior standard deviations, (k,)
-    change: Array
+    change: Array  # change of the unknowns, in prior standard deviations, (k,)
 
 
 def _record(ledger: Ledger, wider: float) -> tuple[Array, Array]:
-    """Return score, (blocks, sensors, k), and information in units of the noise that was found."""
+    """Return score, (blocks, sensors, k), and information, in units of the estimated noise."""
     spread = levels(ledger)[0] * wider
     score = ledger.score / spread[:, None]
     return score, ledger.information / spread[:, None, None]
 
 
 def _inverse(F: Array) -> tuple[Array, int]:
-    """Return the pseudo-inverse of an information, and its rank."""
+    """Return the pseudo-inverse of an information matrix, and its rank."""
     values, axes = np.linalg.eigh(F)
     told = values > LEAST_SHARE * max(float(values[-1]), 1.0)
     inverse = (axes[:, told] / values[told]) @ axes[:, told].T
@@ -521,13 +518,13 @@ def _inverse(F: Array) -> tuple[Array, int]:
 
 
 def constancy(ledger: Ledger, wider: float = 1.0) -> Constancy | None:
-    """Return the test of whether the unknowns stayed; None without a record.
+    """Return the test of constant unknowns; None if the record is too short or not kept.
 
-    `wider` is by how much a mean of correlated errors varies more than one of independent errors.
+    `wider`: variance of a mean of the errors over that of a mean of independent errors.
     """
     score, information = (part.sum(axis=1) for part in _record(ledger, wider))
     k = score.shape[1]
-    # A change is looked for between blocks of the record, each as many samples long.
+    # Candidate changes are between the blocks of the record, which have equal lengths.
     used = int(ledger.seen - 1) // int(ledger.length) + 1
     if not k or used < 4:
         return None
@@ -537,13 +534,12 @@ def constancy(ledger: Ledger, wider: float = 1.0) -> Constancy | None:
         return None
     best, at, change, looks = -1.0, 0, np.zeros(k), 0
     for j in range(min(used, BLOCKS) - 1):
-        # Near the ends of the record one side holds too little information to tell a change.
+        # Near the ends of the record, one side has too little information to detect a change.
         before = float(np.trace(inverse @ F[j])) / rank
         if not LEAST < before < 1.0 - LEAST:
             continue
         looks += 1
-        # Score of the first part at the estimate of the whole: zero but for chance without a
-        # change.
+        # Score of the first part at the estimate from all blocks: zero mean without a change.
         c = B[j] - F[j] @ inverse @ B[-1]
         A, _ = _inverse(F[j] - F[j] @ inverse @ F[j])
         statistic = float(c @ A @ c)
@@ -552,17 +548,18 @@ def constancy(ledger: Ledger, wider: float = 1.0) -> Constancy | None:
             best, at, change = statistic, j, -A @ c
     if not looks:
         return None
-    # Bonferroni's bound over the places that were looked at.
+    # Bonferroni bound over the candidate changes.
     p = min(1.0, looks * chance(best, rank))
     after = (at + 1) * int(ledger.length) / int(ledger.seen)
     return Constancy(p, min(after, 1.0), change)
 
 
 def disagreement(ledger: Ledger, wider: float = 1.0) -> tuple[float, Array] | None:
-    """Return p-value and share of each sensor of the test of whether sensors agree; None without.
+    """Return p-value and share of each sensor in the test for agreement of sensors.
 
-    Q = sum_i Bp_i^T F_i^+ Bp_i, Bp_i = B_i - F_i F^-1 sum B: the heterogeneity of the estimates of
-    the unknowns by each sensor alone (Cochran 1954), chi-square under the model.
+    Q = sum_i Bp_i^T F_i^+ Bp_i, with Bp_i = B_i - F_i F^-1 sum B, measures the heterogeneity of the
+    estimates from single sensors (Cochran 1954). It is chi-square under the model. None if there is
+    no record, or if no unknown is determined by two sensors.
     """
     score, information = (part.sum(axis=0) for part in _record(ledger, wider))
     sensors, k = score.shape
@@ -572,7 +569,7 @@ def disagreement(ledger: Ledger, wider: float = 1.0) -> tuple[float, Array] | No
     each, freedom = np.zeros(sensors), -rank
     for i in range(sensors):
         own, told = _inverse(information[i])
-        # Score of a sensor at the estimate of all of them.
+        # Score of a sensor at the estimate from all sensors.
         left = score[i] - information[i] @ inverse @ score.sum(axis=0)
         each[i] = left @ own @ left
         freedom += told

@@ -1,4 +1,4 @@
-"""Verdict: its level, and findings with evidence, causes, remedy and consequence; shifts."""
+"""Verdict: its level and its findings, with evidence, causes, remedies and shifts of estimates."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ Severity: TypeAlias = Literal["note", "caution", "do not trust"]
 Measure: TypeAlias = Literal["e-value", "p-value", "number"]
 
 NOT_JUDGED: Literal["not judged"] = "not judged"
-# From the best to the worst: of a run that nobody has judged nothing is known, not even what a
-# caution says.
+# In order of severity: a run that was not judged ranks below a caution, as its errors are unknown.
 LEVELS: tuple[Level, ...] = ("trusted", "caution", NOT_JUDGED, "do not trust")
 NUMBERS: dict[Level, int] = {NOT_JUDGED: -1, "trusted": 0, "caution": 1, "do not trust": 2}
-"""Level -> its number in metrics; a larger one is worse, and -1 is none of them."""
+"""Level -> its number in metrics: larger is worse, and -1 means not judged."""
 
 PROMISES: dict[Level, str] = {
     "trusted": "no significant model error was found",
@@ -30,25 +29,26 @@ PROMISES: dict[Level, str] = {
     LEVELS[-1]: "do not use the estimates as they are",
 }
 """Level -> its meaning for the estimates."""
-DOUBTS = ("misfit", "constancy", "disagreement")  # findings that speak against the model
-# Those whose severity follows from fit and effect: the interval holds shifts by the discretisation.
+DOUBTS = ("misfit", "constancy", "disagreement")  # findings against the model
+# Findings whose severity follows from misfit and effect, since the intervals allow for them.
 RANKED = (*DOUBTS, "following", "stuck", "discretisation")
 NAMES: dict[str, Severity] = {"trusted": "note", "caution": "caution", LEVELS[-1]: "do not trust"}
 WORST: dict[Severity, Level] = {"note": "trusted", "caution": "caution", "do not trust": LEVELS[-1]}
-FEWEST = 20  # samples before which there is nothing to judge by
-FLAT = 0.9  # remaining share of a prior standard deviation from which data do not identify
-MOST = 5  # findings that are said unasked
-NAMED = 4  # causes that are kept
-HALF = 0.5  # share of a misfit
-CANDIDATES = 3  # causes that are named where none explains half of a misfit
-GROSS = ("unit", "exchange")  # kinds of causes
-ONCE = ("discretisation", "held", "hold")  # findings on the run as a whole: one each at most
-LARGEST = 1e99  # evidence beyond is written as that
-SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
-DECIDES = 5.0  # the same, from which the interval is little else
-GUESSED = 2.0  # the same by input lines alone: where inputs jump, a guess of even the wrong sign
-SHARED = 1.0  # the same by one kind of error, from which it is named
-SETTING = 1.0  # the same if inputs are readings: no interval holds that
+FEWEST = 20  # smallest number of samples for a verdict
+FLAT = 0.9  # posterior over prior standard deviation from which an unknown is not identifiable
+MOST = 5  # findings that are shown by default
+NAMED = 4  # causes that a finding keeps
+HALF = 0.5  # share of a misfit from which a cause is its explanation
+CANDIDATES = 3  # causes that are named if none explains half of a misfit
+GROSS = ("unit", "exchange")  # kinds of causes that invalidate all estimates
+ONCE = ("discretisation", "held", "hold")  # findings on the run as a whole, at most one of each
+LARGEST = 1e99  # upper bound of evidence in JSON
+# Shifts of an unknown in standard deviations from which ...
+SHIFTED = 2.0  # ... a discretisation error is reported
+DECIDES = 5.0  # ... it is a caution, because it dominates the interval
+GUESSED = 2.0  # ... interpolation of inputs is a caution: with jumps its sign may be wrong
+SHARED = 1.0  # ... a kind of discretisation error is named
+SETTING = 1.0  # ... held inputs are reported: the intervals do not include this shift
 HOLD = "hold"
 LISTED = 5  # unknowns in a sentence
 REFINE = {
@@ -59,7 +59,7 @@ REFINE = {
         'Sample these inputs more often. If they switch, add `between = "hold"` to their channels.',
     ),
 }
-"""Kind of a discretisation error -> its name, and the remedy."""
+"""Kind of discretisation error -> its name and remedy."""
 NOT_KNOWN: Any = math.nan
 Number = TypeVar("Number")
 Other = TypeVar("Other")
@@ -82,12 +82,11 @@ class Cause:
     remedy
         Recommended action, as a sentence.
     setting
-        "key=value" of a case that makes the cause an unknown, or corrects a column, as `livepde run
-        --set` takes it;
-        several are separated by "; ". Empty if no setting frees the cause.
+        Settings "key=value" for `livepde run --set` that estimate the cause or correct a column,
+        separated by "; ". Empty if there is no such setting.
     size
-        Its size in units of the model: of a gain the share, of a lag the time, of a source the
-        change of the state per unit of time, of a loss the rate; NaN if not known.
+        Size in units of the model: a share for a gain, a time for a lag, a change of the state per
+        unit of time for a source, a rate for a loss; NaN if not known.
     """
 
     kind: str
@@ -103,7 +102,7 @@ class Cause:
         return cls(**{**stored, **{name: _number(stored[name]) for name in ("share", "size")}})
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the cause as JSON can hold it."""
+        """Return the cause as a dictionary for JSON."""
         numbers = {"share": self.share, "size": self.size}
         plain = {name: None if math.isnan(value) else value for name, value in numbers.items()}
         return {**vars(self), **plain}
@@ -160,7 +159,7 @@ class Finding:
         return " ".join(parts)
 
     def _likely(self) -> list[str]:
-        """Return the likely causes as sentences; candidates where none explains half of it."""
+        """Return sentences on the likely causes; candidates if none explains half of the misfit."""
         first, *others = self.causes
         if first.share < HALF:
             each = [f"{one.text}{_shown(one.share)}" for one in self.causes[:CANDIDATES]]
@@ -179,7 +178,7 @@ class Finding:
         return cls(**{**own, "causes": causes, "evidence": _number(own["evidence"])})
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the finding as JSON can hold it."""
+        """Return the finding as a dictionary for JSON."""
         evidence = None if math.isnan(self.evidence) else min(self.evidence, LARGEST)
         shift = {name: float(size) for name, size in self.shift.items()}
         causes = [cause.to_dict() for cause in self.causes]
@@ -188,7 +187,7 @@ class Finding:
 
 
 def _shown(share: float, words: str = "{}") -> str:
-    """Return a share in parentheses; empty if it is not known."""
+    """Return a share in parentheses; empty if not known."""
     return "" if math.isnan(share) else f" ({words.format(percent(share))})"
 
 
@@ -197,35 +196,35 @@ def _number(value: float | None) -> float:
 
 
 def channel_setting(name: str, key: str, value: str) -> str:
-    """Return the setting of a key of a channel, as `Cause.setting` has it; the value is TOML."""
+    """Return a setting of a channel in the format of `Cause.setting`; the value is TOML."""
     return f"channels.{quoted(name)}.{key}={value}"
 
 
 def too_few(what: str, samples: int) -> str:
-    """Return why a test was not made, for `Verdict.untested`: there are too few samples."""
+    """Return the entry of `Verdict.untested` for a test with too few samples."""
     return f"{what}: {samples} samples, at least {FEWEST} required"
 
 
 def at_bound(label: str, value: float) -> Finding:
-    """Return the finding of an unknown that ends at a bound."""
+    """Return the finding that the estimate of an unknown is at a bound."""
     text, _ = FINDINGS["bound"].filled(label=label, value=value)
     return Finding("bound", "caution", text, label, value)
 
 
 def at_limit() -> Finding:
-    """Return the finding of unknowns that are held at the allowed distance from the prior."""
+    """Return the finding that unknowns are held at the allowed distance from the prior."""
     text, remedy = FINDINGS["held, now"]
     return Finding("held", "do not trust", text, remedy=remedy)
 
 
 def flat(label: str, left: float) -> Finding:
-    """Return the finding of an unknown that the data do not identify."""
+    """Return the finding that an unknown is not identifiable; `left`: posterior over prior std."""
     text, remedy = FINDINGS["flat"].filled(label=label, left=percent(left))
     return Finding("flat", "caution", text, label, left, remedy=remedy)
 
 
 def _after_misfit(findings: Iterable[Finding]) -> list[Finding]:
-    """Return findings; beside a gross misfit, a wide interval shows nothing about the data."""
+    """Return findings; if there is a misfit, it is named as the reason for wide intervals."""
     given = list(findings)
     if not any((one.what, one.severity) == ("misfit", "do not trust") for one in given):
         return given
@@ -241,7 +240,7 @@ def _after_misfit(findings: Iterable[Finding]) -> list[Finding]:
 
 
 def _ranked(findings: Iterable[Finding], errors: ModelErrors) -> list[Finding]:
-    """Return findings whose severities follow from fit and effect, with what these are."""
+    """Return findings with severities from misfit and effect, led by the finding "effect"."""
     given = [finding for finding in findings if finding.what != "effect"]
     doubted = any(finding.what in DOUBTS for finding in given)
     level = errors.level(doubted=doubted)
@@ -258,7 +257,7 @@ def _ranked(findings: Iterable[Finding], errors: ModelErrors) -> list[Finding]:
 
 
 def _gross(finding: Finding) -> bool:
-    """Whether a column is in another unit, or of another sensor: then no estimate is right."""
+    """Return whether a column has a wrong unit or sensor, which invalidates all estimates."""
     first = finding.causes[0] if finding.causes else None
     return first is not None and first.kind in GROSS and first.share >= HALF
 
@@ -268,46 +267,46 @@ def _graver(finding: Finding) -> Finding:
 
 
 def _merged(causes: Sequence[Cause], known: Sequence[Cause]) -> tuple[Cause, ...]:
-    """Return causes that were fitted, with those that a run has named before, by their shares."""
+    """Return fitted causes and the known causes of a run, sorted by their shares."""
     before = {(one.kind, one.subject): one for one in known}
-    # What frees a cause is known where the run has named it already. A key that corrects a column
-    # has the size that was fitted.
+    # A fitted cause without a setting adopts remedy and setting of the known cause. A setting that
+    # corrects a column depends on the fitted size, so it is kept.
     causes = [
         replace(one, remedy=named.remedy, setting=named.setting)
         if not one.setting and (named := before.get((one.kind, one.subject)))
         else one
         for one in causes
     ]
-    # An offset or a gain of an input is that of a boundary value, or of a channel.
+    # An offset or a gain of an input is the same cause as its boundary value or channel.
     said = {(kind, one.subject) for one in causes for kind in (one.kind, "boundary", "channel")}
     others = [one for one in known if (one.kind, one.subject) not in said]
-    # Of the same share what was fitted counts more than what a linear model says.
+    # The sort is stable: at equal shares, fitted causes precede causes from the linear model.
     return tuple(sorted([*causes, *others], key=lambda one: -one.share)[:NAMED])
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the estimates of a run are to be believed.
+    """Assessment of whether the estimates of a run can be trusted.
 
     Attributes
     ----------
     level
-        "trusted", "caution", "not judged" or "do not trust". A run whose main tests were not made
-        is not judged, unless something says not to trust it.
+        "trusted", "caution", "not judged" or "do not trust". If the main tests were not made, the
+        level is "not judged", unless a finding is "do not trust".
     findings
         Findings against the estimates, the worst first, and notes.
     untested
-        Tests that were not made, and why; of a run that is not judged the main ones come first.
+        Tests that were not made, with reasons. If the run is not judged, main tests come first.
     unseen
-        Errors that the data would not show and that would yet move an estimate by more than its
-        interval, as sentences, the worst first.
+        Sentences on errors that data cannot reveal, but that would shift an estimate by more than
+        its interval, the worst first.
     judged
-        Whether the main tests were made: what is left of the readings, or of the equation, is noise
-        if the model is right.
+        Whether the main tests were made. They check whether the residuals of the readings, or of
+        the equation, are noise.
     errors
-        Misfit of the model, and intervals that allow for its errors; None if not computed. With
-        them the level follows from fit and effect: however much speaks against a model, its
-        estimates may be of use.
+        Misfit of the model, and intervals that allow for its errors; None if not computed. If
+        given, the level follows from misfit and effect, because the estimates of an inexact model
+        may still be useful.
     """
 
     level: Level
@@ -327,7 +326,7 @@ class Verdict:
         judged: bool = True,
         errors: ModelErrors | None = None,
     ) -> Verdict:
-        """Return the verdict of some findings: the worst of them counts."""
+        """Return the verdict on findings: the worst of them determines the level."""
         if errors is not None:
             findings = _ranked(findings, errors)
         findings = _after_misfit(findings)
@@ -354,14 +353,14 @@ class Verdict:
 
     @classmethod
     def unjudged(cls) -> Verdict:
-        """Return the verdict where nothing was looked at."""
+        """Return the verdict on a run without any test."""
         return cls.of((), ("everything: no law has tested the run",), judged=False)
 
     def with_findings(self, more: Iterable[Finding]) -> Verdict:
-        """Return the verdict with more findings, each of them once.
+        """Return the verdict with additional findings, without duplicates.
 
-        One on the same unknown or sensor as an earlier one, or on the run as a whole (`ONCE`),
-        replaces it: it is of later data.
+        A new finding replaces an earlier one of the same name on the same subject. A finding in
+        `ONCE` replaces an earlier one of the same name, because it is based on later data.
         """
         texts = {finding.text for finding in self.findings}
         new = [finding for finding in more if finding.text not in texts]
@@ -370,11 +369,11 @@ class Verdict:
         return self._with(findings=[*kept, *new])
 
     def with_errors(self, errors: ModelErrors) -> Verdict:
-        """Return the verdict whose level follows from fit and effect."""
+        """Return the verdict with model errors: its level follows from misfit and effect."""
         return self._with(errors=errors)
 
     def with_untested(self, untested: str) -> Verdict:
-        """Return the verdict with one more thing that was not tested."""
+        """Return the verdict with an additional entry in `untested`."""
         return self._with(untested=(*self.untested, untested))
 
     def _with(self, **parts: Any) -> Verdict:
@@ -382,9 +381,9 @@ class Verdict:
         return Verdict.of(**(own | parts))
 
     def with_causes(self, causes: Sequence[Cause]) -> Verdict:
-        """Return the verdict with other causes of its misfit, the likeliest first.
+        """Return the verdict with fitted causes of its misfit, the likeliest first.
 
-        Without a misfit one is added if the first of them explains half of it.
+        If there is no finding of a misfit, one is added if the first cause explains half of it.
         """
         misfit = next((one for one in self.findings if one.what == "misfit"), None)
         if misfit is None:
@@ -402,18 +401,18 @@ class Verdict:
 
     @property
     def every_sentence(self) -> list[str]:
-        """Whether the run is not judged, and all findings: a sentence each, the worst first."""
+        """A sentence if the run is not judged, and one for each finding, the worst first."""
         why = f" ({self.untested[0]})" if self.untested else ""
         first = [] if self.judged else [f"Not judged: the model was not tested{why}."]
         return list(dict.fromkeys([*first, *(finding.sentence for finding in self.findings)]))
 
     @property
     def sentences(self) -> list[str]:
-        """At most five sentences, the worst first, each once."""
+        """The first five sentences, the worst first, without duplicates."""
         return self.every_sentence[:MOST]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the verdict as JSON can hold it."""
+        """Return the verdict as a dictionary for JSON."""
         findings = [finding.to_dict() for finding in self.findings]
         errors = None if self.errors is None else self.errors.to_dict()
         lists = {"untested": list(self.untested), "unseen": list(self.unseen)}
@@ -425,25 +424,25 @@ class Verdict:
 
 @dataclass(frozen=True, eq=False)
 class Shifts(Generic[Number]):
-    """Shifts of the unknown numbers by errors that are estimated online.
+    """Shifts of the unknowns due to errors that are estimated online.
 
-    Kinds of errors are "step", "mesh", "input" and so on. A number is a float, or an array over
+    Kinds of errors are "step", "mesh", "input" and "hold". A number is a float, or an array over
     members.
     """
 
-    # Largest shift of an unknown by all kinds together, in standard deviations; NaN: not known
+    # Largest total shift of an unknown, in standard deviations; NaN if not known
     largest: Number = NOT_KNOWN
-    # Kind -> shift of that unknown, in standard deviations
+    # Kind -> shift of the unknown with the largest total, in standard deviations
     sizes: Mapping[str, Number] = field(default_factory=dict)
-    # (Label of an unknown, kind) -> its shift, in the unit of the unknown
+    # (Label of an unknown, kind) -> shift, in the unit of the unknown
     unknowns: Mapping[tuple[str, str], Number] = field(default_factory=dict)
 
     def by(self, kind: str) -> dict[str, Number]:
-        """Return label -> shift by one kind of error."""
+        """Return label -> shift due to one kind of error."""
         return {label: shift for (label, of), shift in self.unknowns.items() if of == kind}
 
     def named(self) -> dict[str, Number]:
-        """Return the numbers by their names in tables and files, NaN among them."""
+        """Return column name in tables and files -> number, which may be NaN."""
         sizes = {f"{kind}_shift": size for kind, size in self.sizes.items()}
         shifts = {f"{label}_{kind}_shift": shift for (label, kind), shift in self.unknowns.items()}
         return {"discretisation_shift": self.largest, **sizes, **shifts}
@@ -457,14 +456,14 @@ class Shifts(Generic[Number]):
 
 
 def known(number: Any) -> bool:
-    """Return whether a number, or an array over members, is known: that is not NaN alone."""
-    if isinstance(number, float):  # as most are: without a call of NumPy
+    """Return whether a number is known: it is an array over members, or a scalar other than NaN."""
+    if isinstance(number, float):  # the usual case, without the cost of a NumPy call
         return not math.isnan(number)
     return bool(np.ndim(number)) or not math.isnan(number)
 
 
 def discretised(shifts: Shifts[float]) -> Iterator[Finding]:
-    """Return the finding that the discretisation has shifted the unknowns, if it has."""
+    """Yield the finding on shifts of the unknowns due to discretisation, if significant."""
     total = shifts.largest
     sizes = {kind: abs(shifts.sizes[kind]) for kind in REFINE if kind in shifts.sizes}
     if not total > SHIFTED or not sizes:
@@ -473,23 +472,23 @@ def discretised(shifts: Shifts[float]) -> Iterator[Finding]:
     each = [f"{REFINE[kind][0]} by {sizes[kind]:.1f}{_listed(shifts.by(kind))}" for kind in parts]
     text, _ = FINDINGS["discretisation"].filled(total=total, each=", ".join(each))
     remedy = " ".join(REFINE[kind][1] for kind in parts)
-    # Shifts are part of the reported variance. Beyond five deviations the interval is little else,
-    # and depends more on the mesh and the step than on the data.
+    # The reported variance includes the shifts. Beyond `DECIDES` deviations, the interval depends
+    # more on the mesh and the step than on the data.
     unsure = total > DECIDES or sizes.get("input", 0.0) > GUESSED
-    severity: Severity = "caution" if unsure else "note"  # the interval holds it
+    severity: Severity = "caution" if unsure else "note"
     yield Finding("discretisation", severity, text, evidence=total, remedy=remedy)
 
 
 def _named(sizes: Mapping[str, float]) -> list[str]:
-    """Return the largest kind of shift, and each from `SHARED` on, the largest first."""
-    # Shares may cancel in the total.
+    """Return the kinds of shifts of at least `SHARED`, but at least one, the largest first."""
+    # All kinds may be below `SHARED`, because the total adds them.
     least = min(max(sizes.values()), SHARED)
     kinds = sorted(sizes, key=sizes.__getitem__, reverse=True)
     return [kind for kind in kinds if sizes[kind] >= least]
 
 
 def held_inputs(shifts: Shifts[float]) -> Iterator[Finding]:
-    """Return whether inputs that are constant between readings would matter as straight lines."""
+    """Yield a finding if linear interpolation of held inputs would shift the unknowns."""
     total = abs(shifts.sizes.get(HOLD, math.nan))
     if not total > SETTING:
         return
@@ -499,6 +498,6 @@ def held_inputs(shifts: Shifts[float]) -> Iterator[Finding]:
 
 
 def _listed(shifts: Mapping[str, float]) -> str:
-    """Return the shifts of the first unknowns in parentheses."""
+    """Return the shifts of at most `LISTED` unknowns in parentheses."""
     parts = [f"{label} by {shift:+.2g}" for label, shift in shifts.items() if math.isfinite(shift)]
     return f" ({', '.join(parts[:LISTED])})" if parts else ""

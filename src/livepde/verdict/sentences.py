@@ -1,7 +1,7 @@
-"""Every sentence that a verdict can print: findings, likely causes, and what to do.
+"""All sentences of a verdict: findings, likely causes, and remedies.
 
-Findings fill these templates; what programs read is in the fields of `Finding` and `Cause`. A cause
-is a clause without a full stop, as it can be part of a list.
+Findings fill these templates; programs read the fields of `Finding` and `Cause` instead. A cause is
+a clause without a full stop, because it can be part of a list.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import NamedTuple
 from livepde.showing import in_percent
 
 SMALLEST = 1e-6  # p-value that is printed
-CENTI = {"m": ("cm", "mm")}  # unit -> those of a hundredth and a thousandth
+CENTI = {"m": ("cm", "mm")}  # unit -> units of a hundredth and a thousandth of it
 
 
 class Sentence(NamedTuple):
@@ -294,7 +294,7 @@ FINDINGS: dict[str, Sentence] = {
         "Check inputs, boundary values and their units.",
     ),
 }
-"""Test, and variant of its result -> statement and remedy."""
+"""Test, and variant of its result -> statement with its remedy."""
 
 LIKELY: dict[str, Sentence] = {
     "offset": Sentence(
@@ -378,14 +378,14 @@ LIKELY: dict[str, Sentence] = {
     "clock, unit": Sentence("the unit of time may have changed at {at}"),
     "clock, leap": Sentence("the clock may have jumped by {times} at {at}"),
 }
-"""Kind of a cause, and its variant -> the cause as a clause, and its remedy."""
+"""Kind of a cause, and its variant -> clause with its remedy."""
 
 ESTIMATED = {
     "offset": ("an offset", "offset"),
     "gain": ("a gain", "gain"),
     "position": ("its position", "at_std"),
 }
-"""Kind of an error of a sensor -> what to estimate, and the key that makes it an unknown."""
+"""Kind of sensor error -> the quantity to estimate, and the key that makes it an unknown."""
 
 SIDES = {
     "offset": ("high", "low"),
@@ -400,20 +400,20 @@ SIDES = {
     "initial": ("higher", "lower"),
     "initial, uncertain": ("higher", "lower"),
 }
-"""Kind of a cause -> its side in words if it is positive, and if it is negative."""
+"""Kind of a cause -> word for its direction if it is positive, and if it is negative."""
 
 
 def clause(
     kind: str, name: str, size: float, size_unit: str, *, positive: bool, **more: object
 ) -> Sentence:
-    """Return a cause of a size in a unit as a clause, and its remedy."""
+    """Return the clause for a cause of a size in a unit, with its remedy."""
     side = SIDES[kind][not positive] if kind in SIDES else ""
     amount, share = amount_of(abs(size), size_unit), in_percent(abs(size))
     return LIKELY[kind].filled(name=name, amount=amount, share=share, side=side, **more)
 
 
 def table_of(name: str) -> str:
-    """Return the table of a channel in a case, as a sentence has it.
+    """Return the name of a channel's table in a case, for use in a sentence.
 
     >>> table_of("T_50"), table_of("T 50")
     ('`[channels.T_50]`', '`[channels."T 50"]`')
@@ -422,13 +422,13 @@ def table_of(name: str) -> str:
 
 
 def quoted(name: str) -> str:
-    """Return the name of a channel as a key of TOML."""
+    """Return the name of a channel as a TOML key, quoted if necessary."""
     plain = re.fullmatch(r"[A-Za-z0-9_-]+", name)
     return name if plain else json.dumps(name, ensure_ascii=False)
 
 
 def estimating(kind: str, name: str, value: str) -> str:
-    """Return how to make an error of a sensor an unknown; the value is TOML.
+    """Return the remedy that estimates a sensor error; the value is TOML.
 
     >>> estimating("offset", "T_50", '"0.2 K"')
     'To test this, estimate an offset: add `offset = "0.2 K"` to `[channels.T_50]`.'
@@ -438,13 +438,13 @@ def estimating(kind: str, name: str, value: str) -> str:
 
 
 def width(size: float, unit: str) -> str:
-    """Return a standard deviation of twice a size, with its unit as TOML."""
+    """Return twice a size as a standard deviation in TOML, with its unit."""
     value, unit = f"{2.0 * abs(size):.2g}", unit.replace("degC", "K")
     return f'"{value} {unit}"' if unit else value
 
 
 def percent(share: float, digits: int = 0) -> str:
-    """Return a share in per cent.
+    """Return a share as a percentage.
 
     >>> percent(0.187), percent(0.0234, 1)
     ('19 %', '2.3 %')
@@ -453,7 +453,7 @@ def percent(share: float, digits: int = 0) -> str:
 
 
 def amount_of(size: float, unit: str) -> str:
-    """Return a positive size with its unit, as a difference: of temperatures in K.
+    """Return a positive difference with its unit: a difference of temperatures is in K.
 
     >>> (
     ...     amount_of(0.01, "m"),
@@ -471,7 +471,7 @@ def amount_of(size: float, unit: str) -> str:
 
 
 def significance(log_e: float) -> str:
-    """Return the largest p-value that an e-value allows: by Ville's inequality, its inverse.
+    """Return a bound of the p-value: by Ville's inequality, the inverse of the e-value.
 
     >>> significance(20.0), significance(10.0)
     ('p < 1e-6', 'p < 5e-5')
