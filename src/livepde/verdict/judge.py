@@ -1,26 +1,25 @@
-"""Running scores of a filter: the data of its verdict, and the shifts by causes of misfit.
+"""Running scores of a filter: the data of its verdict, and the shifts due to causes of misfit.
 
-Let delta be the difference of the truth and the estimate of [u; a] due to a cause of amplitude one,
-and f the direct effect of that cause on the readings. A Kalman filter without a model of the cause
-has the innovations r = r_0 + theta g with
+Let delta be truth minus estimate of [u; a] due to a cause of unit amplitude, and f the direct
+effect of that cause on the readings. A Kalman filter without a model of the cause has innovations
+r = r_0 + theta g with
 
     g = H delta + f,    delta <- delta - K g,    delta <- S delta between samples
 
-(Friedland 1969; Willsky and Jones 1976). Causes act on sensors or through a response p of the state
-that goes on by itself, so that delta = p + [U C]^T w: it starts with w = 0, and predictions move
-the rows of [U C] as they move delta. With Y = H [U C]^T and W W^T = (I + Y N^-1 Y^T)^-1, in units
-of the noise, an update is
+(Friedland 1969; Willsky and Jones 1976). Causes act on sensors or through a free response p of the
+state, so that delta = p + [U C]^T w. Initially w = 0, and predictions map the rows of [U C] as they
+map delta. With Y = H [U C]^T and W W^T = (I + Y N^-1 Y^T)^-1, in units of the noise, an update is
 
     w <- W^T (w - Y f),    since  [U C] <- W^T [U C]  and  K = [U C]^T W W^T Y N^-1.
 
-A sample only writes one row of numbers; a batch of rows is summed at once. `FilterState.causes`
-holds M, by which updates and predictions have moved the rows of [U C] since the last sample, so
-that the batch has
+For each sample only one row of numbers is stored, and rows are summed in batches.
+`FilterState.causes` is M, the product of the maps of the rows of [U C] since the last sample, so
+that a batch satisfies
 
     w_k = M_k (w_(k-1) - Y_(k-1) f_(k-1)),    g_k = f_k + Y_k^T w_k.
 
-So w costs no solve: it is exact for a linear filter, whatever moves, and C^T w is the truth less
-the estimate of the unknowns for each unit of the cause.
+Thus w requires no solve. It is exact for a linear filter, including moving unknowns, and C^T w is
+truth minus estimate of the unknowns per unit of the cause.
 """
 
 from __future__ import annotations
@@ -37,29 +36,31 @@ from livepde.verdict.directions import JUMP, Dictionary, Now, stride
 from livepde.verdict.evidence import causes_of, quiet
 from livepde.verdict.ledger import WINDOWS, Ledger, batch_of, blocked, summed
 
-MOST_MEMBERS = 16  # of a fleet in which missing terms are looked for
-MOST_RECORDED = 400  # numbers in a block of the record of the unknowns
-SAME = 1e-12  # relative difference of readings that are the same
-REACHED = 1e-6  # of a step: times that are the same but for rounding
+MOST_MEMBERS = 16  # largest fleet that is tested for missing terms
+MOST_RECORDED = 400  # most numbers in a block of the record of the unknowns
+SAME = 1e-12  # relative tolerance for equal readings
+REACHED = 1e-6  # tolerance for equal times, as a share of a step
 
 
 class ScoredSample(NamedTuple):
-    """Prior of a filter at a sample, with the sample; in units of the noise."""
+    """A sample and the prior of a filter at its time, in units of the noise."""
 
     # C, M: square root of the covariance of the unknowns, (members, r, k), and the product of the
-    # matrices that have moved its rows since the last sample, (members, r, rank)
+    # maps of its rows since the last sample, (members, r, rank)
     C: Array
     M: Array
-    # a, q: functions that return the estimated reduced and latent unknowns: not every judge asks
+    # a, q: functions that return the estimated reduced and latent unknowns, since few judges
+    # require them
     a: Callable[[], Array]
     q: Callable[[], Array]
-    u: Array  # the estimated state
-    # Y, d, used: observed square root, (members, r, sensors), innovations less their shift by the
-    # estimated discretisation error, and the mask of the values that are used
+    u: Array  # estimated state
+    # Y, d, used: observed square root, (members, r, sensors), innovations minus their shift due to
+    # the estimated discretisation error, and mask of the values in use
     Y: Array
     d: Array
     used: Mask
-    # z, predicted, noise: readings, their predictions, and the noise, (members or 1, sensors)
+    # z, predicted, noise: readings, predictions, and standard deviations of the noise,
+    # (members or 1, sensors)
     z: Array
     predicted: Array
     noise: Array
@@ -67,13 +68,12 @@ class ScoredSample(NamedTuple):
 
 
 class Judge:
-    """Configuration of a ledger: it adds samples to it, and sums them.
+    """Adds samples to a ledger and sums them.
 
     `dictionary`: the directions.
-    `sensors`, `unknowns`, `n`: number of sensors, of reduced unknowns and of coefficients of the
-    state.
-    `rank`: rows of the square root at most when samples come.
-    `still`: whether all unknowns stay as they are, so that their record can be kept.
+    `sensors`, `unknowns`, `n`: number of sensors, reduced unknowns and coefficients of the state.
+    `rank`: largest number of rows of the square root at a sample.
+    `still`: whether all unknowns are constant, so that their record can be kept.
     """
 
     def __init__(
@@ -81,14 +81,14 @@ class Judge:
     ) -> None:
         self.dictionary = dictionary
         self.sensors, self.unknowns, self.n, self.rank = sensors, unknowns, n, rank
-        # The record takes (k, k) numbers for each sensor and block, and the scores of unknowns that
-        # move cannot be cumulated.
+        # The record has (k, k) numbers for each sensor and block. Scores of varying unknowns cannot
+        # be accumulated.
         self.recorded = still and 0 < sensors * unknowns**2 <= MOST_RECORDED
         self.windows = len(WINDOWS)
         self.terms = len(dictionary.process.terms) if dictionary.process else 0
         self._drift = dictionary.parts.get("drift", slice(0, 0))
         self._jump, self._process = dictionary.parts["jump"], dictionary.parts["process"]
-        # Numbers of a sample, in the order in which `add` writes them.
+        # Layout of the row of a sample, see `_row`.
         sizes = {
             "t": 1,
             "used": sensors,
@@ -118,22 +118,22 @@ class Judge:
         return Ledger.start(self.sensors, *counts, self.batch, self.numbers)
 
     def add(self, ledger: Ledger, sample: ScoredSample) -> tuple[Array, Ledger]:
-        """Return M of the next sample before its update, the identity, and the ledger."""
+        """Return the ledger with a sample, and M before the update of this sample: the identity."""
         M = sample.M
         members, r, _ = M.shape
-        # A batch is summed when the next sample comes, so that whoever reads the verdict in between
-        # sums a copy and changes nothing. None waits before the first sample, too.
+        # A full batch is summed when the next sample arrives, so that a verdict in between sums a
+        # copy without side effects. The condition also holds before the first sample.
         if np.count_nonzero(ledger.waiting % self.batch) < members:
             M, ledger = self._begin_batch(ledger, sample)
         reached = _reached(ledger, sample.at.t)
-        # Missing terms cost a solve for each member.
+        # Missing terms require a solve for each member.
         follows = self.terms > 0 and members <= MOST_MEMBERS
         if follows and np.count_nonzero(reached) < members:
             ledger = self._extend_answers(ledger, sample)
         rows, waiting = ledger.rows.copy(), ledger.waiting
         rows[np.arange(members), waiting] = self._row(sample, M)
-        # The update of this sample multiplies M by W^T, and predictions by what moves the rows of
-        # [U C].
+        # The update of this sample will multiply M by W^T, and predictions by their maps of the
+        # rows of [U C].
         one = self._eye[:, :r]
         after = changed(ledger, seen=ledger.seen + 1, waiting=ledger.waiting + 1, rows=rows)
         return one if members == 1 else np.repeat(one, members, axis=0), after
@@ -148,10 +148,10 @@ class Judge:
         for name, part in (("Y", sample.Y), ("M", M)):
             start, stop = at[name].start, at[name].stop
             row[:, start : start + part[0].size] = part.reshape(members, -1)
-            row[:, start + part[0].size : stop] = 0.0  # rows that a square root lacks
+            row[:, start + part[0].size : stop] = 0.0  # if the square root has fewer rows
         if self.dictionary.axes:
             row[:, at["moved"]] = self.dictionary.moved(sample.u)
-        if self.terms:  # interpolated later on, many at once
+        if self.terms:  # interpolated later for the whole batch
             row[:, at["answers"]] = np.nan
         if self.recorded:
             known = sample.C.shape[1] == self.unknowns
@@ -159,14 +159,14 @@ class Judge:
             row[:, at["C"]] = sample.C.reshape(members, -1) if known else 0.0
         return row
 
-    @nonfinite_allowed()  # counted as nothing
+    @nonfinite_allowed()  # nonfinite effects are set to zero
     def summed_up(self, ledger: Ledger, M: Array) -> tuple[Array, Ledger]:
-        """Return w and the ledger after all samples that wait are summed.
+        """Return w and the ledger after all waiting samples are summed.
 
-        `M`: as it is now, (members, r, rank). `w`: (members, r, windows times directions).
+        `M`: current value, (members, r, rank). `w`: shape (members, r, windows * directions).
         """
         members, at, due = len(ledger.seen), self._at, ledger.due
-        # Only as many rows as some member has waiting are summed.
+        # Sum only as many rows as any member has.
         batch = max(int(ledger.waiting.max(initial=0)), 1)
         rows, there = ledger.rows[:, :batch], np.arange(batch) < ledger.waiting[:, None]
         ledger = self._with_interval(ledger, rows, there)
@@ -174,20 +174,20 @@ class Judge:
         Y = rows[:, :, at["Y"]].reshape(members, batch, self.rank, self.sensors)
         f, growth = self._effects(ledger, rows, used, due)
         before, w = self._coordinates(ledger, rows, there, _in_windows(Y @ f, growth))
-        # Innovations and g, not yet whitened, in one array: (members, batch, sensors, 1 + columns).
+        # Stack innovations and g before whitening: (members, batch, sensors, 1 + columns).
         d = rows[:, :, at["d"], None]
         found = np.concatenate([d, _in_windows(f, growth) + Y.swapaxes(-1, -2) @ before], axis=-1)
         # T = (1 + Y^T Y)^(-1/2) = 1 + X scale X^T whitens the innovations of a sample.
         X, scale = _whitening(Y)
         found += X @ (scale * (X.swapaxes(-1, -2) @ found))
-        # A single wild value must be no evidence for a cause (Huber's loss).
+        # A single outlier must not be evidence for a cause (Huber's loss).
         found[..., 0] = ledger.clipped(found[..., 0])
         if not there.all():
             found *= there[:, :, None, None]
-        # Sums over the samples that waited, in the windows that go on or begin with them.
+        # Sums over the waiting samples, in windows that continue or begin with them.
         parts: dict[str, Any] = summed(ledger, due, found, used)
-        # The record is of raw residuals about the prior mean, d + Y^T a: its scores do not depend
-        # on the estimate of the moment, so that blocks of different times may be added.
+        # The record uses raw residuals about the prior mean, d + Y^T a. Its scores do not depend on
+        # the current estimate, so blocks of different times can be added.
         if self.recorded:
             parts |= blocked(ledger, *self._record(rows, Y[:, :, : self.unknowns], used))
         z, last = rows[:, :, at["z"]], rows[np.arange(members), np.maximum(ledger.waiting - 1, 0)]
@@ -209,10 +209,10 @@ class Judge:
     def _coordinates(
         self, ledger: Ledger, rows: Array, there: Mask, effect: Array
     ) -> tuple[Array, Array]:
-        """Return w before the update of each sample that waits, and w - Y f of the last one.
+        """Return w before the update of each waiting sample, and w - Y f of the last sample.
 
-        Shapes (members, batch, rank, columns) and (members, rank, columns). Where none is there w
-        stays.
+        Shapes (members, batch, rank, columns) and (members, rank, columns). Members without a
+        sample keep their w.
         """
         M = rows[:, :, self._at["M"]].reshape(*rows.shape[:2], self.rank, self.rank)
         before, w, whole = np.empty_like(effect), ledger.w, bool(there.all())
@@ -223,9 +223,9 @@ class Judge:
         return before, w
 
     def _record(self, rows: Array, Y: Array, used: Array) -> tuple[Array, Array]:
-        """Return sensitivities to the unknowns, and residuals at the prior mean, of the record.
+        """Return sensitivities to the unknowns, and residuals at the prior mean, for the record.
 
-        Shapes (members, batch, k, sensors) and (members, batch, sensors); zero where no value is.
+        Shapes (members, batch, k, sensors) and (members, batch, sensors); zero without a value.
         """
         at, k = self._at, self.unknowns
         Y = _sensitivity(rows[:, :, at["C"]].reshape(*rows.shape[:2], k, k), Y)
@@ -233,7 +233,7 @@ class Judge:
         return Y * used[:, :, None], told * used
 
     def _with_interval(self, ledger: Ledger, rows: Array, there: Mask) -> Ledger:
-        """Return the ledger with the usual interval, the first one, and the first predictions."""
+        """Return the ledger with its first interval, as the usual one, and first predictions."""
         if np.isfinite(ledger.times[:, 1]).all() and np.isfinite(ledger.first).all():
             return ledger
         times = np.concatenate([ledger.times[:, :1], rows[:, :, 0]], axis=1)
@@ -247,15 +247,15 @@ class Judge:
 
     @staticmethod
     def _stuck(ledger: Ledger, z: Array) -> dict[str, Any]:
-        """Return how often in a row sensors have shown the same value, and that value."""
+        """Return the number of successive repetitions of the latest value, and that value."""
         before = np.concatenate([ledger.value[:, None], z[:, :-1]], axis=1)
-        # Most often all are shown, and none is that before.
+        # Fast path for the usual case: no value is missing, and none repeats.
         if np.isfinite(z).all() and not (np.abs(z - before) <= SAME * np.abs(z)).any():
             return {"stuck": np.zeros_like(ledger.stuck), "value": z[:, -1]}
         z = np.concatenate([ledger.value[:, None], z], axis=1)
         order, seen = np.arange(z.shape[1])[:, None], np.isfinite(z)
         latest = np.maximum.accumulate(np.where(seen, order, 0), axis=1)
-        value = np.take_along_axis(z, latest, axis=1)  # the last one that was shown
+        value = np.take_along_axis(z, latest, axis=1)  # latest finite value
         same = np.abs(z[:, 1:] - value[:, :-1]) <= SAME * np.abs(z[:, 1:])
         changes = np.where(seen[:, 1:] & ~same, order[1:], 0).max(axis=1)
         since = (seen[:, 1:] & (order[1:] > changes[:, None])).sum(axis=1)
@@ -263,7 +263,7 @@ class Judge:
         return {"stuck": stuck, "value": value[:, -1]}
 
     def _begin_batch(self, ledger: Ledger, sample: ScoredSample) -> tuple[Array, Ledger]:
-        """Return M and the ledger of members whose batch is full, or the first one."""
+        """Return M and the ledger with a new batch for members whose batch is full or empty."""
         full = ledger.waiting == self.batch
         begins = full | (ledger.waiting == 0)
         members, r, _ = sample.M.shape
@@ -280,17 +280,17 @@ class Judge:
         return M, changed(ledger, w=np.where(chosen, kept, ledger.w))
 
     def _begin_windows(self, ledger: Ledger, sample: ScoredSample, due: Mask, w: Array) -> Array:
-        """Return w with that of windows that begin: nothing but jumps of the unknowns."""
+        """Return w with initial values in windows that begin: zero except for jumps."""
         count = len(self.dictionary)
         if not due.any() or not count:
             return w
         members, r, _ = w.shape
-        # Directions of a new window have not moved the estimate yet: w = 0 ...
+        # Directions of a new window have not shifted the estimate yet: w = 0 ...
         w = w.reshape(members, r, self.windows, count)
         w.transpose(0, 2, 1, 3)[due] = 0.0
         jumps = self.dictionary.jumps
         if jumps and ledger.seen.any():
-            # ... but a jump of an unknown is a shift C^T w = e of the estimate from the beginning.
+            # ... but a jump of an unknown is an initial shift C^T w = e of the estimate.
             units = JUMP * np.eye(sample.C.shape[2])[:, jumps]
             for k in np.flatnonzero(due[:, 1:].any(axis=1)).tolist():
                 moved = np.linalg.lstsq(sample.C[k].T, units, rcond=None)[0]
@@ -299,15 +299,15 @@ class Judge:
         return w.reshape(members, r, -1)
 
     def _effects(self, ledger: Ledger, rows: Array, used: Array, due: Mask) -> tuple[Array, Array]:
-        """Return f of the samples that wait, (members, batch, sensors, directions).
+        """Return f of the waiting samples, and its factor in each window.
 
-        And its factor in each window, (members, batch, windows, directions): a drift begins with
-        its window and grows by one unit with each sample.
+        Shapes (members, batch, sensors, directions) and (members, batch, windows, directions). A
+        drift starts with its window and grows by one unit per sample.
         """
         at, (members, batch, _) = self._at, rows.shape
         t, h = rows[:, :, 0], rows[:, :, at["predicted"]]
         before = np.concatenate([ledger.times[:, :1], t[:, :-1]], axis=1)
-        # A sensor that is late by a sample shows the prediction of the sample before it.
+        # A sensor that is late by one sample shows the prediction of the previous sample.
         last = np.concatenate([ledger.last[:, None], h[:, :-1]], axis=1)
         late = (last - h) * (ledger.times[:, 1:] / (t - before))[:, :, None]
         moved, change = rows[:, :, at["moved"]], h - ledger.first[:, None]
@@ -315,23 +315,23 @@ class Judge:
         answers = answers.reshape(members, batch, self.terms, self.sensors)
         f = self.dictionary.effects(rows[:, :, at["noise"]], change, late, moved, answers)
         f *= used[..., None]
-        f[~np.isfinite(f)] = 0.0  # the sample before is not known, or a row is not filled
+        f[~np.isfinite(f)] = 0.0  # without a previous sample, or in rows that are not filled
         growth = np.ones((members, batch, self.windows, len(self.dictionary)))
         age = np.where(due, 0, ledger.age)[:, None] + np.arange(batch)[:, None]
         growth[..., self._drift] = age[..., None]
         return f, growth
 
     def _answers(self, ledger: Ledger) -> Array:
-        """Return readings due to missing terms at samples that wait, (members, batch, numbers)."""
+        """Return readings due to missing terms at waiting samples, (members, batch, numbers)."""
         known = ledger.rows[:, :, self._at["answers"]]
         since = (ledger.rows[:, :, 0] - ledger.reached[:, :1])[:, :, None]
         low, slope = ledger.readings.reshape(len(known), 2, 1, -1).swapaxes(0, 1)
         return np.where(np.isnan(known), low + since * slope, known)
 
     def _extend_answers(self, ledger: Ledger, sample: ScoredSample) -> Ledger:
-        """Return the ledger with responses of the process that reach a sample at least.
+        """Return the ledger with responses of the process that extend to the time of a sample.
 
-        One step of the process answers for several samples, which interpolate between its ends.
+        One step of the process spans several samples, whose responses are interpolated.
         """
         process, t = self.dictionary.process, sample.at.t
         if process is None:
@@ -341,10 +341,10 @@ class Judge:
         p, readings = ledger.process.copy(), ledger.readings.copy()
         reached, q = ledger.reached.copy(), sample.q()
         for k in np.flatnonzero(~_reached(ledger, t)).tolist():
-            # Without a better guess, what the sensors showed first is where nothing is lost.
+            # The mean of the first predictions approximates the equilibrium state without loss.
             first = ledger.first[k, np.isfinite(ledger.first[k])]
             rest = float(first.sum()) / max(len(first), 1)
-            # The usual interval, or the time since the first sample.
+            # The usual interval, or else the time since the first sample.
             unit, since = float(ledger.times[k, 1]), t - float(ledger.rows[k, 0, 0])
             if not np.isfinite(unit):
                 unit = since if since > 0.0 else 1.0
@@ -364,18 +364,18 @@ class Judge:
 
 
 def _reached(ledger: Ledger, t: float) -> Mask:
-    """Return whether the responses reach a time; where samples are regular, they end at one."""
+    """Return whether the responses reach a time; the tolerance is for regular sample times."""
     begin, end = ledger.reached.T
     return np.asarray(end >= t - REACHED * (end - begin))
 
 
 def _in_windows(effect: Array, growth: Array) -> Array:
-    """Return effects of each direction in each window, (..., k, windows * directions)."""
+    """Return the effect of each direction in each window, (..., k, windows * directions)."""
     return (effect[..., None, :] * growth[:, :, None]).reshape(*effect.shape[:3], -1)
 
 
 def _sound(ledger: Ledger, due: Mask) -> Mask:
-    """Return whether there was no evidence against the model in the last longest window."""
+    """Return whether the longest window was free of evidence when it last ended."""
     ends = due[:, -1] & (ledger.age[:, -1] > 0)
     if not ends.any():
         return ledger.sound
@@ -389,8 +389,8 @@ def _sound(ledger: Ledger, due: Mask) -> Mask:
 def _whitening(Y: Array) -> tuple[Array, Array]:
     """Return X and scale with (1 + Y^T Y)^(-1/2) = 1 + X scale X^T, for Y (..., rank, sensors).
 
-    From the smaller one of Y Y^T = V L V^T, with X = Y^T V, and Y^T Y = X L X^T. Shapes (...,
-    sensors, k) and (..., k, 1).
+    The eigenvectors are those of the smaller matrix: Y Y^T = V L V^T with X = Y^T V, or Y^T Y =
+    X L X^T. Shapes (..., sensors, k) and (..., k, 1).
     """
     rank, sensors = Y.shape[-2:]
     if not np.isfinite(Y).all():
@@ -400,7 +400,7 @@ def _whitening(Y: Array) -> tuple[Array, Array]:
     values, axes = np.linalg.eigh(Y @ Yt if small else Yt @ Y)
     values = np.maximum(values, 0.0)
     scale = 1.0 / np.sqrt(1.0 + values) - 1.0
-    # X = Y^T V scaled by L^(-1): a product with the axes of the small matrix Y Y^T.
+    # X = Y^T V has squared norms L, so the scale is divided by L.
     if small:
         scale /= np.where(values > 0.0, values, 1.0)
         axes = Yt @ axes
@@ -408,7 +408,7 @@ def _whitening(Y: Array) -> tuple[Array, Array]:
 
 
 def _sensitivity(C: Array, Y: Array) -> Array:
-    """Return how readings change with the unknowns, (..., k, sensors); zero where not known."""
+    """Return sensitivities C^-1 Y of the readings, (..., k, sensors); zero if C is singular."""
     determinant = np.linalg.det(C)
     known = np.isfinite(determinant) & (determinant != 0.0)
     if known.all():

@@ -1,9 +1,9 @@
 """Ledger of running sums over the innovations: the data of a verdict, in constant memory.
 
-Every array has the members as its leading axis. A *direction* is a possible cause of misfit with
-an amplitude of one: an offset of a sensor, a wrong boundary value, a jump of an unknown. If it is
-there with the amplitude theta, the whitened innovation r_k of a linear filter is white noise plus
-theta g_k, and the sums of g r and g g hold all that the samples tell of theta (Rao 1948).
+The leading axis of every array is over members. A *direction* is a possible cause of misfit of unit
+amplitude, such as an offset of a sensor, a wrong boundary value, or a jump of an unknown. If its
+amplitude is theta, the whitened innovation r_k of a linear filter is white noise plus theta g_k,
+and the sums of g r and g g are sufficient statistics for theta (Rao 1948).
 """
 
 from __future__ import annotations
@@ -24,75 +24,72 @@ from livepde.verdict.model_errors import FAILED, OF_SIGNAL
 from livepde.verdict.sentences import FINDINGS, LIKELY, table_of
 
 WINDOWS = (0, 64, 512)
-"""Samples after which a window begins anew; 0: the window of all samples. The faults of a window
-begin with it, so that an old, sound record does not hide a fault that is new."""
+"""Number of samples after which a window restarts; 0 for the window of all samples. Faults start
+with their window, so that a long record without evidence does not hide a recent fault."""
 
 LENGTHS = np.array([length or np.inf for length in WINDOWS])
-BATCH = 16  # samples at most that wait until they are summed together
-ROOM = 2**16  # numbers at most that they take while they wait
-BLOCKS = 16  # of the record of an unknown that stays; they double in length, and pairs merge
-CLIP = 4.0  # times the usual size: no whitened innovation counts for more (Huber)
-HELD = 0.02  # share of the samples in which the last value of an input was held
-CHANCE = 5e-4  # probability of a false alarm of all validation sensors of a run
-SIMILAR = 0.05  # relative difference of a slope to that of a unit
+BATCH = 16  # most samples that are summed together
+ROOM = 2**16  # most numbers that waiting samples occupy
+BLOCKS = 16  # most blocks of the record; if all are in use, pairs merge and the length doubles
+CLIP = 4.0  # bound of a whitened innovation over its usual size (Huber)
+HELD = 0.02  # share of samples with a held input above which there is a finding
+CHANCE = 5e-4  # probability of a false alarm by any validation sensor of a run
+SIMILAR = 0.05  # a slope may differ from the slope of a unit by four times this share
 UNITS = (
     ("degF", "degC", 1.8, 32.0),
     ("degC", "degF", 1.0 / 1.8, -32.0 / 1.8),
     ("K", "degC", 1.0, 273.15),
     ("degC", "K", 1.0, -273.15),
 )
-"""Unit that a sensor may have, the one that it is taken for, slope and intercept of that."""
+"""Possible unit of a sensor, configured unit, and slope and intercept of the conversion."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ledger:
     """Running sums of each member over the samples so far."""
 
-    # seen, waiting: number of samples, and of those that wait to be summed, shape (members,)
+    # seen, waiting: number of samples, and number of samples not yet summed, (members,)
     seen: IntArray
     waiting: IntArray
-    rows: Array  # samples that wait, (members, batch, numbers); see `livepde.verdict.judge`
-    # Coordinates of all directions in all windows on the rows of the square root as they were when
-    # the first of these came, (members, rank, windows times directions)
+    rows: Array  # waiting samples, (members, batch, numbers); see `livepde.verdict.judge`
+    # Coordinates of all directions in all windows, relative to the rows of the square root before
+    # the first waiting sample, (members, rank, windows * directions)
     w: Array
-    times: Array  # time of the last sample that was summed, and the usual interval, (members, 2)
-    # first, last: first prediction of each sensor, and the last that was summed, (members,
-    # sensors); NaN before
+    times: Array  # time of the last summed sample, and the usual interval, (members, 2)
+    # first, last: predictions of the first sample and of the last summed sample, (members,
+    # sensors); initially NaN
     first: Array
     last: Array
-    # age, epoch: samples in each window, and how often it has begun anew, (members, windows)
+    # age, epoch: number of samples in each window, and number of its restarts, (members, windows)
     age: IntArray
     epoch: IntArray
-    # Sums of g r, g g, g_k r_(k-1) + g_(k-1) r_k and g_k g_(k-1) of each window, direction and
-    # sensor, shape (members, 4, windows, directions, sensors)
+    # Sums of g r, g g, g_k r_(k-1) + g_(k-1) r_k and g_k g_(k-1) for each window, direction and
+    # sensor, (members, 4, windows, directions, sensors)
     sums: Array
-    # Number of r, and sums of r, r r, r_k r_(k-1) and the number of such pairs, of each window and
-    # sensor, shape (members, 5, windows, sensors); r_(k-1) is the last value of the same sensor,
-    # however many samples were without one
+    # Number of r, sums of r, r r and r_k r_(k-1), and number of such pairs for each window and
+    # sensor, (members, 5, windows, sensors); r_(k-1) is the previous value of the same sensor, also
+    # across samples without a value
     noise: Array
     # Whitened innovation and responses of the last value of each sensor, (members, 1 + windows
-    # times directions, sensors)
+    # * directions, sensors)
     before: Array
-    present: Array  # 1 where a sensor has had a value, shape (members, sensors)
-    # score, information: of each block and sensor, about the prior mean: sums of Y r, (members,
-    # blocks, sensors, k), and of Y Y^T, (members, blocks, sensors, k, k); k = 0 where they are not
-    # kept
+    present: Array  # 1 if a sensor has had a value, (members, sensors)
+    # score, information: sums of Y r, (members, blocks, sensors, k), and of Y Y^T, (members,
+    # blocks, sensors, k, k), about the prior mean; k = 0 if there is no record
     score: Array
     information: Array
-    length: IntArray  # samples in a block, shape (members,)
-    process: Array  # states by which the process answers a missing term, (members, terms, n)
-    # readings, reached: readings due to those states at the first of two times, and their change
-    # per unit of time up to the second one, (members, 2, terms, sensors), and these times,
-    # (members, 2)
+    length: IntArray  # samples in a block, (members,)
+    process: Array  # responses of the state to missing terms, (members, terms, n)
+    # readings, reached: readings due to these responses at the first of two times, and their slope
+    # up to the second time, (members, 2, terms, sensors), and the two times, (members, 2)
     readings: Array
     reached: Array
-    # Whether nothing spoke against the model in the longest window that ended last, (members,)
+    # Whether the longest window was free of evidence when it last ended, (members,)
     sound: Mask
-    # How many readings each sensor has shown, and how many of them a gate has refused, (members, 2,
-    # sensors)
+    # Number of readings of each sensor, and number of rejected readings, (members, 2, sensors)
     shown: IntArray
-    # stuck, value: how often in a row each sensor has shown the same value, and that value, shapes
-    # (members, sensors)
+    # stuck, value: number of successive repetitions of the latest value of each sensor, and that
+    # value, (members, sensors)
     stuck: IntArray
     value: Array
 
@@ -109,12 +106,12 @@ class Ledger:
         batch: int,
         numbers: int,
     ) -> Ledger:
-        """Return the value of one member before any sample.
+        """Return the ledger of one member before any sample.
 
-        `followed`: number k of unknown coordinates of which the record is kept.
-        `terms`, `n`: number of missing terms, and of coefficients of the state.
+        `followed`: number k of unknown coordinates with a record.
+        `terms`, `n`: number of missing terms and of coefficients of the state.
         `rank`, `batch`, `numbers`: rows of the square root, samples that are summed together, and
-        numbers of each.
+        numbers per sample.
         """
         never, zero = np.full((1, sensors), np.nan), np.zeros(1, dtype=np.int64)
         return cls(
@@ -144,7 +141,7 @@ class Ledger:
         )
 
     def of_member(self, k: int) -> Ledger:
-        """Return the ledger of one member, whose arrays have no axis of members."""
+        """Return the ledger of one member, with arrays without the axis of members."""
         return changed(self, **{name: value[k] for name, value in vars(self).items()})
 
     @property
@@ -153,17 +150,19 @@ class Ledger:
         return np.asarray((self.age >= LENGTHS[: self.age.shape[1]]) | (self.age == 0))
 
     def clipped(self, r: Array) -> Array:
-        """Return whitened innovations, (members, batch, sensors), none far beyond usual."""
+        """Return whitened innovations clipped to `CLIP` times their usual size.
+
+        Shape (members, batch, sensors).
+        """
         count, squares = self.noise[:, 0, 0], self.noise[:, 2, 0]
-        # Ten samples of the stated noise count beforehand: the first ones are not clipped by
-        # chance.
+        # The prior is worth ten samples of unit size, so that early values are rarely clipped.
         usual = np.sqrt(np.maximum((squares + 10.0) / (count + 10.0), 1.0))
         limit = CLIP * usual[:, None]
         return np.minimum(np.maximum(r, -limit), limit)
 
 
 def batch_of(numbers: int) -> int:
-    """Return how many samples of so many numbers are summed together: a power of two."""
+    """Return how many samples are summed together: a power of two that fits into `ROOM`."""
     batch = BATCH
     while batch > 1 and batch * numbers > ROOM:
         batch //= 2
@@ -174,27 +173,27 @@ def summed(old: Ledger, due: Mask, whitened: Array, used: Array) -> dict[str, Ar
     """Return `sums`, `noise`, `before` and `present` after a batch of samples.
 
     `due`: windows that begin with this batch, (members, windows).
-    `whitened`: innovations r, and responses g of each direction in each window, (members, batch,
-    sensors, 1 + windows * directions); zero where no value is.
-    `used`: 1 where there is a value, (members, batch, sensors).
+    `whitened`: innovations r, and responses g to each direction in each window, (members, batch,
+    sensors, 1 + windows * directions); zero without a value.
+    `used`: 1 if there is a value, else 0, (members, batch, sensors).
     """
     members, _, sensors, _ = whitened.shape
     windows, directions = old.sums.shape[2:4]
-    # Sums of windows that begin anew start from nothing.
+    # Sums of restarting windows are reset to zero.
     kept = ~(due & (old.age > 0))
-    # The last value before the batch comes first: products of successive values need it.
+    # Prepend the last value before the batch, for products of successive values.
     before = old.before.copy()
     before[:, 1:].reshape(members, windows, -1)[~kept] = 0.0
     row = np.concatenate([before.swapaxes(1, 2)[:, None], whitened], axis=1)
     present = np.concatenate([old.present[:, None], used], axis=1)
-    # Row of the last value of each sensor: sensors need not have values in the same samples.
+    # Row of the latest value of each sensor: sensors may have values in different samples.
     place = np.arange(row.shape[1])[:, None]
     newest = np.maximum.accumulate(np.where(present > 0.0, place, 0), axis=1)
     now, earlier = row[:, 1:], row[:, :-1]
     if not (present > 0.0).all():
         earlier = np.take_along_axis(row, newest[:, :-1, :, None], axis=1)
     pair = used * np.maximum.accumulate(present, axis=1)[:, :-1]
-    # Weights of g in two sums: of g_k r_k, and of g_k r_(k-1) + g_(k-1) r_k.
+    # Weights of g in the sums of g_k r_k and of g_k r_(k-1) + g_(k-1) r_k.
     weights = np.zeros((2, *row.shape[:3]))
     weights[0, :, 1:], weights[1, :, 1:] = now[..., 0], earlier[..., 0]
     each = np.arange(members)[:, None, None], newest[:, :-1], np.arange(sensors)
@@ -218,10 +217,10 @@ def blocked(old: Ledger, Y: Array, r: Array) -> dict[str, Any]:
     """Return `score`, `information` and `length` after a batch of samples.
 
     `Y`, `r`: sensitivities to the followed unknowns, (members, batch, k, sensors), and residuals at
-    the prior mean, (members, batch, sensors), in units of the noise; zero where no value is.
+    the prior mean, (members, batch, sensors), in units of the noise; zero without a value.
     """
     score, information, length = old.score, old.information, old.length
-    # All blocks are in use: neighbours merge, and each holds twice as many samples from now on.
+    # If all blocks are in use, merge neighbours and double the number of samples in a block.
     before = old.seen - old.waiting
     full = before // length >= BLOCKS
     if full.any():
@@ -236,7 +235,7 @@ def blocked(old: Ledger, Y: Array, r: Array) -> dict[str, Any]:
 
 
 def _merged(values: Array, full: Mask) -> Array:
-    """Return blocks of which neighbours are merged, for some members."""
+    """Return blocks with neighbours merged for the members in the mask `full`."""
     merged = np.zeros_like(values)
     merged[:, : BLOCKS // 2] = values[:, ::2] + values[:, 1::2]
     chosen = full.reshape(-1, *(1,) * (values.ndim - 1))
@@ -247,12 +246,12 @@ def _merged(values: Array, full: Mask) -> Array:
 class InputLedger:
     """Gaps of the input channels so far."""
 
-    # Number of samples, and of those in which each channel was held, shape (1 + channels,)
+    # Number of samples, and number of samples in which each channel was held, (1 + channels,)
     counts: IntArray
-    # Time for which each channel has been held by now, shape (channels,); 0 if it has a value
+    # Time since the last value of each channel, (channels,); 0 if it has a value
     held: Array
-    # 1 for each channel without a value at the initial time, whose first one was held over the
-    # first interval, shape (channels,)
+    # 1 for each channel without a value at the initial time, whose first value was used for the
+    # first interval, (channels,)
     unstated: Array
 
     @classmethod
@@ -261,12 +260,12 @@ class InputLedger:
         return cls(counts=np.zeros(1 + channels, dtype=np.int64), held=none, unstated=none)
 
     def add(self, length: float, missing: Array) -> InputLedger:
-        """Return the value after an interval; `missing`: 1 for channels that are held at its end.
+        """Return the ledger after an interval; `missing`: 1 for channels that are held at its end.
 
-        The interval in which a channel has a value again is no gap: there the value changes.
+        An interval at whose end a channel has a value does not count as a gap.
         """
         counts = self.counts.copy()
-        counts[0] += 1  # of all samples
+        counts[0] += 1
         held = self.held
         if np.count_nonzero(missing) or np.count_nonzero(held):
             counts[1:] += missing > 0.0
@@ -275,18 +274,18 @@ class InputLedger:
 
     @property
     def silent(self) -> bool:
-        """True if no channel was ever held."""
+        """Whether no channel was ever held."""
         return not (any(self.counts.tolist()[1:]) or any(self.unstated.tolist()))
 
     def gaps(self, names: Sequence[str], missing: Array) -> dict[str, tuple[float, bool]]:
-        """Return for how long channels were held by now, and whether they are once more."""
+        """Return channel -> (duration of its gap, whether it continues), for channels in a gap."""
         each = zip(names, self.held.tolist(), (missing > 0.0).tolist(), strict=True)
         return {name: (held, again) for name, held, again in each if held or again}
 
     def findings(self, names: Sequence[str], shifts: Shifts[float]) -> Iterator[Finding]:
-        """Return which channels were held in more than 2 % of the samples, and which at the start.
+        """Yield findings on channels without a value at the start or in many samples (`HELD`).
 
-        `shifts`: of the estimate, with the shift of each unknown by its inputs.
+        `shifts`: shifts of the estimate, including those due to interpolation of inputs.
         """
         samples = max(int(self.counts[0]), 1)
         each = shifts.by("input").items()
@@ -308,25 +307,25 @@ class ValidationLedger:
     """Sums over the values of each validation sensor, in constant memory."""
 
     # Shape (9, sensors): number of values and of successive pairs; sums of half the squared
-    # difference of those, of squared errors, errors, predictions p, p p, p z, and of the variance
-    # that is predicted
+    # difference of errors in a pair, of squared errors, errors, predictions p, p p, p z, and
+    # predicted variances
     sums: Array
-    last: Array  # last error of each sensor, shape (sensors,); NaN before
+    last: Array  # last error of each sensor, (sensors,); initially NaN
 
     @classmethod
     def start(cls, sensors: int) -> ValidationLedger:
         return cls(np.zeros((9, sensors)), np.full(sensors, np.nan))
 
     def add(self, z: Array, predicted: Array, variance: Array) -> ValidationLedger:
-        """Return the value after a sample; z is NaN where missing.
+        """Return the ledger after a sample; missing values of z are NaN.
 
-        `variance`: of the prediction, without noise, shape (sensors,).
+        `variance`: variance of the prediction without noise, (sensors,).
         """
         error = z - predicted
         seen = np.isfinite(error)
         if not seen.any():
             return self
-        # A sensor need not have a value in each sample: its last value is where it had one.
+        # The previous error of a sensor may be several samples old.
         step = error - self.last
         pair = np.isfinite(step)
         rows = np.array(
@@ -349,11 +348,11 @@ class ValidationLedger:
     def findings(
         self, names: Sequence[str], ignored: Collection[str] = (), units: Sequence[str] = ()
     ) -> Iterator[Finding]:
-        """Return which sensors, without ignored ones, are missed by more than prediction and noise.
+        """Yield findings on sensors, except ignored ones, with significant prediction errors.
 
-        The errors of one sensor are correlated as far as they come from the unknowns: so their mean
-        square over its expected value counts as one draw of chi-square. The noise is estimated from
-        successive differences.
+        Errors of a sensor that are due to the unknowns are correlated. Therefore the ratio of their
+        mean square to its expected value is tested as a single chi-square variable. The noise is
+        estimated from successive differences.
         """
         for k, name in enumerate(names):
             if name in ignored or self.sums[0, k] < FEWEST:
@@ -371,7 +370,7 @@ class ValidationLedger:
             )
             likely, remedy = LIKELY["validation"].filled(name=name)
             cause = self._unit(k, name) or Cause("validation", name, likely, remedy=remedy)
-            # A small error shows that the model is not exact, a gross one that it is wrong.
+            # A small error means that the model is inexact, a gross error that it is wrong.
             gross = size > FAILED * math.sqrt(noise) and size > OF_SIGNAL * self._scatter(k)
             severity: Severity = "do not trust" if gross or cause.kind == "unit" else "caution"
             yield Finding("validation", severity, text, name, p, "p-value", (cause,))
@@ -382,7 +381,7 @@ class ValidationLedger:
         return math.sqrt(max((squares + 2.0 * pz - pp) / count - mean**2, 0.0))
 
     def _unit(self, k: int, name: str) -> Cause | None:
-        """Return the cause that a sensor has another unit, if its values indicate that."""
+        """Return the cause that a sensor has another unit, if its values indicate that; or None."""
         count, _, _, _, errors, p, pp, pz, _ = self.sums[:, k]
         mean_p, mean_z = p / count, (errors + p) / count
         spread = pp / count - mean_p**2

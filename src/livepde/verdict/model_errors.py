@@ -1,4 +1,4 @@
-"""Misfit of a model, and how far its errors may have moved the unknowns."""
+"""Misfit of a model, and possible effects of its errors on the unknowns."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from livepde.showing import in_percent
 Rank: TypeAlias = Literal["trusted", "caution", "do not trust"]
 
 FAILED = 5.0  # misfit over noise, and ...
-OF_SIGNAL = 0.1  # ... misfit over signal from which a fit has failed
-HARMLESS = 0.02  # relative effect of an error that the data show, but that does no harm
-USELESS = 0.5  # relative effect from which an interval is too wide to use
-HIDDEN = 0.1  # relative effect of errors that the data do not show
+OF_SIGNAL = 0.1  # ... misfit over signal above which a fit has failed
+HARMLESS = 0.02  # largest relative effect of a detected error that is acceptable
+USELESS = 0.5  # relative effect above which an interval is too wide to use
+HIDDEN = 0.1  # relative effect of undetectable errors above which there is a caution
 USUAL = 0.2  # prior standard deviations below which an unknown of either sign is near zero
-WIDER = 2.0  # width over that of the noise alone from which such effects count
-DIFFERENT = 1.1  # the same from which the interval is shown
+WIDER = 2.0  # width over the width due to noise above which undetectable errors count
+DIFFERENT = 1.1  # width over the plain width above which the interval is shown
 MOST = 3  # unknowns in a sentence
 
 
@@ -26,32 +26,32 @@ MOST = 3  # unknowns in a sentence
 class Allowed:
     """An unknown with an interval that allows for errors of the model."""
 
-    # label, unit: the unknown; of a field the root mean square over the domain
+    # label, unit: name and unit of the unknown; a field is represented by its root mean square
     label: str
     unit: str
-    value: float  # the estimate
-    # low, high: the 95 % interval that allows for errors of the model
+    value: float  # estimate
+    # low, high: 95 % interval that allows for errors of the model
     low: float
     high: float
-    # plain_low, plain_high: the 95 % interval if the model is exact
+    # plain_low, plain_high: 95 % interval if the model is exact
     plain_low: float
     plain_high: float
-    wider: float  # width over that of the noise alone
-    # Least size that an error is relative to, where the prior allows either sign: an unknown near
-    # zero is known well if little of its prior is left.
+    wider: float  # width of the interval over the width due to noise alone
+    # Lower bound of the size to which an error is relative, if the prior allows either sign: the
+    # relative error of an unknown near zero is compared with its prior
     usual: float = 0.0
-    # Whether it is an error of a sensor, such as an offset, or a correction of an input
+    # Whether the unknown is a sensor error, such as an offset, or a correction of an input
     of_sensor: bool = False
 
     @classmethod
     def of(cls, label: str, unit: str, numbers: Iterable[float], **rest: Any) -> Allowed:
-        """Return an unknown with its numbers in the order of the attributes, and the rest."""
+        """Return an unknown from its numbers, in the order of the attributes, and the rest."""
         value, low, high, plain_low, plain_high, wider = numbers
         return cls(label, unit, value, low, high, plain_low, plain_high, wider, **rest)
 
     @property
     def effect(self) -> float:
-        """Largest error of the value, relative to it; near zero to `usual`."""
+        """Largest error of the value, relative to its size or to `usual`, whichever is larger."""
         off = max(abs(self.low - self.value), abs(self.high - self.value))
         size = max(self._size, self.usual)
         return off / size if size > 0.0 else math.inf
@@ -61,7 +61,7 @@ class Allowed:
         return max(abs(self.value), abs(self.plain_low), abs(self.plain_high))
 
     def about(self, value: float, plain_low: float, plain_high: float) -> Allowed:
-        """Return a later estimate with an interval that is as much wider than the plain one."""
+        """Return the interval of a later estimate: the plain one, widened by the same factors."""
 
         def end(wide: float, plain: float, now: float) -> float:
             away = plain - self.value
@@ -74,7 +74,7 @@ class Allowed:
 
     @property
     def text(self) -> str:
-        """The unknown with its interval, and its effect in per cent."""
+        """The unknown with its interval, and its effect as a percentage."""
         unit = f" {self.unit}" if self.unit else ""
         if self._size < self.usual:
             off = f"{in_percent(USUAL * self.effect)} of its prior standard deviation"
@@ -94,14 +94,14 @@ class ModelErrors:
     Attributes
     ----------
     misfit
-        Root mean square of the residuals of the best fit, over the noise that
-        successive readings show.
+        Root mean square of the residuals of the best fit, over the noise estimated from
+        successive differences.
     of_signal
-        The same over the standard deviation of the readings in time.
+        Root mean square of the residuals over the standard deviation of the readings in time.
     sensors
-        Sensor -> its own misfit over noise.
+        Sensor -> misfit of its readings over noise.
     unknowns
-        The unknowns, those of sensors as well.
+        All unknowns, including sensor errors.
     """
 
     misfit: float
@@ -111,12 +111,12 @@ class ModelErrors:
 
     @property
     def failed(self) -> bool:
-        """Whether the model misses the readings grossly."""
+        """Whether the residuals are large compared with both noise and signal."""
         return self.misfit > FAILED and self.of_signal > OF_SIGNAL
 
     @property
     def asked(self) -> list[Allowed]:
-        """Unknowns of the model, the one that may be off the most first."""
+        """Unknowns of the model, by decreasing effect."""
         own = [one for one in self.unknowns if not one.of_sensor]
         return sorted(own, key=lambda one: -one.effect)
 
@@ -132,53 +132,50 @@ class ModelErrors:
         return any(map(far, self.unknowns))
 
     def __getitem__(self, label: str) -> Allowed:
-        """Return the unknown with a label."""
+        """Return the unknown with the given label."""
         return next(one for one in self.unknowns if one.label == label)
 
     @property
     def effect(self) -> float:
-        """Largest relative effect on an unknown of the model; 0 without."""
+        """Largest relative effect on an unknown of the model; 0 without unknowns."""
         return max((one.effect for one in self.asked), default=0.0)
 
     def about(self, now: Mapping[str, tuple[float, float, float]]) -> ModelErrors:
-        """Return the same for later estimates: label -> value, and ends of the plain interval."""
+        """Return the errors at later estimates: label -> (value, plain low, plain high)."""
         moved = [one.about(*now[one.label]) if one.label in now else one for one in self.unknowns]
         return replace(self, unknowns=tuple(moved))
 
     def level(self, *, doubted: bool) -> Rank:
-        """Return the level of a run.
-
-        `doubted`: whether a test speaks against the model.
-        """
+        """Return the level of a run; `doubted`: whether a test contradicts the model."""
         if self.failed:
             return "do not trust"
-        if not self.asked:  # no unknown of which an effect could be harmless
+        if not self.asked:  # without unknowns there are no effects
             return "caution" if doubted else "trusted"
         if not doubted:
             return "caution" if self.wide > HIDDEN else "trusted"
-        # One unknown that is too uncertain does not take the value from the others.
+        # A useless interval of one unknown does not invalidate the others.
         if self.wide > USELESS and len(self.useless) == len(self.asked):
             return "do not trust"
         return "trusted" if self.effect <= HARMLESS else "caution"
 
     @property
     def wide(self) -> float:
-        """Largest effect on an unknown whose interval is much wider than by the noise alone."""
+        """Largest effect on an unknown whose interval is much wider than noise alone implies."""
         return max((one.effect for one in self.asked if one.wider > WIDER), default=0.0)
 
     @property
     def useless(self) -> list[str]:
-        """Unknowns of the model whose interval is too wide to use."""
+        """Labels of the unknowns of the model whose interval is too wide to use."""
         return [one.label for one in self.asked if one.effect > USELESS]
 
     def sentence(self, *, doubted: bool) -> str:
-        """Return fit and effect in words."""
+        """Return a sentence on misfit and effect."""
         signal = 100.0 * self.of_signal
         share = f"{signal:.0f}" if signal >= 99.5 else f"{signal:.2g}"
         fit = f"Residuals are {self.misfit:.2g} times the noise and {share} % of the signal."
         if self.failed:
             return f"The fit failed. {fit}"
-        # Of many unknowns those are listed whose error may be largest.
+        # List the unknowns with the largest effects.
         some = [one.text for one in self.asked[:MOST]]
         rest = len(self.asked) - MOST
         more = f" The table lists {rest} more." if rest > 0 else ""
@@ -187,7 +184,7 @@ class ModelErrors:
 
     @property
     def remedy(self) -> str:
-        """What to do with such intervals."""
+        """Recommended use of the intervals."""
         if self.failed:
             return "Do not use the estimates. Find the error in the model or the data first."
         if not (useless := self.useless):
@@ -199,14 +196,14 @@ class ModelErrors:
         return f"Use these intervals, but not that of {names}{more}: too wide to use."
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the value as JSON can hold it."""
+        """Return the errors as a dictionary for JSON."""
         own = {**asdict(self), "sensors": dict(self.sensors)}
         found: dict[str, Any] = _without_nonfinite(own)
         return found
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any] | None) -> ModelErrors | None:
-        """Return the value that `to_dict` has written; None if there is none."""
+        """Return the errors from the result of `to_dict`; None if there are none."""
         if stored is None:
             return None
         numbers = {key: _number(stored[key]) for key in ("misfit", "of_signal")}
@@ -216,7 +213,7 @@ class ModelErrors:
 
 
 def _without_nonfinite(value: Any) -> Any:
-    """Return nested data with None for infinite numbers, which JSON has not."""
+    """Return nested data with None instead of nonfinite numbers, which JSON does not support."""
     if isinstance(value, dict):
         return {key: _without_nonfinite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -225,5 +222,5 @@ def _without_nonfinite(value: Any) -> Any:
 
 
 def _number(value: Any) -> Any:
-    """Return an infinite number for None: only an effect or a ratio has no bound."""
+    """Return infinity for None: of the stored numbers, only ratios can be infinite."""
     return math.inf if value is None else value
