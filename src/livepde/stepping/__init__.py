@@ -1,4 +1,4 @@
-"""Time schemes, the nonlinear iteration, substeps, and the forward model."""
+"""Time schemes, the nonlinear solver, step control, and the forward model."""
 
 from __future__ import annotations
 

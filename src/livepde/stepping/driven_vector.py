@@ -1,4 +1,4 @@
-"""Vectors of a stage that inputs drive: assembled once, where they are affine in them."""
+"""Vectors of a stage that depend on inputs; if they are affine in them, they are assembled once."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
 from livepde.stepping.interval import Moments
 
-# Magnitudes of the random inputs with which affinity is tested: a kink or saturation may lie far
-# from one.
+# Magnitudes of the random inputs in the test for affinity: the threshold of a kink or saturation
+# may be far from one.
 SCALES = (1e-3, 1.0, 1e3, 1e6)
 # Relative deviation from affinity that is attributed to rounding in the assembly.
 ROUNDING = 1e-11
-# Inputs at which responses are measured: so large that subtracting the vector without inputs
-# cancels no digits, and a power of two so that the division is exact.
+# Inputs at which responses are evaluated: large, so that subtracting the vector without inputs
+# cancels no digits, and a power of two, so that the division is exact.
 LARGE = 2.0**20
 
 
@@ -26,8 +26,8 @@ LARGE = 2.0**20
 class DrivenVector:
     """A vector v(t, inputs), (n,), usually affine in the inputs and independent of time.
 
-    In that case it is assembled once, and its evaluation is one small matrix product. `timed`
-    returns True if the vector has read the time so far.
+    If it is, it is assembled once, and its evaluation is a small matrix product. `timed` returns
+    whether evaluations of the vector so far have used the time.
     """
 
     vector: Callable[[Moment], Array]
@@ -40,11 +40,10 @@ class DrivenVector:
 
     @cached_property
     def affine(self) -> bool:
-        """True if the vector is affine in the inputs, probed at several magnitudes."""
+        """Whether the vector is affine in the inputs, tested at several magnitudes."""
         if not self.channels:
             return True
-        # A fixed seed: whether a model counts as affine must not differ between two runs. Several
-        # magnitudes, since a kink or a saturation may lie far from one.
+        # The fixed seed makes the result reproducible between runs.
         rng = np.random.default_rng(2)
         for scale in SCALES:
             a, b = scale * rng.standard_normal((2, len(self.channels)))
@@ -60,7 +59,7 @@ class DrivenVector:
     def responses(self) -> tuple[Array, Array] | None:
         """Vector without inputs, (1, n), and its derivative by each input, (channels, n).
 
-        None if the vector reads the time or is not affine.
+        None if the vector depends on time or is not affine.
         """
         if not self.affine:
             return None
@@ -71,7 +70,7 @@ class DrivenVector:
         return self._at(0.0, np.zeros(len(self.channels)))
 
     def assembled(self) -> tuple[Array, Array]:
-        """Return vector without inputs, (n,), and derivative, as if it were affine in them."""
+        """Return vector without inputs, (n,), and derivative, (channels, n), assuming affinity."""
         base, units = self.without_inputs(), LARGE * np.eye(len(self.channels))
         changes = [(self._at(0.0, unit) - base) / LARGE for unit in units]
         return base, np.reshape(changes, (len(units), len(base)))
@@ -82,11 +81,11 @@ class DrivenVector:
 
     @cached_property
     def constant(self) -> bool:
-        """True if neither time nor inputs change the vector."""
+        """Whether the vector depends on neither time nor inputs."""
         return self.responses is not None and not self.responses[1].any()
 
     def __call__(self, at: Moments) -> Array:
-        """Return the vector of each member, shape (members, n); (1, n) if the same for all."""
+        """Return the vector of each member, shape (members, n); (1, n) if equal for all."""
         if self.responses is not None:
             base, changes = self.responses
             return base if self.constant else base + at.inputs[:, : len(changes)].dot(changes)
@@ -94,10 +93,10 @@ class DrivenVector:
             return self.vector(at.member(0))[None]
         base = self._at(at.t, np.zeros(len(self.channels)))
         total = base[None]
-        # Affine in the inputs, but time-dependent: one evaluation per channel serves all members.
+        # Affine in the inputs but time-dependent: evaluate once per channel for all members.
         largest_inputs = np.abs(at.inputs[:, : len(self.channels)]).max(axis=0)
         for c, largest in enumerate(largest_inputs):
-            if largest > 0.0:  # a difference at the size of the values: no digits are lost
+            if largest > 0.0:  # a difference at the magnitude of the inputs loses no digits
                 unit = np.zeros(len(self.channels))
                 unit[c] = largest
                 total = total + (at.inputs[:, c] / largest)[:, None] * (self._at(at.t, unit) - base)

@@ -35,10 +35,10 @@ from livepde.stepping.schemes import Advance, advance
 
 # Relative error of a state that is solved with a reused factor.
 STATE = 1e-8
-# Relative rounding error of a sum of terms, in units of the sizes of its terms.
+# Rounding error of a sum, relative to the sizes of its terms.
 ROUNDING = 1e-15
-# Expected corrections of the state with a factor of a nearby q; tangents need one less. Only
-# corrections beyond it count as excess solves.
+# Expected number of corrections of the state with the factor of a nearby q; tangents require one
+# less. Only further corrections count as excess solves.
 PASSES = 2
 # Relative asymmetry that is attributed to rounding in the assembly.
 LINEAR = 1e-12
@@ -47,9 +47,9 @@ LINEAR = 1e-12
 class ForwardStage:
     """Implicit stage M (u - c)/h + B(u) + A(u) q = F(t) for u, with Dirichlet values imposed.
 
-    If B and A are affine in u with derivatives that read neither time nor inputs, the matrix is
-    factorised once for each (h, q) and a stage is one back-substitution. This never changes the
-    numbers. `advance` also solves for tangents, and reuses a factor for nearby q and h.
+    If B and A are affine in u with derivatives that depend on neither time nor inputs, the matrix
+    is factorised once for each (h, q), and a stage is one back-substitution with identical results.
+    `advance` also solves for tangents, and reuses a factor for nearby q and h.
     """
 
     def __init__(self, model: Model, newton: Newton | None = None) -> None:
@@ -63,8 +63,8 @@ class ForwardStage:
         self._driving: tuple[Array, Array, Array] | None = None
 
     def twin(self) -> ForwardStage:
-        """Return a stage with the same symbolic analysis and its own factors."""
-        _ = self._dual_weights, self.engine  # common to both
+        """Return a stage with the same symbolic analysis and separate factors."""
+        _ = self._dual_weights, self.engine  # computed before the copy, to be shared
         other = copy.copy(self)
         other._made = other._last = other._rate = other._driving = None
         return other
@@ -92,10 +92,10 @@ class ForwardStage:
 
     @cached_property
     def symmetric(self) -> bool:
-        """True if the matrix of a stage is expected to be symmetric for all q and h."""
+        """Whether the matrix of a stage is expected to be symmetric for all q and h."""
         if not self.keeps:
             return False
-        # M is symmetric. One random q suffices, with probability one, if the matrix is linear in q;
+        # If the matrix is linear in q, a test with one random q is correct with probability one.
         # `_factorise` tests every matrix again.
         model, rows = self.model, self._free[1]
         some = np.random.default_rng(0).standard_normal(model.Q.dim) * model.latent.deviations
@@ -113,9 +113,9 @@ class ForwardStage:
         return pattern.positions(pattern.indices, pattern.rows)
 
     def _mirrored(self, data: Array) -> bool:
-        """Return True if data of the free block are symmetric, relative to the diagonal."""
-        # The entries of a positive definite matrix satisfy |a_ij| <= sqrt(a_ii a_jj): a tolerance
-        # that does not depend on the units of the state's components.
+        """Return whether data of the free block are symmetric, relative to the diagonal."""
+        # Entries of a positive definite matrix satisfy |a_ij| <= sqrt(a_ii a_jj). This scale does
+        # not depend on the units of the components of the state.
         pattern = self._free[0]
         scale = np.sqrt(np.abs(pattern.matrix(data).diagonal()))
         allowed = LINEAR * scale[pattern.rows] * scale[pattern.indices]
@@ -132,11 +132,11 @@ class ForwardStage:
 
     @cached_property
     def _general(self) -> Solver:
-        """Solver of a symmetric matrix that is not positive definite."""
+        """Solver for matrices that are not positive definite."""
         return analyse(self._free[0])
 
     def _data(self, u: Array, q: Array, h: float, moment: Moment) -> Array:
-        """Return the data of the matrix rows at a state; q is physical here and below."""
+        """Return the data of the matrix rows at a state; q is physical, also in private methods."""
         model, maps = self.model, self._rows[1]
         data: Array = maps["M"] @ (model.mass.data / h)
         data += maps["B"] @ model.form_B.data("v", "u", moment, u=u)
@@ -147,7 +147,7 @@ class ForwardStage:
         """Return the data of the matrix rows of an affine model; constant parts are cached."""
         model, maps = self.model, self._rows[1]
         zero = np.zeros(model.X.dim)
-        rate = self._rate  # read once: copies of an identifier may step in other threads
+        rate = self._rate  # read only once: copies of an identifier may step in other threads
         if rate is None or rate[0] != h:
             data = maps["M"] @ (model.mass.data / h)
             data += maps["B"] @ model.form_B.data("v", "u", moment, u=zero)
@@ -162,9 +162,9 @@ class ForwardStage:
 
     @cached_property
     def _slope(self) -> sp.csr_array | Array | None:
-        """Linear map from q to the data of d(A q)/du; None if there is no sparse one."""
+        """Linear map from q to the data of d(A q)/du; None if there is no sparse tensor."""
         tensor = self.form.tensor("v", "u")
-        if not isinstance(tensor, sp.csr_array):  # none, or one of a large mesh
+        if not isinstance(tensor, sp.csr_array):  # no tensor, or the mesh is large
             return None
         return compact(sp.csr_array(self._rows[1]["A"] @ tensor))
 
@@ -176,7 +176,7 @@ class ForwardStage:
     def _dual_weights(self) -> Array:
         diagonal = np.abs(self.model.mass.diagonal())
         least = diagonal.max(initial=0.0) or 1.0
-        # Algebraic components have no mass: they are weighed like the heaviest coefficient.
+        # Algebraic components have no mass and use the largest diagonal entry instead.
         return self.model.X.free / np.where(diagonal > 0.0, diagonal, least)
 
     @cached_property
@@ -190,14 +190,14 @@ class ForwardStage:
     def _factorise(self, data: Array) -> Factor:
         _, rows, fixed = self._free
         complete = rows @ data + fixed if len(self.model.X.fixed) else data
-        # A Cholesky solver reads one triangle only: it would silently accept a nonsymmetric matrix.
+        # A Cholesky solver reads only one triangle, so a nonsymmetric matrix would go unnoticed.
         if not self.solver.definite or self._mirrored(complete):
             try:
                 return self.solver.factorise(complete)
             except LinearAlgebraError as error:
                 if not self.symmetric:
                     raise StepFailed("singular", str(error)) from error
-        try:  # not positive definite: q is far off, and the step may still be good
+        try:  # the matrix is not positive definite for extreme q, but the step may still succeed
             return self._general.factorise(complete)
         except LinearAlgebraError as error:
             raise StepFailed("singular", str(error)) from error
@@ -223,7 +223,7 @@ class ForwardStage:
 
     @property
     def keeps(self) -> bool:
-        """True if the matrix of a stage depends on h and q only, so that its factor is reusable."""
+        """Whether the matrix of a stage depends only on h and q, so that its factor is reusable."""
         return self.model.affine and self.model.steady
 
     def _system(self, q: Array, h: float, moment: Moment) -> _System:
@@ -241,7 +241,7 @@ class ForwardStage:
         """Return the factor of an affine model for (q, h), cached for the last pair."""
         made, last = self._made, self._last
         if made is None or not made[0].same(q, h):
-            self._made = made = None  # two at once may be more than there is memory
+            self._made = made = None  # memory may not suffice for two factors
             if last is not None and last[0].same(q, h):
                 data = last[1].data
             else:
@@ -257,7 +257,7 @@ class ForwardStage:
         if not self._driven_affinely:
             physical = self.model.latent.value(q)
             return known - self._at_zero(physical, moment) + self.model.F(moment)
-        driving = self._driving  # read once: copies of an identifier may step in other threads
+        driving = self._driving  # read only once: copies of an identifier may step in other threads
         if driving is None or not np.array_equal(driving[0], q):
             self._driving = driving = (q, *self._load(self.model.latent.value(q)).assembled())
         _, base, changes = driving
@@ -275,9 +275,9 @@ class ForwardStage:
 
     @cached_property
     def _driven_affinely(self) -> bool:
-        """True if inputs drive the state affinely and time does not.
+        """Whether the load is affine in the inputs and independent of time.
 
-        Probed at a drawn q: at the prior mean a product of an unknown and an input may vanish.
+        Tested at a random q: at the prior mean, a product of an unknown and an input may vanish.
         """
         latent = self.model.latent
         some = np.random.default_rng(0).standard_normal(latent.dim) * latent.deviations
@@ -303,12 +303,12 @@ class ForwardStage:
     def linearised(
         self, u: Array, q: Array, h: float, moment: Moment
     ) -> tuple[Factor, sp.csr_array | Array]:
-        """Return the factorised S = M/h + B'(u) + d(A(u) q)/du, and its rows as a matrix.
+        """Return the factor of S = M/h + B'(u) + d(A(u) q)/du, and S as a matrix.
 
-        The factor is that on the free coefficients, the matrix has all columns.
+        The factor is restricted to free coefficients; the matrix has free rows and all columns.
         """
         if self.keeps:
-            rows = self._system(q, h, moment).matrix  # first: the factor is made of its data
+            rows = self._system(q, h, moment).matrix  # first, since `factor` reuses its data
             return self.factor(q, h, moment), rows
         data = self._data(u, self.model.latent.value(q), h, moment)
         return self._factorise(data), self._rows[0].matrix(data)
@@ -326,10 +326,10 @@ class ForwardStage:
     ) -> tuple[Array, Kept]:
         """Return state and tangents at the end of a stage, and its warm-start data.
 
-        If the matrix depends on q and h only, the factor of an earlier q is reused by iterative
-        refinement until the error of the state is 1e-8 of its norm and a hundredth of its change.
-        The matrix is factorised again as soon as the excess solves since the last factorisation
-        would cost more than a new one (`Solver.price`).
+        If the matrix depends only on q and h, the factor of an earlier q is used for iterative
+        refinement until the error of the state is below 1e-8 of its norm and 1 % of its change. The
+        matrix is factorised again if the excess solves since the last factorisation would cost more
+        than a new one (`Solver.price`).
 
         Parameters
         ----------
@@ -338,8 +338,8 @@ class ForwardStage:
         directions
             Derivative of the latent coefficients of q along each tangent, shape (m, r).
         tolerance
-            Bound on the error of the tangents, relative to the norm of all of them; a hundredth of
-            their change is a second bound.
+            Bound on the error of the tangents, relative to the norm of all of them. A second bound
+            is 1 % of their change.
         apart
             Number of trailing tangents that are solved separately, by one correction.
 
@@ -363,8 +363,7 @@ class ForwardStage:
                 for part in groups:
                     new[:, part] = solved(tangent, driven(u, part) * free)
             return new, kept
-        # Linear extrapolation in time predicts the state; the error of the predictor decides how
-        # many corrections are needed.
+        # Predict the state by linear extrapolation in time: a better predictor saves corrections.
         guess = begin + h * kept.trend if len(kept.q) else begin
         system = self._system(q, h, moment)
         known = self._known(begin, system, q, h, moment)
@@ -373,7 +372,7 @@ class ForwardStage:
         exact = At(q, h).same(*corrected.factor_at)
         for part in groups:
             start, known = c[:, part], driven(u, part)
-            if exact:  # no iteration, and so no start
+            if exact:  # a direct solve requires no initial guess
                 known *= free
                 new[:, part] = solved(self.factor(q, h, moment), known)
             elif part.start == end:
@@ -383,7 +382,7 @@ class ForwardStage:
         return new, Kept(*corrected.factor_at, corrected.spent, (u - begin) / h)
 
     def _corrections(self, system: _System, at: At, moment: Moment, kept: Kept) -> Corrections:
-        """Return the solver of a stage that begins with the factor of an earlier one."""
+        """Return the refinement for a stage that starts with the factor of an earlier stage."""
         return Corrections(
             system.matrix,
             at,
@@ -411,7 +410,7 @@ class ForwardStage:
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """Matrix of a stage, as data and as a matrix, and its offset B(0) + A(0) q if constant."""
+    """Matrix of a stage, as data and as a matrix, and B(0) + A(0) q if constant, else None."""
 
     data: Array
     matrix: sp.csr_array | Array
@@ -459,7 +458,7 @@ class _StageEquation:
     def limited(self, at: _StateEvaluation, allowed: float) -> bool:
         stage, moment = self.stage, self.moment
         data = np.abs(stage._data(at.y, self.q, self.h, moment))
-        # Rounding leaves a share of |S| |u|, the sum of the sizes of all terms in each row.
+        # The rounding error is proportional to |S| |u|, the sum of the sizes of terms in each row.
         sizes = stage._rows[0].matrix(data) @ np.maximum(np.abs(at.y), np.abs(self.c))
         own = stage.dual(at.residual)
         rounding = ROUNDING * max(stage.dual(sizes), stage.dual(self.source))
@@ -474,7 +473,7 @@ def simulate(
     control: Advance,
     inputs: Callable[[float], Any] | None = None,
 ) -> Iterator[tuple[float, Array]]:
-    """Yield (t, u) of the forward model at the given times, the first being the initial time.
+    """Yield (t, u) of the forward model at the given times, starting with the initial time.
 
     Parameters
     ----------
@@ -488,7 +487,7 @@ def simulate(
     Raises
     ------
     StepFailed
-        A step failed even when halved as often as `control` allows.
+        A step failed after the maximum number of halvings of `control`.
 
     Examples
     --------
@@ -508,7 +507,7 @@ def simulate(
     for t0, t1 in pairwise(times):
         interval = Interval(t0=t0, t1=t1, inputs0=values(t0), inputs1=values(t1), z0=none, z1=none)
 
-        # The interval is a default, since a closure would see that of a later round.
+        # The interval is bound as a default, since a closure would use a later iteration's value.
         def stage(c: Array, t: float, h: float, interval: Interval = interval) -> Array:
             return forward.solve(c, q, h, interval.at(t))
 

@@ -1,4 +1,4 @@
-"""Sample intervals, and how inputs behave between two readings."""
+"""Sample intervals, and the behaviour of inputs between readings."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from livepde.fem import Inputs, Moment
 from livepde.linalg import Array, IntArray, Mask
 
 Between: TypeAlias = Literal["line", "hold", "next"]
-"""A straight line; the last reading until the next one; or the next reading since the last one."""
+"""Value of an input between readings: linear, the previous reading, or the next reading."""
 
 
 @dataclass(frozen=True)
 class Held:
-    """The channels that are constant between two readings; all others are straight lines.
+    """Channels that are constant between readings; all others are linear.
 
-    The value of a channel in `last` holds until the next reading (`between = "hold"`); the reading
-    of a channel in `next` is the mean since the last one (`between = "next"`).
+    A channel in `last` keeps its value until the next reading (`between = "hold"`). The reading of
+    a channel in `next` is the mean since the previous one (`between = "next"`).
     """
 
     last: tuple[str, ...] = ()
@@ -31,9 +31,9 @@ class Held:
 
     @classmethod
     def of(cls, between: Mapping[str, Any], inputs: Collection[str]) -> Held:
-        """Return the channels of a mapping from channel to behaviour, checked.
+        """Return the channels from a mapping of channel to behaviour.
 
-        Raises `ConfigurationError`: another channel than those in `inputs`, or another behaviour.
+        Raises `ConfigurationError`: a channel is not in `inputs`, or a behaviour is unknown.
         """
         if not isinstance(between, Mapping):
             raise ConfigurationError(
@@ -58,9 +58,9 @@ class Held:
     def acting(
         self, channels: Sequence[str], first: Array, last: Array, row: Array
     ) -> tuple[Array, Array]:
-        """Return the inputs that act inside intervals, at their starts and ends.
+        """Return the inputs inside intervals, at their starts and ends.
 
-        `row` are those of the samples at the ends; all have the shape (..., channels).
+        `row`: inputs of the samples at the ends. All arrays have shape (..., channels).
         """
         first = np.where([name in self.next for name in channels], row, first)
         return first, np.where([name in self.last for name in channels], first, last)
@@ -95,21 +95,21 @@ class Interval:
     Attributes
     ----------
     t0, t1
-        Times of the last accepted sample and of this one.
+        Times of the last accepted sample and of the current one.
     inputs0, inputs1
-        Input channels at both ends, as they act on the process inside the interval.
+        Input channels at both ends, as limits from inside the interval.
     z0, z1
-        Measurements at both ends, shape (sensors,), NaN where missing.
+        Measurements at both ends, shape (sensors,), NaN if missing.
     noise
         Standard deviation of each value of z1, shape (sensors,), NaN for the default of the sensor;
         None if all are defaults.
     gaps
         Channel held at either end -> duration of the gap before, and whether it lasts at the end.
     row
-        Inputs of the sample at the end, which sensors read and the next interval begins with; None
-        if they are `inputs1`. They differ where a channel switches at the end (`driven`).
+        Inputs of the sample at the end, which sensors use and the next interval starts with; None
+        if equal to `inputs1`. They differ if a channel switches at the end (`driven`).
     parts
-        Number of parts of every substep; 0 if it is not chosen yet.
+        Number of parts of every substep; 0 if not chosen yet.
     """
 
     t0: float
@@ -125,7 +125,7 @@ class Interval:
 
     @classmethod
     def between(cls, start: End, stop: End) -> Interval:
-        """Return the interval from one end to another; of no length if both are the same."""
+        """Return the interval between two ends; its length is zero if both are the same."""
         return cls(
             t0=start.t,
             t1=stop.t,
@@ -139,7 +139,7 @@ class Interval:
         )
 
     def driven(self, held: Held) -> Interval:
-        """Return the interval with some channels constant inside it; once more changes nothing."""
+        """Return the interval with held channels constant inside it; the map is idempotent."""
         first, last = self.inputs0, self.inputs1
         if first is last or not held:
             return self
@@ -156,14 +156,14 @@ class Interval:
         return (t - self.t0) / (self.t1 - self.t0)
 
     def at(self, t: float) -> Moment:
-        """Return time and inputs at t; at the end those before a switch."""
+        """Return time and inputs at t; at the end, inputs before a switch."""
         if t == self.t1:
             return self._last
         if self.inputs0 is self.inputs1:
             return Moment(t, self._last.inputs)
         s = self._weight(t)
         mixed = {k: (1 - s) * self.inputs0[k] + s * v for k, v in self.inputs1.items()}
-        if self.row is not None:  # a channel that is held keeps its value to the last digit
+        if self.row is not None:  # avoid rounding errors in the values of held channels
             mixed |= {k: v for k, v in self.inputs1.items() if v == self.inputs0[k]}
         return Moment(t, Inputs(mixed))
 
@@ -178,7 +178,7 @@ class Interval:
 
     @property
     def silent(self) -> Interval:
-        """Copy of the interval without a measurement at the end."""
+        """The interval without measurements at the end."""
         return replace(self, z1=np.full_like(self.z1, np.nan))
 
     @cached_property
@@ -187,7 +187,7 @@ class Interval:
         return np.isfinite(self.z1)
 
     def z(self, t: float) -> Array:
-        """Return measurements interpolated at t; where the value at t0 is missing, those of t1."""
+        """Return measurements interpolated at t; if a value at t0 is missing, the value at t1."""
         if t == self.t1:
             return self.z1
         s = self._weight(t)
@@ -208,16 +208,16 @@ def own_noise(noise: ArrayLike) -> Array | None:
 def gaps_of(
     channels: Sequence[str], before: Iterable[float], again: Iterable[float]
 ) -> dict[str, tuple[float, bool]]:
-    """Return channels held at either end, with how long before and whether at the end."""
+    """Return the attribute `gaps` of an interval from durations before it and flags at its end."""
     each = zip(channels, before, again, strict=True)
     return {name: (past, now > 0.0) for name, past, now in each if past or now}
 
 
 class Moments(NamedTuple):
-    """One time, with the input channels of each member.
+    """A time, with the input channels of each member.
 
-    `inputs` has the shape (members, channels), or (1, channels) if they are the same for all;
-    `interval`, of a single process, contains the time, and is None for members of a fleet.
+    `inputs` has shape (members, channels), or (1, channels) if equal for all members. `interval` is
+    the interval of a single process that contains the time, and None for members of a fleet.
     """
 
     t: float
@@ -236,11 +236,11 @@ class Moments(NamedTuple):
 class Span:
     """Sample intervals of all members, with a common end, as arrays.
 
-    Shapes (members, channels) and (members, sensors), or (1, channels) and (1, sensors) if the same
-    for all. Other attributes are those of `Interval`.
+    Shapes (members, channels) and (members, sensors), or (1, channels) and (1, sensors) if equal
+    for all members. See `Interval` for attributes without a comment.
     """
 
-    # Time of the last accepted sample of each member, shape (members,), and of this one.
+    # t0, t1: times of the last accepted sample of each member, (members,), and of the current one.
     t0: Array
     t1: float
     channels: tuple[str, ...]
@@ -248,13 +248,13 @@ class Span:
     inputs1: Array
     z0: Array
     z1: Array
-    interval: Interval | None = None  # that of a single process; None for members of a fleet
+    interval: Interval | None = None  # interval of a single process; None for members of a fleet
     noise: Array | None = None
     # Duration of the gap of each channel before this interval, and 1 if it lasts at its end, shape
     # (members, 2, channels) or (1, 2, channels); None without a gap.
     gaps: Array | None = None
     row: Array | None = None
-    parts: IntArray | None = None  # shape (members,); None if they are not chosen yet
+    parts: IntArray | None = None  # shape (members,); None if not chosen yet
 
     @classmethod
     def of(cls, interval: Interval, channels: tuple[str, ...]) -> Span:
@@ -282,7 +282,7 @@ class Span:
         )
 
     def driven(self, held: Held) -> Span:
-        """Return the span with some channels constant inside it; once more changes nothing."""
+        """Return the span with held channels constant inside it; the map is idempotent."""
         first, last = self.inputs0, self.inputs1
         if first is last or not held:
             return self
@@ -296,7 +296,7 @@ class Span:
 
     @property
     def stated(self) -> Array:
-        """Inputs of the sample at the end, as it states them."""
+        """Inputs of the sample at the end, including a switch there."""
         return self.inputs1 if self.row is None else self.row
 
     def __len__(self) -> int:
@@ -304,7 +304,7 @@ class Span:
 
     @property
     def division(self) -> int:
-        """Number of parts of every substep, of members that have the same; 1 if not chosen yet."""
+        """Number of parts of every substep, equal for all members; 1 if not chosen yet."""
         return 1 if self.parts is None else int(self.parts[0])
 
     @property
@@ -330,20 +330,20 @@ class Span:
         return np.asarray(given.any(axis=1))
 
     def at(self, t: float) -> Moments:
-        """Return time and inputs at t of members with one start; at the end before a switch."""
+        """Return time and inputs at t for members with a common start; at t1, before a switch."""
         mixed = last = self.inputs1
-        # The same object at both ends says that inputs are held: no interpolation.
+        # If both ends are the same object, all inputs are constant.
         if t != self.t1 and self.inputs0 is not last:
             s = (t - self.start) / (self.t1 - self.start)
             mixed = (1 - s) * self.inputs0 + s * last
-            if self.row is not None:  # a channel that is held keeps its value to the last digit
+            if self.row is not None:  # avoid rounding errors in the values of held channels
                 mixed = np.where(self.inputs0 == last, last, mixed)
         return Moments(t=t, channels=self.channels, inputs=mixed, interval=self.interval)
 
     @property
     def end(self) -> Moments:
         """Time and inputs of the sample at the end."""
-        # The interval knows the inputs that act at its end; those of the sample may differ.
+        # The interval returns inputs before a switch, which differ from `stated` if there is a row.
         interval = self.interval if self.row is None else None
         return Moments(t=self.t1, channels=self.channels, inputs=self.stated, interval=interval)
 
@@ -353,7 +353,7 @@ class Span:
 
         parts = {item.name: getattr(self, item.name) for item in fields(self)}
         arrays = {name: some(part) for name, part in parts.items() if isinstance(part, np.ndarray)}
-        if self.inputs0 is self.inputs1:  # the same object says that inputs are held
+        if self.inputs0 is self.inputs1:  # identity marks constant inputs, so preserve it
             arrays["inputs0"] = arrays["inputs1"]
         return Span(**(parts | arrays))
 

@@ -33,18 +33,18 @@ from livepde.stepping.forward import ForwardStage
 from livepde.stepping.interval import Moments
 from livepde.stepping.newton import Kept, StepFailed
 
-# Relative error of a covariance square root. It affects the gain only, not the innovation, and may
-# be coarser than the state.
+# Relative error of a covariance square root. It affects the gain but not the innovation, so it can
+# be larger than the error of the state.
 GAIN = 1e-4
-# Relative error of the tangent that carries the estimated mean, as accurate as the state itself.
+# Relative error of the tangent that represents the estimated mean: as accurate as the state.
 ESTIMATE = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
 class KeptFactors:
-    """Warm-start data of each member, as `Kept`, with the members as first axis.
+    """Warm-start data of all members: arrays of `Kept` with the members as first axis.
 
-    h = 0 for a member without a cached factor. For stages that cache none, q and trend have no
+    For a member without a cached factor, h = 0. If a stage caches no factors, q and trend have no
     columns.
     """
 
@@ -60,7 +60,7 @@ class KeptFactors:
         return cls(np.zeros((members, m)), zero, zero, np.zeros((members, n)))
 
     def forgotten(self) -> KeptFactors:
-        """Return empty warm-start data of the same members."""
+        """Return empty warm-start data for the same number of members."""
         return KeptFactors.none(len(self.h)) if self.q.shape[1] else self
 
     def member(self, k: int) -> Kept:
@@ -71,9 +71,9 @@ class KeptFactors:
 
 
 class StageOfMembers(NamedTuple):
-    """Arguments of a batched stage, besides its initial states and tangents."""
+    """Arguments of a batched stage, in addition to its initial states and tangents."""
 
-    members: IntArray  # numbers of the members, as keys of their cached factors, shape (members,)
+    members: IntArray  # indices of the members, as keys of their cached factors, shape (members,)
     # q, directions: latent parameters, (members, dim), and derivative of q along each tangent,
     # (members, r, m).
     q: Array
@@ -85,8 +85,8 @@ class StageOfMembers(NamedTuple):
     # Mask of members, (members,), whose last tangent is the offset of the estimated mean from the
     # linearisation point, which has to be more accurate than a covariance square root.
     off_centre: Mask
-    # Cache of factorised matrices for this q, keyed by step length, shared by the stages of one
-    # step of a time scheme; a stage may read it and add to it.
+    # Cache of factorised matrices for this q by step length, which the stages of one step of a time
+    # scheme share and extend.
     factors: dict[float, Any]
     # Number of trailing tangents that are solved separately, so that their presence does not change
     # the rounding of the other columns.
@@ -102,7 +102,7 @@ class MemberStage(ABC):
 
     @abstractmethod
     def twin(self) -> MemberStage:
-        """Return a stage of the same model with its own factor cache, for other step lengths."""
+        """Return a stage of the same model with a separate factor cache, for other step lengths."""
 
     @abstractmethod
     def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
@@ -113,14 +113,14 @@ class MemberStage(ABC):
 
 
 class SeparateStages(MemberStage):
-    """Loop of one `ForwardStage` per member: serves any model."""
+    """Loop over a separate `ForwardStage` for each member: applicable to any model."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
         self._stages: list[ForwardStage] = []
 
     def _stage(self, k: int) -> ForwardStage:
-        """Return the stage of a member: symbolic analysis is shared, numeric factors are not."""
+        """Return the stage of a member, which shares the symbolic analysis but no factors."""
         if not self._stages:
             self._stages.append(ForwardStage(self.model))
         while len(self._stages) <= k:
@@ -159,18 +159,18 @@ class SeparateStages(MemberStage):
         return new, KeptFactors(*rows)
 
 
-# Largest number of unknowns with an assembled matrix A_j each: the cost of summing them grows
-# linearly.
+# Largest number of unknowns with assembled matrices A_j: the cost of their sum grows linearly.
 MOST_UNKNOWNS = 64
 
-NO_RESPONSE = np.zeros((0, 0))  # of a stage that does not depend on inputs
+NO_RESPONSE = np.zeros((0, 0))  # derivative in the inputs of a stage that does not depend on them
 
 
 class BandedStep(NamedTuple):
-    """What stages of one length with the same unknowns share.
+    """Common data of stages with the same length and unknowns.
 
-    `amounts` are h q of the unknowns in which A is linear, (members, unknowns), `slopes` their
-    derivatives in the physical unknowns, (members, unknowns, m), None if these are the same.
+    `amounts`: h q of the coefficients in which A is linear, (members, unknowns). `slopes`: their
+    derivatives by the physical unknowns, (members, unknowns, m), None for the identity. `forced`:
+    the right-hand side of the state and its derivative by the inputs, see `_forced`.
     """
 
     factor: BlockFactor
@@ -181,9 +181,9 @@ class BandedStep(NamedTuple):
 
 
 class MatrixTerm(NamedTuple):
-    """One matrix of a stage, by its entries: part of A_j, or of B for `unknown` = -1.
+    """Entries of one matrix of a stage: part of A_j, or of B if `unknown` is -1.
 
-    It is multiplied by the input of a channel, or is the part without inputs for `channel` = -1.
+    It is the factor of the input of a channel, or the part without inputs if `channel` is -1.
     """
 
     unknown: int
@@ -192,11 +192,11 @@ class MatrixTerm(NamedTuple):
 
 
 class BandedStage(MemberStage):
-    """Batched stage of models whose matrices are banded, and affine in q and in the inputs.
+    """Batched stage for models whose matrices are banded, and affine in q and in the inputs.
 
-    The matrices M, B and A_j are assembled once, those of each input apart: the flow that carries
-    heat, say. The matrices of all members are the diagonal blocks of one banded matrix, which is
-    factorised by one LAPACK call.
+    The matrices M, B and A_j are assembled once, with separate terms for inputs, such as a flow
+    that transports heat. The matrices of all members are the diagonal blocks of one banded matrix,
+    which is factorised by one LAPACK call.
     """
 
     def __init__(self, model: Model) -> None:
@@ -208,21 +208,21 @@ class BandedStage(MemberStage):
         inner, outer = free[rows] * free[cols], free[rows] * (1.0 - free[cols])
         mass = maps["M"] @ model.mass.data
         self._mass = row_product(self._stacked(mass * free[rows]))
-        # Those without inputs first: one of each unknown, then of B.
+        # Terms without inputs come first: one for each unknown, then one for B.
         terms = _matrix_terms(model, maps)
         self._terms = terms[unknowns + 1 :]
         slopes = [term.data for term in terms if term.unknown >= 0]
         self._slopes = row_product(self._stacked(*(slope * inner for slope in slopes)))
-        # Fixed coefficients have rows of the identity, multiplied by h like all of the rest.
+        # Fixed coefficients have rows of the identity, scaled by h like the matrix.
         ones = np.where(rows == cols, 1.0 - free[rows], 0.0)
         parts = [term.data * inner for term in terms]
         parts[unknowns] = parts[unknowns] + ones
         every = np.array([*parts, mass * inner])
         self._blocks = BandedBlocks.of(BandedSolver(self.pattern), *every)
-        # The matrix of a stage is the sum of these with weights h q, h, those times inputs, and 1.
+        # The matrix of a stage is their sum with weights h q, h, both times inputs, and 1.
         self._bands = self._blocks.band(every)
-        # The couplings of free coefficients to Dirichlet values are moved to the right-hand side.
-        # They have few entries, and stay sparse: their products are formed once.
+        # Couplings of free coefficients to Dirichlet values are moved to the right-hand side. They
+        # are sparse matrices with few entries.
         self._drive(
             self._stacked(mass * outer),
             self._stacked(terms[unknowns].data * outer),
@@ -234,7 +234,7 @@ class BandedStage(MemberStage):
     def _drive(
         self, mass_edge: sp.csr_array, rest_edge: sp.csr_array, slope_edge: sp.csr_array
     ) -> None:
-        """Set the vectors that drive a stage, from couplings of M, of B, and of each A_j."""
+        """Set the driving vectors of a stage, given the Dirichlet couplings of M, B and all A_j."""
         model, form, free = self.model, self.model.linear_A, self.model.X.free
         zero, units = np.zeros(model.X.dim), np.eye(form.spaces["q"].dim)
         timeless = (int, float, Channel)
@@ -270,7 +270,7 @@ class BandedStage(MemberStage):
 
     @staticmethod
     def refuses(model: Model) -> str:
-        """Return the reason why a model does not fit this stage; empty if it fits."""
+        """Return why this stage is not applicable to a model; empty if it is."""
         if not (model.linear_A.affine_in_parameter and model.affine):
             return "the model is not affine in its state and its unknowns"
         if model.linear_A.spaces["q"].dim > MOST_UNKNOWNS:
@@ -284,14 +284,14 @@ class BandedStage(MemberStage):
 
     @property
     def refusal(self) -> str:
-        """Reason why members with different inputs cannot be batched; empty if they can."""
+        """Why members with different inputs cannot be batched; empty if they can."""
         if not all(item.affine for item in (self._boundary, self._load, self._offset)):
             return "the model is not affine in its input channels"
         return ""
 
     @property
     def repeats(self) -> bool:
-        """True if stages of one length and the same unknowns differ by their inputs alone."""
+        """Whether stages with the same length and unknowns differ only in their inputs."""
         vectors = self._boundary, self._mass_boundary, self._load, self._offset
         return not self._terms and all(one.responses is not None for one in vectors)
 
@@ -299,11 +299,11 @@ class BandedStage(MemberStage):
         """Return vertically stacked matrices of the pattern."""
         blocks = [self.pattern.matrix(part) for part in parts]
         whole = sp.csr_array(sp.vstack(blocks, format="csr"))
-        whole.eliminate_zeros()  # an unknown of a layer has an effect there only
+        whole.eliminate_zeros()  # an unknown of one layer has entries only there
         return whole
 
     def twin(self) -> BandedStage:
-        return self  # it keeps no factor
+        return self  # no factor is cached
 
     def kept(self, members: int) -> KeptFactors:
         return KeptFactors.none(members)
@@ -324,7 +324,7 @@ class BandedStage(MemberStage):
             offset = self._along_edges(u, offset, step, at)
         if offset is not None:
             u -= (step.amounts[:, None] @ offset)[:, 0]
-        # The state first: the tangents need it.
+        # Solve for the state first, since the tangents depend on it.
         u[:] = step.factor.solve(new[:1])[0]
         if len(columns) > 1:
             driven = self._driven(u, offset, step, at.inputs)
@@ -335,9 +335,9 @@ class BandedStage(MemberStage):
         return new, stage.kept
 
     def _times_mass(self, columns: Array, together: int) -> Array:
-        """Return the product of M with columns, of which those from `together` on are separate."""
-        # BLAS may round products of other shapes differently, so the separate columns share no
-        # product with the others. Each column is solved by itself, however many there are.
+        """Return M times the columns, with a separate product for rows from `together` on."""
+        # Rounding in BLAS may depend on the shape, so separate columns must not share a product
+        # with the others. The solution of a column does not depend on other columns.
         new, n = np.empty(columns.shape), columns.shape[2]
         rows, known = columns.reshape(-1, n), new.reshape(-1, n)
         if self._mass.separate or together == len(rows):
@@ -348,7 +348,7 @@ class BandedStage(MemberStage):
         return new
 
     def _add_load(self, u: Array, step: BandedStep, stage: StageOfMembers) -> None:
-        """Add what drives the state to its right-hand side, (members, n)."""
+        """Add loads and boundary terms to the right-hand side of the state, (members, n)."""
         if step.forced is None:
             u += stage.h * self._load(stage.at) - self._mass_boundary(stage.at)
             return
@@ -361,7 +361,7 @@ class BandedStage(MemberStage):
     def _add_driven(
         known: Array, driven: Array, stage: StageOfMembers, step: BandedStep, together: int
     ) -> None:
-        """Subtract what drives the tangents from their right-hand sides, (columns * members, n)."""
+        """Subtract the forcing from the right-hand sides of tangents, (columns * members, n)."""
         size = len(stage.q)
         along, chosen = stage.h * stage.directions, together // size - 1
         if step.slopes is not None:
@@ -372,7 +372,7 @@ class BandedStage(MemberStage):
             known[together:] -= _sums_along(along[:, chosen:], driven)
 
     def _begin(self, stage: StageOfMembers) -> BandedStep:
-        """Return the common part of all stages of a length, and keep it for the next one."""
+        """Return the common data of stages of a length, and cache them if they are reusable."""
         latent, h = self.model.latent, stage.h
         unknowns = stage.q if latent.plain else latent.value(stage.q.T).T
         slopes, coefficients = None, self.model.coefficients
@@ -388,14 +388,14 @@ class BandedStage(MemberStage):
             weights[:, place] *= stage.at.inputs[:, term.channel]
         factor = self._blocks.factorise(weights.dot(self._bands))
         step = BandedStep(factor, h, amounts, slopes, self._forced(h))
-        if not self._terms:  # else it is that of the inputs of this stage alone
+        if not self._terms:  # otherwise the factor depends on the inputs of this stage
             stage.factors[h] = step
         return step
 
     def _along_edges(
         self, u: Array, offset: Array | None, step: BandedStep, at: Moments
     ) -> Array | None:
-        """Return the offset with what inputs times boundary values add to it, and add to u."""
+        """Add the terms that couple inputs to boundary values to u and to the returned offset."""
         h, boundary = step.h, self._boundary(at)
         members, unknowns = step.amounts.shape
         offset = None if offset is None else offset.repeat(members // len(offset), axis=0)
@@ -410,7 +410,7 @@ class BandedStage(MemberStage):
         return offset
 
     def _driven(self, u: Array, offset: Array | None, step: BandedStep, inputs: Array) -> Array:
-        """Return what drives the tangents, A(u) e_j = A_j u + offset_j, (members, unknowns, n)."""
+        """Return the forcing A(u) e_j = A_j u + offset_j of tangents, (members, unknowns, n)."""
         parts, count = self._slopes(u).reshape(len(u), -1, u.shape[1]), step.amounts.shape[1]
         found = parts
         if self._terms:
@@ -421,9 +421,9 @@ class BandedStage(MemberStage):
         return found if offset is None else found + offset
 
     def _forced(self, h: float) -> tuple[Array, Array] | None:
-        """Return what drives the state in a stage, (1, n), and its derivative in the inputs.
+        """Return the right-hand side of the state, (1, n), and its derivative by the inputs.
 
-        None where that reads the time, or is not affine in the inputs.
+        None if it depends on time, or is not affine in the inputs.
         """
         load, boundary = self._load.responses, self._mass_boundary.responses
         if load is None or boundary is None:
@@ -434,18 +434,18 @@ class BandedStage(MemberStage):
 
 
 def _sums_along(directions: Array, driven: Array) -> Array:
-    """Return sums of what drives the tangents along their directions, (r * members, n)."""
-    if len(driven) == 1:  # a product of stacks costs more
+    """Return the forcing of the tangents along their directions, (r * members, n)."""
+    if len(driven) == 1:  # faster than a product of stacks
         return np.asarray(directions[0].dot(driven[0]))
     found: Array = (directions @ driven).transpose(1, 0, 2)
     return found.reshape(-1, driven.shape[2])
 
 
 def _along(form: Form, unit: Array, of: Callable[[Array], Array]) -> Array:
-    """Return the change of an affine function of q with one of the unknowns, `unit` a row of ones.
+    """Return the derivative of an affine function of q by an unknown; `unit` is its unit vector.
 
-    Where A has a part without unknowns it is a difference, at values so large that it loses none
-    of its digits.
+    If A has a part without unknowns, the derivative is a difference at values that are large enough
+    to lose no digits.
     """
     if form.linear_in_parameter:
         return of(unit)
@@ -453,7 +453,7 @@ def _along(form: Form, unit: Array, of: Callable[[Array], Array]) -> Array:
 
 
 def _matrices(model: Model, maps: Mapping[str, sp.csr_array]) -> Iterator[DrivenVector]:
-    """Iterate over the entries of A_j and B as the inputs drive them; B has what A knows."""
+    """Iterate over the entries of A_j and B as functions of inputs; B includes A at q = 0."""
     A, B, zero = model.linear_A, model.form_B, np.zeros(model.X.dim)
     units = np.eye(A.spaces["q"].dim)
 
@@ -474,7 +474,7 @@ def _matrices(model: Model, maps: Mapping[str, sp.csr_array]) -> Iterator[Driven
 
 
 def _matrix_terms(model: Model, maps: Mapping[str, sp.csr_array]) -> list[MatrixTerm]:
-    """Return the matrices of A_j and B: those without inputs, then those of inputs that matter."""
+    """Return the terms of A_j and B: all terms without inputs, then nonzero terms of inputs."""
     bases, more = list[MatrixTerm](), list[MatrixTerm]()
     every = list(_matrices(model, maps))
     for unknown, entries in zip((*range(len(every) - 1), -1), every, strict=True):
@@ -498,7 +498,7 @@ def _analysed(model: Model) -> tuple[Pattern, dict[str, sp.csr_array]]:
 
 
 def member_stage(model: Model) -> MemberStage:
-    """Return the fastest applicable batched stage; the only place of this decision."""
+    """Return the fastest batched stage that is applicable to a model."""
     if BandedStage.refuses(model):
         return SeparateStages(model)
     return BandedStage(model)

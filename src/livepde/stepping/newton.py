@@ -24,7 +24,7 @@ FACTORS = 3
 
 
 class StepFailed(Exception):
-    """Failure of a stage; caught by the step control, never seen by users."""
+    """Failure of a stage, which the step control handles; internal."""
 
     def __init__(self, code: str, detail: str) -> None:
         super().__init__(detail)
@@ -49,7 +49,7 @@ class StagePoint(Protocol):
 
     @property
     def resolved(self) -> bool:
-        """False if the residual is too large to resolve a small difference in the equation."""
+        """Whether the residual is small enough to resolve a small difference in the equation."""
 
 
 Point = TypeVar("Point", bound=StagePoint)
@@ -65,7 +65,7 @@ class StageEquation(Protocol[Point]):
         """Return the factorised Jacobian at an iterate."""
 
     def limited(self, at: Point, allowed: float) -> bool:
-        """Return True if rounding errors alone keep the residual above `allowed`."""
+        """Return whether only rounding errors keep the residual above `allowed`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class Near:
     """Predictor of a stage: starting value y and cached Jacobian factor."""
 
     y: Array
-    # Factor of a nearby Jacobian, for the first updates; None: the Jacobian at y is factorised.
+    # Factor of a nearby Jacobian for the first updates; None to factorise the Jacobian at y.
     factor: Factor | None = None
     # Contraction factor of the residual above which `factor` is replaced by a new one.
     refresh: float = 0.2
@@ -83,7 +83,7 @@ class Near:
 class Solution(Generic[Point]):
     """Solution `at` of a stage, with the number of Newton updates.
 
-    `made` is the iterate of the last factorised Jacobian, and its factor; None without one.
+    `made`: iterate of the last factorised Jacobian, and its factor; None without a factorisation.
     """
 
     at: Point
@@ -96,10 +96,10 @@ class Newton:
     """Simplified Newton method with cached factors and residual-based acceptance.
 
     A stage is solved when its residual, in the dual norm and relative to the largest term of the
-    equation, is at most `tolerance` or at rounding level. From a good prediction a reduction to
-    `share` of the initial residual, and at most `ceiling`, is enough: the error of a prediction is
-    about the truncation error of the time step. The size of an update is no criterion: an outdated
-    factor can make it small, too.
+    equation, is at most `tolerance` or at rounding level. From a prediction, a reduction to `share`
+    of the initial residual, and at most `ceiling`, suffices: the error of a prediction is
+    comparable to the truncation error of the time step. The size of an update is not a criterion,
+    because an outdated factor can also make it small.
 
     An update that does not reduce the residual is damped by halving (line search).
 
@@ -110,15 +110,14 @@ class Newton:
     share
         Accepted fraction of the residual of a prediction. 0: always solve to `tolerance`.
     ceiling
-        Bound on the relative residual with `share`: the next stage corrects what remains. The
-        default keeps q and u within 1e-2 of those of strict solves, relative to their largest
-        values, and 1e-4 within 1e-3 (study `exact` in experiments: one and two dimensions,
-        vanishing diffusivity, 1 % noise; undivided steps). Large coupled stages, solved by blocks,
-        raise it to 5e-3.
+        Bound on the relative residual with `share`: the next stage corrects the rest. With the
+        default, q and u differ from strict solves by at most 1e-2 of their largest values, with
+        1e-4 by at most 1e-3 (study `exact` in experiments: one and two dimensions, vanishing
+        diffusivity, 1 % noise; undivided steps). Large coupled stages, solved by blocks, use 5e-3.
     iterations
         Maximum number of updates.
     refresh
-        The Jacobian is factorised again when an update leaves more than this share of the residual.
+        If an update leaves more than this share of the residual, the Jacobian is factorised again.
     """
 
     tolerance: float = 1e-8
@@ -136,8 +135,8 @@ class Newton:
     ) -> Solution[Point]:
         """Return the solution of a stage.
 
-        `start` is the initial iterate, or a function that returns it: with `near`, the predicted
-        solution, it may not be needed.
+        `start` is the initial iterate, or a function that returns it, which is called only if the
+        iteration from the prediction `near` fails.
 
         Raises `StepFailed`: "not_converged", "not_finite" or "singular".
         """
@@ -145,11 +144,11 @@ class Newton:
         if near is not None:
             at = equation.evaluate(near.y)
             allowed = max(self.tolerance, min(self.share * at.size, self.ceiling))
-            with suppress(StepFailed):  # the prediction was no good one
+            with suppress(StepFailed):  # the prediction was poor
                 return iteration.run(at, near, allowed, FACTORS)
         at = equation.evaluate(start() if callable(start) else start)
-        # Without a prediction the residual at the start does not measure the truncation error, so
-        # the strict tolerance holds.
+        # Without a prediction, the initial residual does not measure the truncation error, so the
+        # strict tolerance applies.
         return iteration.run(at, Near(at.y), self.tolerance, self.iterations)
 
 
@@ -180,17 +179,17 @@ class _Iteration(Generic[Point]):
                     at = limited
                     break
                 new = self._damped(at, update)
-            # A factor that came with the prediction has a limit of its own.
+            # The factor of the prediction has a separate limit.
             refresh = near.refresh if factor is near.factor else newton.refresh
             slow = not new.size <= refresh * at.size
-            # With an old factor an update may fail: the better iterate stays, and is factorised
-            # next.
+            # If an update with an old factor fails, the better iterate is kept and its Jacobian
+            # factorised.
             at = new if new.size < at.size else at
             factor = None if slow else factor
         return Solution(at, self.updates, self.made)
 
     def _check_budget(self, at: Point, *, spent: bool) -> None:
-        """Raise `StepFailed` without an update left; `spent`: it needs one factor too many."""
+        """Raise `StepFailed` if the updates are used up, or the factorisations (`spent`)."""
         if spent or self.updates >= self.newton.iterations:
             text = f"{self.updates} updates left a relative residual of {at.size:.1e}"
             raise StepFailed("not_converged", text)
@@ -222,13 +221,13 @@ class _Iteration(Generic[Point]):
         return new, update
 
     def _damped(self, at: Point, update: Array) -> Point:
-        """Return the stage after a damped update that reduces the residual."""
+        """Return the evaluation after a damped update that reduces the residual."""
         part = 1.0
         for _ in range(HALVINGS):
             part *= 0.5
             new = self.equation.evaluate(at.y - part * update)
-            # A sufficient decrease proportional to the step (Armijo): any decrease at all would let
-            # the iteration stall.
+            # Sufficient decrease proportional to the step (Armijo): an arbitrarily small decrease
+            # would allow the iteration to stall.
             if new.size <= (1.0 - 0.1 * part) * at.size:
                 return new
         raise StepFailed(
@@ -236,14 +235,14 @@ class _Iteration(Generic[Point]):
         )
 
 
-# Bound on the error of a stage relative to the change of the state in it, so that the accuracy does
-# not depend on how slow the process is.
+# Bound on the error of a stage relative to the change of the state, so that the relative accuracy
+# does not depend on the time scale of the process.
 SHARE = 1e-2
 # Relative size of a correction at the level of accumulated rounding errors: further corrections
 # would not improve the solution.
 ROUNDING = 1e-11
-# A factor with a contraction rate above this is replaced: five corrections would gain fewer than
-# three digits.
+# Contraction rate above which a factor is replaced: five corrections would gain fewer than three
+# digits.
 SLOW = 0.3
 
 
@@ -251,10 +250,10 @@ SLOW = 0.3
 class Kept:
     """Warm-start data of a stage: q, (m,), and step h of its cached factor, trend of u, (n,).
 
-    The factor itself is not stored: it is recomputed from these data if it is missing, as after a
-    restart, and the subsequent numbers are the same. q is empty if there is no factor. `spent` are
-    the excess solves since the factor was computed, beyond those expected with a nearby q; the
-    trend is the rate of change for the predictor of the next stage.
+    The factor itself is not stored. If it is missing, as after a restart, it is recomputed from
+    these data, with identical results. q is empty if there is no factor. `spent` is the number of
+    solves since the factorisation beyond the number expected with a nearby q. The trend is the rate
+    of change for the predictor of the next stage.
     """
 
     q: Array
@@ -275,7 +274,7 @@ class At(NamedTuple):
     h: float
 
     def same(self, q: Array, h: float) -> bool:
-        """Return True if parameter and step equal (q, h)."""
+        """Return whether parameter and step equal (q, h)."""
         return self.h == h and (self.q is q or np.array_equal(self.q, q))
 
 
@@ -283,8 +282,8 @@ class At(NamedTuple):
 class Corrections:
     """Iterative refinement with the matrix of one stage and the factor of another.
 
-    `matrix`, `at` and the mask `free` are of the stage; `factor` returns the factorised matrix of
-    (q, h), at a `price` in triangular solves, and is used at `factor_at`. `spent` is as in `Kept`.
+    `matrix`, `at` and the mask `free` describe the stage. `factor` returns the factorised matrix
+    for (q, h), at a `price` in triangular solves; it is used for `factor_at`. `spent`: see `Kept`.
     """
 
     matrix: sp.csr_array | Array
@@ -298,8 +297,8 @@ class Corrections:
     def once(self, start: Array, b: Array) -> Array:
         """Return the solution of matrix x = b after a single correction.
 
-        The error left is at most `SLOW` of the initial one, since the factor would be replaced
-        otherwise.
+        The remaining error is at most `SLOW` times the initial error; otherwise the factor would
+        have been replaced.
         """
         r = (b - self.matrix @ start) * self.free[:, None]
         return start + solved(self.factor(*self.factor_at), r)
@@ -307,10 +306,10 @@ class Corrections:
     def solve(self, before: Array, start: Array, b: Array, tolerance: float, passes: int) -> Array:
         """Return the solution of matrix x = b on the free coefficients, shape (n,) or (n, r).
 
-        `before` is x at the beginning of the stage, `start` an initial guess, exact on the fixed
-        coefficients. `tolerance` bounds the error relative to x, both in the Frobenius norm over
-        all columns, which is invariant under rotations of the columns of a covariance square root.
-        Only corrections beyond `passes` count as excess solves.
+        `before` is x at the beginning of the stage, and `start` an initial guess that is exact on
+        the fixed coefficients. `tolerance` bounds the error relative to x in the Frobenius norm
+        over all columns, which is invariant under rotations of the columns of a covariance square
+        root. Only corrections beyond `passes` count as excess solves.
         """
         free = self.free.reshape(-1, *[1] * (b.ndim - 1))
         width = b[0].size
@@ -320,17 +319,17 @@ class Corrections:
         while True:
             update = solved(self.factor(*self.factor_at), r)
             x, count = x + update, count + 1
-            if exact:  # the factor of the stage's own matrix needs no iteration
+            if exact:  # the factor is that of the stage's matrix, so no iteration is needed
                 return x
             moved, size = float(np.linalg.norm(update)), float(np.linalg.norm(x))
-            if moved <= ROUNDING * size:  # corrections only exchange rounding errors
+            if moved <= ROUNDING * size:  # further corrections are rounding errors
                 return x
             last, r = float(np.linalg.norm(r)), (b - self.matrix @ x) * free
-            # The contraction rate is estimated from residuals, not from updates: the residual of
-            # the new iterate is needed anyway for the next correction.
+            # The contraction rate is estimated from residuals instead of updates, since the next
+            # correction requires the residual of the new iterate in any case.
             rate = float(np.linalg.norm(r)) / last if last else math.inf  # squares may underflow
             if rate <= SLOW:
-                # The remaining error is the geometric series of all further corrections.
+                # The remaining error is the geometric series of further corrections.
                 left = moved * rate / (1.0 - rate)
                 change = float(np.linalg.norm(x - before))
                 allowed = max(min(tolerance * size, SHARE * change), ROUNDING * size)
@@ -342,8 +341,7 @@ class Corrections:
                     return x
                 if spent <= self.price:
                     continue
-            # The refinement with the old factor has cost, or would cost, as much as a
-            # factorisation.
+            # The refinement with the old factor costs more than a factorisation.
             self.factor_at, self.spent, exact = self.at, 0.0, True
             x, r = start, first
 

@@ -1,7 +1,7 @@
-"""Time schemes as sequences of implicit Euler stages, and the substeps they take over an interval.
+"""Time schemes as sequences of implicit Euler stages, and step control within an interval.
 
-A *stage* solves M (y - c)/h + R(t, y) = 0 for y; every scheme here is a recipe of such stages, so a
-law writes its implicit equations once.
+A *stage* solves M (y - c)/h + R(t, y) = 0 for y. Every scheme here is a sequence of such stages, so
+a law implements a single implicit equation.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from livepde.linalg import Array
 from livepde.stepping.interval import LINES, Held
 from livepde.stepping.newton import StepFailed
 
-# A variable of the context, not of a control: a refit in its own thread is not interrupted.
+# A context variable instead of an attribute of a control: a refit in another thread must not be
+# interrupted.
 CHECK: ContextVar[Callable[[], None] | None] = ContextVar("livepde_interruption", default=None)
 
 
 def safe_point() -> None:
-    """Call the function of `interruptible`, if there is one; called before each substep."""
+    """Call the function set by `interruptible`, if any; to be called before each substep."""
     check = CHECK.get()
     if check is not None:
         check()
@@ -34,7 +35,7 @@ def safe_point() -> None:
 
 @contextmanager
 def interruptible(check: Callable[[], None]) -> Iterator[None]:
-    """Let a function be called before each substep; an exception in it ends the computation."""
+    """Call `check` before each substep within the context; its exceptions end the computation."""
     token = CHECK.set(check)
     try:
         yield
@@ -42,18 +43,17 @@ def interruptible(check: Callable[[], None]) -> Iterator[None]:
         CHECK.reset(token)
 
 
-# An interval of more than so many substeps of `dt_max`, such as a pause of the source, is divided
-# into fewer and longer ones: hourly readings with steps of a second are below, and any pause costs
-# seconds on a rod. The schemes are L-stable, and shadows divide longer substeps again where
-# their error matters.
+# An interval of more than MOST_SUBSTEPS substeps of `dt_max`, such as a pause of the source, has
+# LONG_SUBSTEPS longer ones. Hourly readings with steps of 1 s stay below the limit, and any pause
+# takes seconds for a rod. The schemes are L-stable, and shadows divide substeps with large errors.
 MOST_SUBSTEPS, LONG_SUBSTEPS = 10_000, 1000
-# Beyond this number of halvings a substep would be shorter than the resolution of usual times.
+# With more halvings a substep would be shorter than the resolution of usual times.
 MOST_HALVINGS = 30
-# With three halvings a tenth is left of the error of the first steps of a solution that goes with
-# the square root of time, for the work of six more substeps.
+# For a solution proportional to the square root of time, three halvings reduce the error of the
+# first steps to a tenth, at the cost of six additional substeps.
 MOST_GRADES = 3
 
-# Share of a length that may be the rounding of its ends: seconds since 1970 have a resolution of
+# Relative rounding error of a length from its ends: seconds since 1970 have a resolution of
 # 2.4e-7 s.
 ROUNDING = 1e-5
 
@@ -63,14 +63,14 @@ Stage: TypeAlias = Callable[[Array, float, float], Array]
 
 @dataclass(frozen=True)
 class Scheme(ABC):
-    """A one-step method built of implicit stages."""
+    """A one-step method composed of implicit stages."""
 
     order: ClassVar[int]
 
     @property
     @abstractmethod
     def weight(self) -> float:
-        """Weight of the last stage, at the end, in the quadrature; other stages have the rest."""
+        """Weight of the last stage in the quadrature; the other stages share the remainder."""
 
     @abstractmethod
     def advance(self, stage: Stage, y: Array, t: float, h: float) -> Array:
@@ -121,7 +121,7 @@ class Alexander2(Scheme):
     def advance(self, stage: Stage, y: Array, t: float, h: float) -> Array:
         g = self.gamma
         first = stage(y, t + g * h, g * h)
-        # The second stage begins at y + (1 - gamma) h k_1, where h k_1 = (first - y)/gamma.
+        # The second stage starts from y + (1 - gamma) h k_1 with h k_1 = (first - y)/gamma.
         return stage(y + (1 - g) / g * (first - y), t + h, g * h)
 
 
@@ -135,18 +135,18 @@ class Advance:
         Time scheme.
     dt_max
         Longest substep; a longer interval is divided evenly. An interval of more than
-        `MOST_SUBSTEPS` of them is divided into `LONG_SUBSTEPS` longer substeps.
+        `MOST_SUBSTEPS` substeps is divided into `LONG_SUBSTEPS` longer ones.
     halvings
         Maximum number of successive halvings of a failed substep; 0: no retry.
     held
-        Input channels that are constant between two readings; the others change linearly.
+        Input channels that are constant between readings; the others are linear.
     parts
         Number of parts of every substep, to repeat an interval with shorter steps.
     start
-        Initial time. Substeps h near it are graded: halved, at most three times, where they are
-        longer than half of the time since then, unless `halvings` is 0. Data that do not fit the
-        initial state, as a heat flux that sets in, leave a boundary layer that goes with the
-        square root of time.
+        Initial time. Unless `halvings` is 0, substeps near it are graded: they are halved at most
+        three times while they are longer than half of the time since then. Data that are
+        incompatible with the initial state, such as a sudden heat flux, cause a boundary layer
+        that grows with the square root of time.
 
     Examples
     --------
@@ -172,11 +172,11 @@ class Advance:
             )
 
     def divided(self, parts: int) -> Advance:
-        """Return the control by which every substep is divided into so many parts more."""
+        """Return the control with every substep divided into `parts` parts."""
         return self if parts == 1 else replace(self, parts=parts * self.parts)
 
     def count(self, length: float) -> int:
-        """Return the number of equal substeps of an interval of that length."""
+        """Return the number of equal substeps of an interval of a given length."""
         if length <= self.dt_max:
             return self.parts
         # The factor keeps rounding of the length from adding a substep when dt_max divides it.
@@ -185,11 +185,11 @@ class Advance:
         return self.parts * math.ceil(length / self.dt_max * (1 - ROUNDING))
 
     def stretches(self, length: float) -> bool:
-        """Return whether an interval of that length has substeps longer than `dt_max`."""
+        """Return whether an interval of a given length has substeps longer than `dt_max`."""
         return length * (1 - ROUNDING) > MOST_SUBSTEPS * self.dt_max
 
     def grade(self, t: float, h: float) -> int:
-        """Return how often a substep h from t is halved because it is near the start."""
+        """Return the number of halvings of a substep h at t due to grading near the start."""
         since = t - self.start
         # The factor keeps rounding of the times from halving a step that is half of `since`.
         longest = 0.5 * since * (1 + ROUNDING)
@@ -208,29 +208,29 @@ def advance(
 ) -> tuple[Array, int, StepFailed | None]:
     """Advance y from t0 to t1 by the substeps of a control.
 
-    Times are computed from integer counts, never accumulated. `begin` receives start and length of
-    each substep before it is tried.
+    Times are computed from integer counts, never accumulated. `begin` is called with start and
+    length of each attempted substep.
 
-    Returned are the state at the end of the interval, or after the last successful substep if
-    halving failed; the number of substeps taken; and the failure of the shortest substep, or None.
+    Returns the state after the last successful substep, the number of successful substeps, and the
+    failure of the shortest substep; None if the end of the interval is reached.
     """
     count = control.count(t1 - t0)
     h = control.parts * (t1 - t0) / count
     grades = control.grade(t0, h)
-    # A substep has 2^k ticks, where k is the number of halvings that may be needed.
+    # A substep has 2^k ticks, where k is the maximum number of halvings.
     whole = 1 << (control.halvings + grades)
     finest = count * whole
     width = (t1 - t0) / finest
-    # Time is counted in ticks of the finest halving: all times are integer multiples of one width,
-    # and a stride can grow again at every multiple of its double.
+    # Time is counted in ticks of the finest halving, so that all times are integer multiples of
+    # `width`.
     tick, steps = 0, 0
     stride = longest = whole >> grades
     while tick < finest:
         t = t0 + tick * width
         stop = t1 if tick + stride == finest else t0 + (tick + stride) * width
-        # Differences of equidistant times differ in their last digits. Rounded to 16 units in the
-        # last place of the larger time they are identical, so that a matrix factorised for one step
-        # length serves all equal steps. For very short steps that would change more than digits.
+        # Differences of equidistant times differ by rounding errors. Rounding lengths to 16 units
+        # in the last place of the larger time makes them identical, so that equal steps share a
+        # factorised matrix. Very short steps are excluded, as rounding would change them.
         unit, length = 16.0 * math.ulp(max(stop, -t)), stop - t
         length = round(length / unit) * unit if length > 1e6 * unit else length
         safe_point()
@@ -244,10 +244,10 @@ def advance(
             continue
         steps += 1
         tick += stride
-        # The longest substep that may begin here; away from the initial time it is not graded.
+        # Longest substep that may start here; it is shorter near the initial time.
         longest = whole >> control.grade(t0 + tick * width, h) if grades else whole
-        # A stride is doubled only at a multiple of its double, so that substeps stay on the grid of
-        # halvings.
+        # A stride is doubled only at a multiple of its double, so that substeps remain on the grid
+        # of halvings.
         if 2 * stride <= longest and tick % (2 * stride) == 0:
             stride <<= 1
     return y, steps, None

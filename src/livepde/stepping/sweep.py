@@ -1,8 +1,8 @@
-"""Many steps of an affine process with fixed unknowns: for each a product with a small matrix.
+"""Many steps of an affine process with fixed unknowns, each by a product with a small matrix.
 
-If stages of one length differ by their inputs alone, a step of a scheme is y+ = Q y + g, with one
-matrix Q for each length. All g of a block of steps are solved for at once, as members of one stage.
-So is what drives the tangents, once the states are known: they have the same Q.
+If stages of equal length differ only in their inputs, a step of a scheme is y+ = Q y + g, with one
+matrix Q for each length. All g in a block of steps are solved for at once, as members of one stage.
+Then the forcing of the tangents is solved for in the same way, since they have the same Q.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from livepde.stepping.schemes import Advance, Scheme, advance, safe_point
 BLOCK = 256  # steps that are solved for at once
 WIDEST = 256  # coefficients of a state up to which products are cheaper than stages
 NOTHING = np.zeros(0)
-MOST_ENTRIES = 2e7  # of all matrices of a sweep, 160 MB
-REPEATED = 8  # steps of each length, in the mean, from which its matrix is worth its solves
+MOST_ENTRIES = 2e7  # most entries of all matrices of a sweep, 160 MB
+REPEATED = 8  # mean number of steps per length from which the matrices are cheaper than stages
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Steps:
     """The substeps of the spans of one process."""
 
-    # starts, lengths, of: of each substep its start, its length, and the number of its span.
+    # starts, lengths, of: start, length, and index of the span of each substep.
     starts: Array
     lengths: Array
     of: IntArray
-    after: IntArray  # how many substeps are taken at the end of each span
+    after: IntArray  # number of substeps up to the end of each span
     # ends, inputs0, inputs1, channels: start and end of each span, (spans, 2), and the inputs
     # there, (spans, channels).
     ends: Array
@@ -51,9 +51,9 @@ class Steps:
         channels: tuple[str, ...],
         control: Advance,
     ) -> Steps:
-        """Return the substeps that a control takes through spans if no step fails.
+        """Return the substeps of a control through spans if no step fails.
 
-        `parts`, (spans,), divides the substeps of each span; the inputs are those of the samples.
+        `parts`: number of parts of each substep, (spans,). `inputs0`, `inputs1`: from the samples.
         """
         begun, counts = list[tuple[float, float]](), list[int]()
 
@@ -81,11 +81,11 @@ class Steps:
 
     @property
     def repeat(self) -> bool:
-        """True if there are many steps of few lengths."""
+        """Whether there are many steps with few different lengths."""
         return len(np.unique(self.lengths)) * REPEATED <= len(self.lengths)
 
     def moments(self, some: IntArray, t: float, members: int) -> Moments:
-        """Return the inputs at a time after the start of some substeps, each for all members."""
+        """Return the inputs of all members at a time t after the start of the substeps `some`."""
         of = self.of[some]
         begin, end = self.ends[of].T
         share = ((self.starts[some] + t - begin) / (end - begin))[:, None]
@@ -98,8 +98,8 @@ class Steps:
 class Sweep:
     """Trajectories of members with fixed unknowns through all steps.
 
-    `q`, (members, dim), are the unknowns, `directions`, (members, r, m), their derivatives along
-    each tangent, and `matrices` the transpose of Q for each length, (members, n, n).
+    `q`: unknowns, (members, dim). `directions`: their derivatives along each tangent, (members, r,
+    m). `matrices`: length of a step -> transpose of Q, (members, n, n).
     """
 
     stage: BandedStage
@@ -114,7 +114,7 @@ class Sweep:
     def of(
         cls, stage: MemberStage, scheme: Scheme, steps: Steps, q: Array, directions: Array
     ) -> Sweep | None:
-        """Return the sweep; None where stages one after the other are needed, or cheaper."""
+        """Return the sweep; None if it is not applicable, or if separate stages are cheaper."""
         if not (isinstance(stage, BandedStage) and stage.repeats and steps.repeat):
             return None
         (members, _, m), n = directions.shape, stage.model.X.dim
@@ -136,9 +136,9 @@ class Sweep:
 
     @nonfinite_allowed()
     def blocks(self, columns: Array) -> Iterator[tuple[slice, Array]]:
-        """Yield states and tangents, from those at the start, (1 + r, members, n).
+        """Yield indices of spans, and columns at their ends, (spans, 1 + r, members, n).
 
-        Numbers of some spans, and the columns at their ends, (spans, 1 + r, members, n).
+        `columns`: initial states and tangents, (1 + r, members, n).
         """
         steps, r = self.steps, len(columns) - 1
         for first in range(0, max(len(steps.of), 1), BLOCK):
@@ -158,7 +158,7 @@ class Sweep:
                 yield part, found[:, steps.after[part] - first].swapaxes(0, 1)
 
     def _recurred(self, columns: Array, some: IntArray, driven: Array) -> Array:
-        """Return columns before some steps and after the last one, (c, steps + 1, members, n)."""
+        """Return columns before the steps `some` and after the last, (c, steps + 1, members, n)."""
         c, count, members, n = driven.shape
         found = np.empty((count + 1, members, c, n))
         found[0], driven = columns.swapaxes(0, 1), driven.transpose(1, 2, 0, 3)
@@ -168,7 +168,7 @@ class Sweep:
         return found.transpose(2, 0, 1, 3)
 
     def _each(self, columns: Array, some: IntArray, factors: dict[float, Any]) -> Array:
-        """Return columns, (1 + r, steps, members, n), each after one of some steps."""
+        """Return columns, (1 + r, steps, members, n), each advanced by one of the steps `some`."""
         found, lengths = np.empty(columns.shape), self.steps.lengths[some]
         for h in np.unique(lengths).tolist():
             own = np.flatnonzero(lengths == h)
@@ -178,7 +178,7 @@ class Sweep:
     def _of_one_length(
         self, columns: Array, some: IntArray, h: float, factors: dict[float, Any]
     ) -> Array:
-        """Return the same for steps of one length: they are members of one stage."""
+        """Return columns advanced by steps of equal length, which are members of one stage."""
         c, steps, members, n = columns.shape
         q = np.tile(self.q, (steps, 1))
         directions = np.tile(self.directions, (steps, 1, 1))
