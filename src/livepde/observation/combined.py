@@ -1,17 +1,17 @@
-"""Observations of several kinds of sensors, calibrated instruments, and sensor functions.
+"""Combinations of sensors, calibrated instruments, and nonlinear sensor characteristics.
 
 Nonlinear observations are z = g(G_0 u). The paper takes G linear "for simplicity of exposition.
-Most of what follows can be carried over to the case of nonlinear observations" (section 2). With
-the derivative G'(u) = diag(g'(G_0 u)) G_0, the null space of G'(u) is that of G_0 wherever g' does
-not vanish, so R and P are those of G_0; and the observed part of the state is a step of Newton's
-method from the last estimate u^,
+Most of what follows can be carried over to the case of nonlinear observations" (section 2). The
+derivative is G'(u) = diag(g'(G_0 u)) G_0. If g' does not vanish, G'(u) and G_0 have the same null
+space, and thus the same R and P. The observed part of the state is a step of Newton's method from
+the last estimate u^,
 
-    u_alpha = R u^ - G'(u^)^+ (G(u^) - z) = G_0^+ (y - (g(y) - z)/g'(y)),    y = G_0 u^,
+    u_alpha = R u^ - G'(u^)^+ (G(u^) - z) = G_0^+ (y - (g(y) - z)/g'(y)),    y = G_0 u^.
 
-which is R u* up to the square of the error R (u^ - u*), and for a linear g exactly G^+ z. That
-square enters the law through B(w) with two derivatives, as noise does, so the step is repeated a
-few times, sensor by sensor; P u^ takes no part. The sensitivity law predicts with g and linearises
-about its prediction, H = G'(u) L.
+It equals R u* up to the square of the error R (u^ - u*), and G^+ z if g is linear. The square
+enters the law through B(w) with two derivatives, as noise does. Therefore the step is repeated a
+few times for each sensor, without P u^. The sensitivity law predicts with g and linearises about
+its prediction, H = G'(u) L.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from livepde.spaces import HilbertSpace
 
 @dataclass(frozen=True, eq=False)
 class Combined(Observation):
-    """Sensors of several kinds, concatenated.
+    """Concatenation of several kinds of sensors.
 
-    The names of all sensors of the `parts` differ. Each part has its own `noise`, unless `noise` is
-    given here for all sensors, and its own `unit` likewise.
+    The names of all sensors in `parts` must differ. `noise` and `unit` are given either for each
+    part, or here for all sensors.
 
     Examples
     --------
@@ -97,7 +97,7 @@ class Combined(Observation):
 
 
 class CombinedObserved(Observed):
-    """Bound `Combined` observation: stacked readings, matrices and noise of its parts."""
+    """Bound `Combined` observation: readings, matrices and noise of its parts are stacked."""
 
     observation: Combined
 
@@ -169,23 +169,21 @@ class Calibrated(Observation):
 
         z = function(y, q, x),      y = readings of `base`
 
-    Derivatives by a complex step are exact for analytic functions.
-
     Parameters
     ----------
     base
-        The underlying sensors: any observation, also a `Combined` one. Its own `noise` is not used.
+        The underlying sensors: any observation, including `Combined`, without `noise`.
     function
-        (y, q, x) with y of shape (sensors,), the numbers among the unknowns q (q.gain; one for each
-        region or name: q.k[1], q.offset["T_10"]), and x for x.t and x.inputs["Q"]; returns readings
-        of shape (sensors,).
+        (y, q, x) -> readings of shape (sensors,). y are base readings of shape (sensors,). q are
+        the scalar unknowns: q.gain, or q.k[1] and q.offset["T_10"] for unknowns by region or name.
+        x has x.t and x.inputs["Q"].
     derivatives
-        (y, q, x) -> derivatives of the function in the readings y, shape (sensors,), and in
-        unknowns, {"gain": shape (sensors,)}; for a function that reads each sensor alone. Default:
-        by a complex step, one call for each sensor and each unknown.
+        (y, q, x) -> derivatives of the function by y, shape (sensors,), and by unknowns, {"gain":
+        shape (sensors,)}. It requires that each reading depends only on its own y. Default: a
+        complex step, exact for analytic functions, with one call for each sensor and unknown.
     adds
-        Whether the function adds unknowns to the readings and does nothing else, at any time: laws
-        then need no derivatives in each step.
+        Whether the function only adds unknowns to the readings, at all times. Laws then require no
+        derivatives in each step.
 
     Examples
     --------
@@ -243,7 +241,7 @@ class CalibratedObserved(Observed):
         return self.base.places
 
     def _read(self, y: Any, q: Any, moment: Moment) -> Any:
-        # A calibration sees time and inputs, and no coordinates.
+        # A calibration may use time and inputs, but no coordinates.
         place = Place(np.zeros((0,)), None, moment)
         z = np.asarray(self.observation.function(y, numbers(self.parameter, q), place))
         if z.shape != (self.size,):
@@ -272,7 +270,7 @@ class CalibratedObserved(Observed):
                 H_q[seen, self.parameter.labels[label]] = column[seen]
             if inner_q is not None:
                 H_q += slopes[:, None] * inner_q
-            scaled = copy(inner_u)  # SciPy's constructor takes longer than all else here
+            scaled = copy(inner_u)  # SciPy's constructor would dominate the cost
             scaled.data = inner_u.data * np.repeat(slopes, np.diff(inner_u.indptr))
             return scaled, H_q
         slope = np.zeros((self.size, self.size))
@@ -314,7 +312,7 @@ class CalibratedObserved(Observed):
         seen = self.base.available(moment)
         if seen.all():
             return seen
-        # A function of a missing reading is missing, too.
+        # A reading that depends on a missing base reading is also missing.
         z = self._read(np.where(seen, 1.0, np.nan), self.parameter.prior, moment)
         return np.asarray(np.logical_and(seen, np.logical_not(np.isnan(z))))
 
@@ -327,33 +325,33 @@ def _nudged(values: Array, k: int) -> Any:
 
 
 Reading = Callable[[Array], Array]
-"""What each sensor shows for the value it sees: (sensors,) -> (sensors,), one by one."""
+"""Sensor characteristic: true values (sensors,) -> readings (sensors,), elementwise."""
 
 
 @dataclass(frozen=True, eq=False)
 class Transformed(Observation):
     """Sensors with a pointwise nonlinear characteristic, z_k = g_k((G_0 u)_k).
 
-    The function g need not be monotone, but a sensor with g' = 0 at the estimate carries no
-    information there, and counts as missing in `GradientLaw`.
+    The function g need not be monotone. If g' = 0 at the estimate, a sensor has no information and
+    counts as missing in `GradientLaw`.
 
     Parameters
     ----------
     base
-        G_0: `Points`, `Averages`, `Subdomain`, ... Its own `noise` and `unit` are not used.
+        G_0: `Points`, `Averages`, `Subdomain`, ..., without `noise`. Its `unit` is not used.
     function
-        g, from values of shape (sensors,) to readings of the same shape, one by one.
+        g, elementwise from values of shape (sensors,) to readings of the same shape.
     derivative
-        g', of the same shape; default by a complex step (for analytic g).
+        g', with the same shape; by default a complex step (for analytic g).
     iterations
-        Newton steps of `GradientLaw` from the last estimate.
+        Number of Newton steps of `GradientLaw` from the last estimate.
     reach
         Maximum length of a Newton step in y = G_0 u, for strongly curved g far from the truth.
 
     Notes
     -----
-    `noise` is that of the readings z. A `reconstruction` by a noise level acts on the linearised
-    data y + (z - g(y))/g'(y), whose noise is larger by 1/g'(y).
+    `noise` is the noise of the readings z. A `reconstruction` that uses a noise level acts on the
+    linearised data y + (z - g(y))/g'(y), whose noise is larger by the factor 1/g'(y).
 
     Examples
     --------
@@ -452,7 +450,7 @@ class TransformedObserved(Observed):
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             for _ in range(sensors.iterations):
                 step = (z - sensors.read(y)) / sensors.slope(y)
-                step[np.isinf(step)] = np.nan  # an insensitive sensor says nothing
-                # A step of Newton's method may be huge where g' is small: `reach` limits it.
+                step[np.isinf(step)] = np.nan  # an insensitive sensor has no information
+                # Steps may be large if g' is small, so `reach` limits them.
                 y = y + np.clip(step, -sensors.reach, sensors.reach)
         return y

@@ -19,15 +19,15 @@ from livepde.linalg import Array
 from livepde.observation.operator import Observation, Observed
 from livepde.spaces import HilbertSpace
 
-STATE, PARAMETER = "u_", "q_"  # in front of the names of unknowns in the joint space
+STATE, PARAMETER = "u_", "q_"  # prefixes of the names of unknowns in the joint space
 
 
 @dataclass(frozen=True, eq=False)
 class Functionals(Observation):
     """Integral observations, z_k = integral of g_k(q, u, x), for any integrand g of a weak form.
 
-    The derivatives in u and q are taken by a complex step, as for `Model`: exact for analytic g.
-    Integrals have the volume element of the state (`Field.weight`).
+    Derivatives in u and q use a complex step, as in `Model`, which is exact for analytic g.
+    Integrals use the volume element of the state (`Field.weight`).
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class Functionals(Observation):
         boundary or a subdomain. The arguments are those of weak forms: grad(u), x.normal, x.t,
         x.inputs.
     order
-        Quadrature order; default that of the state, exact for products of u with fields of q.
+        Quadrature order. The default is exact for products of u with fields of q.
 
     Examples
     --------
@@ -60,7 +60,7 @@ class Functionals(Observation):
 
 
 class FunctionalsObserved(Observed):
-    """Bound `Functionals`: each is a form in (u, q) jointly, tested with w = 1."""
+    """Bound `Functionals`: each sensor is a form in (u, q), tested with w = 1."""
 
     observation: Functionals
     linear = False
@@ -114,7 +114,7 @@ class FunctionalsObserved(Observed):
 
 
 def _jets(uq: Any, prefix: str, space: FunctionSpace) -> Any:
-    """Return state or parameter in the form of weak-form arguments."""
+    """Return state or parameter as an argument of a weak form."""
     names = (name for name in space.names if name not in space.sensors)
     jets = {name: getattr(uq, prefix + name) for name in names}
     return next(iter(jets.values())) if space.single else Named(**jets)
@@ -145,25 +145,25 @@ def in_cells(parameter: FunctionSpace, mesh: Any, name: str) -> sp.csr_array:
 class FluxPlates(Observation):
     """Flux sensors in one dimension, z_k = -D u_x at x_k, such as heat-flux plates.
 
-    At an end the flux **into** the domain counts as positive, inside the flux towards larger x.
+    At a named end, flux **into** the domain is positive; at a position, flux towards larger x.
 
     Parameters
     ----------
     points
         Sensor name -> the name of an end of the mesh ("left"), or a position.
     conductivity
-        Name of the unknown D: one number, by layer, or a field.
+        Name of the unknown D: one number, one for each layer, or a field.
 
     Notes
     -----
-    The flux is linear between the middles of cells, where the slope of the state is most accurate.
-    So it is of second order, also at an end and where D jumps between two cells.
+    The flux is interpolated linearly between the centres of cells, where the slope of the state is
+    most accurate. It is of second order, also at an end or where D jumps between cells.
 
     Raises
     ------
     ObservationError
-        No sensor; when it is bound, a mesh that is no interval, a place outside of the mesh, or a
-        model without the unknown D.
+        There is no sensor. On binding: the mesh is not an interval, a position is outside the mesh,
+        or the model lacks the unknown D.
 
     Examples
     --------
@@ -180,7 +180,7 @@ class FluxPlates(Observation):
 
 
 class FluxPlatesObserved(Observed):
-    """Bound `FluxPlates`: z = W (D q * S u), with means D q and slopes S u of the cells."""
+    """Bound `FluxPlates`: z = W (D q * S u), with means D q and slopes S u in cells."""
 
     observation: FluxPlates
     linear = False
@@ -214,7 +214,7 @@ class FluxPlatesObserved(Observed):
 
     @staticmethod
     def _row(block: FieldBlock, middles: Array, name: str, at: float | str) -> Array:
-        """Return the weights of the fluxes in the middles of all cells."""
+        """Return the weights of the fluxes at the centres of all cells, shape (cells,)."""
         mesh, sign = block.field.mesh, -1.0
         low, high = float(mesh.p.min()), float(mesh.p.max())
         if isinstance(at, str):
@@ -227,7 +227,7 @@ class FluxPlatesObserved(Observed):
             place = float(mesh.p[0][mesh.facets[0][np.asarray(facets)]].mean())
             if place not in (low, high):
                 raise ObservationError(f"FluxPlates: '{name}' is at '{at}', which is not an end.")
-            # Into the domain: at the right end against x.
+            # Flux into the domain is towards smaller x at the right end.
             sign = -1.0 if place == low else 1.0
         else:
             place = float(at)

@@ -1,4 +1,4 @@
-"""Observation operators G: X -> Z, sensors bound to a state space, and their G^+ (section 3.2)."""
+"""Observation operators G: X -> Z, sensors bound to a state space, and G^+ (section 3.2)."""
 
 from __future__ import annotations
 
@@ -45,19 +45,19 @@ class Split:
     Attributes
     ----------
     R, P
-        Sparse, shape (n, n); idempotent to rounding. Fixed (Dirichlet) coefficients are known, and
-        belong to P.
+        Sparse, shape (n, n); idempotent up to rounding. Fixed (Dirichlet) coefficients are known
+        and are in the range of P.
     inverse, G
-        G^+ on the present sensors, shape (n, present), and their rows of G, shape (present, n).
+        G^+ and G restricted to the present sensors, shapes (n, present) and (present, n).
     present
-        Mask of the sensors used, shape (sensors,).
+        Mask of the sensors in use, shape (sensors,).
     vectors
-        Basis of N(G)^perp, shape (n, k); None if the columns of `inverse` are one.
+        Basis of N(G)^perp, shape (n, k); None if the columns of `inverse` are a basis.
     omega
-        Elements on which the data determine the state, for sensors on a subdomain: there the
-        paper's chi_omega is one, and integrals over Omega are split into those over `omega`, with
-        the data, and those over the other elements, with the estimate. None: all elements, with the
-        state split by R and P alone.
+        Elements on which the data determine the state, for sensors on a subdomain. There, chi_omega
+        of the paper is one: integrals over Omega are split into integrals over `omega` with the
+        data and over the other elements with the estimate. None: all elements, and the state is
+        split only by R and P.
     """
 
     R: sp.csr_array
@@ -81,7 +81,7 @@ class Split:
 
     @cached_property
     def _selected(self) -> IntArray | None:
-        """Coefficient read by each present sensor, if each reads a single one; else None."""
+        """Coefficient of each present sensor if each reads a single coefficient; else None."""
         selects = self.vectors is None and is_selection(sp.csr_array(self.inverse.T))
         return sp.csr_array(self.inverse.T).indices if selects else None
 
@@ -92,8 +92,8 @@ class Split:
     def reconstruct(self, z: Array, boundary: Array | None) -> Array:
         """Return the observed part R u* = G^+ z of the state in X, shape (n,).
 
-        Missing measurements (NaN) are ignored. `boundary` is a coefficient vector with the
-        Dirichlet values, zero elsewhere; None: zero.
+        Missing measurements (NaN) are ignored. `boundary` is a coefficient vector with Dirichlet
+        values, and zero elsewhere; None for zero.
         """
         known: Array = z[self.present]
         if boundary is not None and boundary.any():
@@ -106,7 +106,7 @@ class Split:
 
 
 def is_selection(G: sp.csr_array) -> bool:
-    """Return True if every row selects one coefficient, and no two rows the same."""
+    """Return whether every row selects a single coefficient, different for all rows."""
     one_each = bool(np.all(np.diff(G.indptr) == 1) and np.all(G.data == 1.0))
     return one_each and len(np.unique(G.indices)) == len(G.indices)
 
@@ -122,7 +122,7 @@ class Reconstructed:
     misfit
         ||G u_alpha - z||_Z.
     delta
-        Noise level ||z^delta - z||_Z used, or None if unknown.
+        Noise level ||z^delta - z||_Z that was used, or None if unknown.
     """
 
     u: Array
@@ -138,8 +138,8 @@ class Reconstructor(ABC):
     def __call__(self, z: Array, boundary: Array, delta: float | None = None) -> Reconstructed:
         """Return the reconstruction u_alpha from measurements of shape (sensors,).
 
-        `boundary` is a coefficient vector with the Dirichlet values, zero elsewhere; `delta` the
-        noise level ||z^delta - z||_Z, default that of the rule or the observation.
+        `boundary`: coefficient vector with Dirichlet values, and zero elsewhere. `delta`: noise
+        level ||z^delta - z||_Z; by default taken from the rule or the observation.
         """
 
 
@@ -148,17 +148,17 @@ class Reconstruction(ABC):
 
     @property
     def regularises(self) -> bool:
-        """False for G^+ itself."""
+        """Whether the reconstruction differs from G^+."""
         return True
 
     @abstractmethod
     def prepare(self, observed: Observed, present: Array) -> Reconstructor:
-        """Return the reconstructor of a set of present sensors."""
+        """Return the reconstructor for a set of present sensors."""
 
 
 @dataclass(frozen=True)
 class Pseudoinverse(Reconstruction):
-    """Moore-Penrose inverse G^+: for exact data, and where averaging over time is enough."""
+    """Moore-Penrose inverse G^+, for exact data or if averaging over time suffices."""
 
     @property
     def regularises(self) -> bool:
@@ -180,7 +180,7 @@ class _Inverse(Reconstructor):
 
 
 def weights(observed: Observed, present: Array) -> sp.csr_array:
-    """Return the Gram matrix of Z for the sensors present (see `Tikhonov`)."""
+    """Return the Gram matrix of Z for the present sensors (see `Tikhonov`)."""
     if observed.observation.nodal:
         inverse = observed.split(present).inverse
         return sp.csr_array(inverse.T @ observed.X.gram @ inverse)
@@ -190,7 +190,7 @@ def weights(observed: Observed, present: Array) -> sp.csr_array:
 
 
 def data_norm(z: Array, gram: sp.csr_array) -> float:
-    """Return the norm of measurements in Z, of a Gram matrix."""
+    """Return the norm of measurements in Z with a given Gram matrix."""
     return float(np.sqrt(max(float(z @ (gram @ z)), 0.0)))
 
 
@@ -198,16 +198,16 @@ def data_norm(z: Array, gram: sp.csr_array) -> float:
 class Observation:
     """Abstract observation operator: z = G u, plus a direct part D q.
 
-    Subclasses define G by `matrix`; sensors that are nonlinear in the state return their own bound
-    object from `bind`. If a field contains the sensors, in order or by name, `listed` is its name,
-    and the name of one of them.
+    Subclasses define G by `matrix`. Sensors that are nonlinear in the state return their own bound
+    object from `bind`. If an attribute contains the sensors, as a sequence or by name, `listed` is
+    its name, and the word for one of its items.
 
     Parameters
     ----------
     of
-        Component of the state that is observed, if there are several.
+        Observed component of the state, if there are several.
     inputs
-        Channels of the stream read by the sensors, in addition to those of the model.
+        Channels that the sensors use, in addition to the channels of the model.
     noise
         Standard deviation of the measurement noise, in the unit of z: one number, or one for each
         sensor. None: unknown.
@@ -239,12 +239,12 @@ class Observation:
         )
 
     def _sees_all(self, remedy: str) -> None:
-        """Raise an error if `of` is given but has no effect."""
+        """Raise an error if `of` is given, for observations on which it has no effect."""
         if self.of:
             raise ObservationError(f"{type(self).__name__}: of='{self.of}' has no effect; {remedy}")
 
     def scalar_block(self, state: FunctionSpace) -> FieldBlock:
-        """Return the component that is observed, which has to be one number at each point."""
+        """Return the observed component; raise an error if it is a vector field."""
         block, _ = state.component(self.of)
         if block.vector:
             raise ObservationError(
@@ -254,11 +254,11 @@ class Observation:
         return block
 
     def _reads(self, channels: Iterable[str]) -> None:
-        """Prepend channels to `inputs`, each once."""
+        """Prepend channels to `inputs`, without duplicates."""
         object.__setattr__(self, "inputs", tuple(dict.fromkeys([*channels, *self.inputs])))
 
     def _shows(self, base: Observation) -> None:
-        """Take over the channels of a base observation, and refuse that it has its own noise."""
+        """Add the channels of a base observation; raise an error if the base has noise."""
         if base.noise is not None:
             raise ObservationError(
                 f"{type(self).__name__}: give noise= to it and not to its base: it is that of the "
@@ -273,32 +273,32 @@ class Observation:
 
     @property
     def places(self) -> Array | None:
-        """Coordinates of the sensors, shape (sensors, d), if each is at one point."""
+        """Coordinates of the sensors, shape (sensors, d), if each is at a single point."""
         return None
 
     @property
     def directs(self) -> Mapping[str, Direct]:
-        """Direct dependence on the parameter, linear in q, by sensor name."""
+        """Sensor name -> direct dependence on the parameter, linear in q."""
         return {}
 
     @property
     def unknowns(self) -> Mapping[str, Unknown]:
-        """Unknowns of the sensors, added by an identifier to those of the model."""
+        """Unknowns of the sensors, which an identifier adds to the unknowns of the model."""
         return {}
 
     @property
     def states(self) -> Mapping[str, SensorState]:
-        """States of slow sensors, by name, added by an identifier to the state of the model."""
+        """Sensor name -> state of a slow sensor, which an identifier adds to the state."""
         return {}
 
     @property
     def optional(self) -> frozenset[str]:
-        """Names of `inputs` that may be missing: sensors that need them then have no reading."""
+        """Names of `inputs` that may be missing; sensors that require them then have no reading."""
         return frozenset()
 
     @property
     def nodal(self) -> bool:
-        """True if G^+ is taken in coefficients, False if in the inner product of X."""
+        """Whether G^+ uses the Euclidean inner product of coefficients instead of that in X."""
         return False
 
     def region(self, state: FunctionSpace) -> Mask | None:
@@ -307,19 +307,19 @@ class Observation:
 
     @property
     def portable(self) -> bool:
-        """True if readings have the same meaning on every mesh, False if they are coefficients."""
+        """Whether readings have the same meaning on every mesh; coefficients do not."""
         return False
 
     def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
-        """Return the observation of a given state space."""
+        """Return the observation bound to a state space."""
         return Observed(self, state, X, parameter)
 
 
 class Observed:
     """An observation bound to a state space: predicted readings and their derivatives.
 
-    Sensors other than z = G u + D q override `predict`, `jacobian` and `linear`, `available` if
-    readings may be missing, and `_prepare` to compute their common part.
+    Sensors other than z = G u + D q override `predict`, `jacobian` and `linear`; `available` if
+    readings may be missing; and `_prepare` for data that these methods share.
     """
 
     def __init__(
@@ -344,16 +344,16 @@ class Observed:
         for name in observation.directs:
             if name not in self.names:
                 raise ObservationError(f"direct: no sensor is called '{name}'; {self.names} are.")
-        self._steady_direct: Array | None = None  # D, once it is known to read no time or input
+        self._steady_direct: Array | None = None  # D, if found to be independent of time and inputs
         self._splits: Memo[bytes, Split] = Memo(LARGEST_MEMO)
         self._reconstructors: Memo[bytes, Reconstructor] = Memo(LARGEST_MEMO)
 
     def _prepare(self) -> None:
-        """Compute what predictions need; the base class needs nothing."""
+        """Compute data that predictions share; none in the base class."""
 
     @property
     def places(self) -> Mapping[str, Array]:
-        """Coordinates of the sensors that are at one point each, by name."""
+        """Sensor name -> coordinates, for sensors at a single point."""
         at = self.observation.places
         return {} if at is None else dict(zip(self.names, at, strict=True))
 
@@ -393,7 +393,7 @@ class Observed:
 
     @cached_property
     def G(self) -> sp.csr_array:
-        """Constant matrix of the linear part, (sensors, n); raises an error if there is none."""
+        """Constant matrix of the linear part, (sensors, n); an error if there is none."""
         G = sp.csr_array(self.observation.matrix(self.state), copy=True).astype(float)
         if G.shape[1] != self.X.dim:
             raise ObservationError(
@@ -410,16 +410,16 @@ class Observed:
 
     @cached_property
     def _shown(self) -> IntArray | None:
-        """Coefficient read by each sensor, if every sensor reads a single coefficient."""
+        """Coefficient of each sensor if each reads a single coefficient; else None."""
         return self.G.indices if is_selection(self.G) else None
 
     @property
     def linear(self) -> bool:
-        """True if z = G u, possibly after `linearised`, as projections need."""
+        """Whether z = G u, possibly after `linearised`, as projections require."""
         return not self.observation.directs
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
-        """Return the predicted readings, G u + D q, shape (sensors,); NaN: no reading.
+        """Return the predicted readings, G u + D q, shape (sensors,); NaN for no reading.
 
         u and q are coefficients of the state, (n,), and of the parameter, (m,).
         """
@@ -436,7 +436,7 @@ class Observed:
         return self.G, self._direct(moment)
 
     def available(self, moment: Moment) -> Array:
-        """Return the mask of sensors with a reading, shape (sensors,); other values are ignored."""
+        """Return the mask of sensors that can have a reading; other values are ignored."""
         return np.ones(self.size, dtype=bool)
 
     def _direct(self, moment: Moment) -> Array | None:
@@ -446,7 +446,7 @@ class Observed:
         matrix = np.zeros((self.size, self.parameter.dim))
         zero = np.zeros(self.parameter.dim)
         place = Place(np.zeros((0,)), None, moment)
-        # Functions that are linear in q: their values at unit vectors are the columns.
+        # The functions are linear in q, so their values at unit vectors are the columns.
         for name, direct in self.observation.directs.items():
             row = self.names.index(name)
             offset = float(direct(numbers(self.parameter, zero), place))
@@ -465,11 +465,11 @@ class Observed:
 
     @property
     def steady_matrix(self) -> sp.csr_array:
-        """Matrix G of sensors for which `steady_direct` returns D, or that have no D."""
+        """Matrix G in z = G u + D q, for sensors with a constant D or without D."""
         return self.G
 
     def steady_direct(self, moment: Moment) -> Array | None:
-        """Return D if z = G u + D q at all times; None for other sensors, or if there is no D."""
+        """Return D if z = G u + D q with a constant D; None for other sensors, or without D."""
         if type(self) is not Observed or self.observation.inputs:
             return None
         self._direct(moment)
@@ -480,9 +480,9 @@ class Observed:
         return z
 
     def split(self, present: Array | None = None) -> Split:
-        """Return R, P and G^+ for the sensors present (default all).
+        """Return R, P and G^+ for the present sensors (default all).
 
-        Redundant sensors are allowed: the Moore-Penrose inverse averages them.
+        Sensors may be redundant: the Moore-Penrose inverse averages them.
         """
         asked = np.ones(self.size, dtype=bool) if present is None else present
         return self._splits.get(asked.tobytes(), lambda: self._split(asked))
@@ -500,19 +500,18 @@ class Observed:
         Parameters
         ----------
         z
-            Measurements, shape (sensors,), NaN where missing.
+            Measurements, shape (sensors,), NaN if missing.
         delta
-            Noise level ||z^delta - z||_Z; default given by the rule for alpha or by `noise`.
+            Noise level ||z^delta - z||_Z; by default from the rule for alpha or from `noise`.
         boundary
-            Coefficient vector with the Dirichlet values, zero elsewhere; default zero.
+            Coefficient vector with Dirichlet values, and zero elsewhere; default zero.
         present
-            Mask of the sensors used; default those with a value.
+            Mask of the sensors to use; default: sensors with a value.
 
         Raises
         ------
         ObservationError
-            z has another shape, delta is not positive, or no noise level is known where one is
-            needed.
+            z has a wrong shape, delta is not positive, or a required noise level is not known.
         """
         z = np.asarray(z, dtype=float)
         if z.shape != (self.size,):
@@ -534,8 +533,8 @@ class Observed:
         tangent = sp.csr_array(G @ sp.diags_array(self.X.free))
         tangent.eliminate_zeros()
         if self.observation.nodal and is_selection(tangent):
-            # Sensors that read single coefficients need no linear algebra: R is diagonal with zeros
-            # and ones, and G^+ is G^T.
+            # For sensors that read single coefficients, R is diagonal with entries 0 and 1, and G^+
+            # is G^T.
             inverse, V = sp.csr_array(tangent.T), None
             R = sp.csr_array(inverse @ tangent)
             omega = self._observed_elements(tangent.indices)
@@ -550,11 +549,11 @@ class Observed:
             rows = tangent.toarray()
             representers = rows.T if self.observation.nodal else self.X.riesz(rows.T)
             values, vectors = np.linalg.eigh(rows @ representers)
-            # Redundant sensors give zero eigenvalues of G G*, which the pseudoinverse omits.
+            # Redundant sensors cause zero eigenvalues of G G*, which the pseudoinverse omits.
             kept = values > DEPENDENT * max(values.max(initial=0.0), 1e-300)
             C = vectors[:, kept] / np.sqrt(values[kept])
-            # V W is idempotent to rounding only if W V = I to rounding. C alone does not ensure
-            # that for nearly redundant sensors. A sparse W keeps R as narrow as G.
+            # V W is idempotent up to rounding only if W V = I up to rounding, which C does not
+            # ensure for nearly redundant sensors. With a sparse W, R has the support of G.
             V = representers @ C
             W = sp.csr_array(C.T) @ tangent
             W = sp.csr_array(np.linalg.inv(W @ V)) @ W
@@ -566,10 +565,10 @@ class Observed:
         return Split(R, P, inverse, present, G, V, omega)
 
     def _observed_elements(self, observed: IntArray) -> IntArray | None:
-        """Return the elements on which observed coefficients determine the state; None: all.
+        """Return the elements on which observed coefficients determine the state; None for all.
 
-        For several components these are the elements on which every observed component is
-        determined. Dirichlet coefficients are known.
+        With several components, every observed component must be determined. Dirichlet coefficients
+        are known.
         """
         known = self.X.free == 0.0
         known[observed] = True

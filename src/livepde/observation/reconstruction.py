@@ -1,12 +1,12 @@
 """Reconstruction of the observed part of the state by G_alpha (section 3.2).
 
-With noisy data G^+ z is undefined or unstable if the range of G is not closed. Even if it is
-closed, the noise enters the law through B(w), which takes two derivatives. The paper replaces it by
-u_alpha = G_alpha z. Here G_alpha minimises
+With noisy data, G^+ z is undefined or unstable if the range of G is not closed. If it is closed,
+noise still enters the law through B(w), which takes two derivatives. The paper replaces G^+ z by
+u_alpha = G_alpha z. Here G_alpha z minimises
 
     ||G v - z||_Z^2 + alpha |v|^2        over v in N(G)^perp,
 
-with |.| the norm of X as in the paper, or a stronger one.
+where |.| is the norm of X, as in the paper, or a stronger norm.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from livepde.observation.operator import (
     weights,
 )
 
-SMALLEST, LARGEST = 1e-12, 1e12  # alpha of the discrepancy principle, in units of its scale
+SMALLEST, LARGEST = 1e-12, 1e12  # bounds of alpha in the discrepancy principle, over its scale
 # Relative accuracy of alpha in the discrepancy principle.
 ROOT = 1e-10
 # Largest number of sensors for a dense eigendecomposition.
@@ -43,8 +43,8 @@ MOST_SENSORS = 10_000
 class Alpha(ABC):
     """Abstract parameter choice rule for alpha.
 
-    The noise level in Z is `delta`, or `level` relative to ||z||_Z; both None: that of the
-    observation.
+    The noise level in Z is `delta`, or `level` relative to ||z||_Z. If both are None, it follows
+    from `noise` of the observation.
     """
 
     delta: float | None
@@ -59,8 +59,8 @@ class Alpha(ABC):
     def choose(self, misfit: Callable[[float], float], delta: float, scale: float) -> float:
         """Return alpha >= 0 for one sample with noise level delta in Z.
 
-        `misfit` is the function alpha -> ||G u_alpha - z||_Z, nondecreasing; `scale` the alpha at
-        which both terms have equal weight.
+        `misfit` is the nondecreasing function alpha -> ||G u_alpha - z||_Z, and `scale` the alpha
+        at which both terms have equal weight.
         """
 
 
@@ -68,9 +68,9 @@ class Alpha(ABC):
 class Apriori(Alpha):
     """A priori parameter choice, alpha = factor · delta^power.
 
-    Regularisation theory requires alpha -> 0 and delta^2/alpha -> 0: 0 < power < 2. The noise level
-    ||z^delta - z||_Z is `delta`, or `level` relative to ||z^delta||_Z; default given by `noise` of
-    the observation.
+    Regularisation theory requires alpha -> 0 and delta^2/alpha -> 0, so 0 < power < 2. The noise
+    level ||z^delta - z||_Z is `delta`, or `level` relative to ||z^delta||_Z; by default it follows
+    from `noise` of the observation.
     """
 
     power: float = 1.0
@@ -94,11 +94,11 @@ class Apriori(Alpha):
 class Discrepancy(Alpha):
     """Discrepancy principle: alpha with ||G u_alpha - z||_Z = tau · delta, for each sample.
 
-    One scalar equation is solved for each sample; G is factorised once for each set of present
-    sensors. If no alpha attains tau · delta because redundant sensors disagree by more, alpha is
-    the lower end of the search interval; if every misfit is below it, the upper end. In theory tau
-    > 1, so that alpha is never chosen too small for the noise. `delta` and `level` are as for
-    `Apriori`.
+    A scalar equation is solved for each sample, and a decomposition is computed once for each set
+    of present sensors. If every misfit is above tau · delta, because redundant sensors disagree,
+    alpha is the lower end of the search interval. If every misfit is below, it is the upper end.
+    Theory requires tau > 1, so that alpha is not too small for the noise. See `Apriori` for `delta`
+    and `level`.
     """
 
     tau: float = 1.1
@@ -125,27 +125,27 @@ class Discrepancy(Alpha):
 class Tikhonov(Reconstruction):
     """Tikhonov-Phillips regularisation G_alpha: Z -> N(G)^perp (section 3.2).
 
-    The norm ||.||_Z depends on the observation. For a `Subdomain` it is that of X on omega, the
-    paper's Z = L2(omega): ||z||_Z = ||G^+ z||_X. Otherwise it is Euclidean, with every sensor
-    weighted by 1/noise^2 if its noise is known; delta is then the root of the number of sensors.
+    The norm ||.||_Z depends on the observation. For a `Subdomain` it is the norm of X on omega,
+    ||z||_Z = ||G^+ z||_X, as Z = L2(omega) in the paper. Otherwise it is Euclidean, with weights
+    1/noise^2 if the noise is known; delta is then the root of the number of sensors.
 
-    The cost is one dense generalised eigendecomposition for each set of present sensors, of the
-    size of the smaller of their number and N(G)^perp, and one product with a matrix of that size
-    for each sample: intended for up to a few thousand sensors, and refused beyond 10 000.
+    The cost is a dense generalised eigendecomposition for each set of present sensors, whose size
+    is the dimension of N(G)^perp, and a matrix-vector product of that size for each sample. It is
+    intended for up to a few thousand sensors; more than 10 000 are an error.
 
     Parameters
     ----------
     norm
         "X"
-            The paper's formula, (G* G + alpha I)^{-1} G*. For a subdomain G* G = I, so it only
-            shrinks.
+            Norm of X, as in the paper: (G* G + alpha I)^{-1} G*. For a subdomain G* G = I, so it
+            only shrinks the data.
         "V"
-            Second derivatives in L2: the stronger norm V~, which damps what B(w) would amplify. For
-            a subdomain they are integrated over the elements inside of omega only, so nothing pulls
-            to zero at its border; known Dirichlet values count. Elements without second derivatives
-            get a discrete Laplacian, K M^{-1} K with lumped mass, without the rows at the border.
+            Second derivatives in L2, the stronger norm V~, which damps components that B(w) would
+            amplify. For a subdomain they are integrated only over elements in omega, which avoids a
+            bias towards zero at its border; known Dirichlet values count. Elements without second
+            derivatives use a discrete Laplacian, K M^{-1} K with lumped mass, without border rows.
         a form (u, v, x)
-            Symmetric, positive semidefinite; integrated over the same elements.
+            A symmetric, positive semidefinite form, integrated over the same elements.
     alpha
         A number >= 0, `Apriori`, or `Discrepancy` (default).
 
@@ -183,11 +183,11 @@ class Tikhonov(Reconstruction):
 
 
 class Spectral(Reconstructor):
-    """Simultaneous diagonalisation of fit and penalty: minimisers for every alpha.
+    """Simultaneous diagonalisation of fit and penalty, which yields minimisers for every alpha.
 
-    Both quadratic forms are diagonal in one basis phi of N(G)^perp, s for ||G v||_Z^2 and k for
-    |v|^2, scaled so that s + rho k = 1. This is accurate for tiny s (G with a range that is not
-    closed) as well as for k = 0 (the null space of |.|).
+    Both quadratic forms are diagonal in a basis phi of N(G)^perp, with entries s for ||G v||_Z^2
+    and k for |v|^2, scaled so that s + rho k = 1. This is accurate for tiny s (the range of G is
+    not closed) and for k = 0 (the null space of |.|).
     """
 
     def __init__(self, config: Tikhonov, observed: Observed, present: Array) -> None:
@@ -213,13 +213,13 @@ class Spectral(Reconstructor):
         fit = seen.T @ seen
         cost = basis.T @ (penalty @ basis)
         cost = (cost + cost.T) / 2
-        # Unit of alpha: at alpha = rho fit and penalty have the same trace.
+        # Scale of alpha: for alpha = rho, fit and penalty have the same trace.
         self.rho = float(np.trace(fit) / (np.trace(cost) or 1.0))
         s, phi = sl.eigh(fit, fit + self.rho * cost)
         # s is a divisor below, and rounding may make it zero or negative.
         self.s = np.clip(s, np.finfo(float).tiny, 1.0)
-        # In the null space of |.| k must be exactly zero, since alpha k would amplify rounding
-        # errors for large alpha.
+        # In the null space of |.|, k must be exactly zero: for large alpha, alpha k would amplify
+        # rounding errors.
         rest = 1.0 - s
         self.k = np.where(rest > 10 * len(s) * np.finfo(float).eps, rest, 0.0) / self.rho
         self.phi = basis @ phi
@@ -236,8 +236,8 @@ class Spectral(Reconstructor):
         beta = self.fitted @ known
         shift = boundary @ self.pulled
         scaled = self.root @ known
-        # The part of the data outside of the range of G, where redundant sensors disagree, cannot
-        # be fitted by any alpha.
+        # No alpha fits the part of the data outside the range of G, where redundant sensors
+        # disagree.
         outside = scaled - self.image @ (self.image.T @ scaled)
         rest = float(outside @ outside)
 
@@ -317,7 +317,7 @@ def penalty_matrix(norm: str | Integrand, observed: Observed, basis: Array) -> s
 
 
 def _inside(block: FieldBlock, basis: Array) -> Mask:
-    """Return the mask of elements of which all coefficients are observed or known."""
+    """Return the mask of elements whose coefficients are all observed or known."""
     known = np.asarray(np.abs(basis).any(axis=1))
     known[block.fixed] = True
     return np.asarray(known[block.element_dofs].all(axis=0))

@@ -1,4 +1,4 @@
-"""Linear sensors: points, also moving or at uncertain positions, averages, lines, any matrix."""
+"""Point sensors, also moving or at uncertain positions, averages, line integrals, and matrices."""
 
 from __future__ import annotations
 
@@ -18,18 +18,17 @@ from livepde.linalg import Array, IntArray
 from livepde.observation.operator import Direct, Observation, Observed
 from livepde.spaces import HilbertSpace
 
-# Name of the unknown: one number for each sensor and coordinate.
+# Name of the unknown shifts, with one number for each sensor and coordinate.
 POSITION = "position"
 AXES = "xyz"
-# Distance from the end of the mesh, in standard deviations of the position, within which a sensor
-# lies on the end.
+# Tolerance of the search for the end of the mesh, as a share of `REACH` standard deviations.
 NEAR = 1e-6
-REACH = 3.0  # standard deviations to each side within which values at a shifted place are exact
-PER_STD = 4  # places in a standard deviation between which they are interpolated
+REACH = 3.0  # standard deviations to each side within which shifted values are interpolated
+PER_STD = 4  # largest number of interpolation points in a standard deviation
 
 
 def shift_names(sensor: str, dimension: int) -> list[str]:
-    """Return the names of a sensor's shifts: "T" in 1D, else "T.x", "T.y" and so on."""
+    """Return the names of a sensor's shifts: "T" in 1D, otherwise "T.x", "T.y" and so on."""
     return [sensor] if dimension == 1 else [f"{sensor}.{axis}" for axis in AXES[:dimension]]
 
 
@@ -37,14 +36,14 @@ def shift_names(sensor: str, dimension: int) -> list[str]:
 class Moving(Observation):
     """Point sensors with positions from the stream, z_k(t) = u(x_k(t), t).
 
-    While its position is missing or outside of the mesh, a sensor has no reading: its prediction is
-    NaN and its sample is not used. Positions are not held from one sample to the next.
+    If its position is missing or outside the mesh, a sensor has no reading: its prediction is NaN,
+    and its value in the sample is not used. A missing position is not replaced by an earlier one.
 
     Parameters
     ----------
     positions
-        Mapping from sensor name to the channel of its position; in more than one dimension to one
-        channel for each coordinate.
+        Mapping from sensor name to the channel of its position; in more than one dimension, to a
+        sequence of one channel for each coordinate.
 
     Examples
     --------
@@ -89,8 +88,8 @@ class MovingObserved(Observed):
                     f"Moving: sensor '{name}' has position channels {list(channels)}; the mesh "
                     f"has {dimension} coordinates."
                 )
-        # G at the last positions. Copies of an identifier share it, possibly in several threads:
-        # the three values are read and replaced as one tuple, so that they are always consistent.
+        # G at the last positions. Copies of an identifier in several threads may share it, so the
+        # three values are read and replaced as one tuple and are always consistent.
         self._last: tuple[bytes, sp.csr_array, Array] | None = None
 
     def _names(self) -> tuple[str, ...]:
@@ -134,32 +133,31 @@ class MovingObserved(Observed):
 
 @dataclass(frozen=True, eq=False)
 class Points(Observation):
-    """Point sensors, z_k = u(x_k), or one component of it where u is a vector.
+    """Point sensors, z_k = u(x_k), or a component of u(x_k) if u is a vector field.
 
     Parameters
     ----------
     points
-        Positions: a sequence, or a mapping from sensor name to position. Numbers in 1D, else
-        sequences of d coordinates.
+        Positions: a sequence, or a mapping from sensor name to position. A position is a number in
+        1D, otherwise a sequence of d coordinates.
     direct
         Mapping from sensor name to a function (q, x) for a direct dependence on the parameter,
-        linear in q: z_k = u(x_k) + direct(q, x), as in {"T_fluid": lambda q, x: q.R_b *
+        linear in q: z_k = u(x_k) + direct(q, x). Example: {"T_fluid": lambda q, x: q.R_b *
         x.inputs["Q"] / H}.
     position_std
-        Standard deviation of the true positions, along each coordinate: one number for all sensors,
-        or a mapping from sensor name to number for some, with one common value. The shifts are then
-        additional unknowns: `position[NAME]`, in more than one dimension `position[NAME.x]` and so
-        on. The effects of shifts along several coordinates are added, which is exact to first
-        order.
+        Standard deviation of each coordinate of the true positions: one number for all sensors, or
+        a mapping from the names of some sensors to one common number. The shifts are additional
+        unknowns: `position[NAME]`, or `position[NAME.x]` and so on in more than one dimension. The
+        effects of shifts along several coordinates are added, which is exact to first order.
     component
-        Number of the component that is measured, from 0, if the state is a vector at each point:
-        one for all sensors, or one for each. Two components at one place are two sensors.
+        Index of the measured component, starting at 0, if the state is a vector field: one for all
+        sensors, or one for each. Two components at one position are two sensors.
 
     Raises
     ------
     ObservationError
-        No position, or options that do not fit the sensors; when it is bound, a position outside of
-        the mesh, or a vector state of which no component is named.
+        There is no position, or options do not match the sensors. On binding: a position is outside
+        the mesh, or `component` is missing for a vector field.
 
     Examples
     --------
@@ -191,7 +189,7 @@ class Points(Observation):
             )
 
     def _check_component(self) -> None:
-        """Refuse components that are not numbers from 0, or not one for each sensor."""
+        """Raise an error if components are not indices, or not one for each sensor."""
         if self.component is None:
             return
         numbers = np.asarray(self.component)
@@ -211,7 +209,7 @@ class Points(Observation):
 
     @property
     def shift_std(self) -> float:
-        """Standard deviation of a shift, 0 if positions are certain."""
+        """Standard deviation of a shift; 0 if positions are certain."""
         if isinstance(self.position_std, Mapping):
             return float(next(iter(self.position_std.values())))
         return float(self.position_std or 0.0)
@@ -250,15 +248,15 @@ class Points(Observation):
     def rows(
         self, state: FunctionSpace, at: Array, which: Sequence[int], what: str = "sensor"
     ) -> sp.csr_array:
-        """Return the matrix of the values that some sensors would measure at other places, (k, n).
+        """Return the matrix of readings of given sensors at given positions, (k, n).
 
-        `at` are the coordinates, shape (k, d), `which` the number of the sensor at each place, and
-        `what` the name of a place in messages.
+        `at`: coordinates, (k, d). `which`: index of the sensor at each position. `what`: name of a
+        position in messages.
         """
         block, _ = state.component(self.of)
         values = block.probe(at.T, what)
         if block.vector:
-            # Rows: the first component at all places, then the second, and so on.
+            # Rows of the first component at all positions, then rows of the second, and so on.
             axes = self._components(values.shape[0] // len(at))[list(which)]
             values = values[axes * len(at) + np.arange(len(at))]
         elif self.component is not None:
@@ -269,7 +267,7 @@ class Points(Observation):
         return state.widen(sp.csr_array(values), self.of)
 
     def _components(self, count: int) -> IntArray:
-        """Return the number of the component that each sensor measures, of so many."""
+        """Return the index of the component that each sensor measures, below `count`."""
         if self.component is None:
             raise ObservationError(
                 f"Points: the state is a vector of {count} components at each point: name the "
@@ -288,11 +286,11 @@ class Points(Observation):
 class _Shift:
     """Effect of shifting one sensor along one coordinate by d: a cubic spline.
 
-    It interpolates the values at `places`, some shifts up to `REACH` standard deviations to each
-    side or to the end of the mesh; beyond them it is a straight line. Where the mesh reaches to
-    neither side, at the top of a disc say, the shift has no effect. A derivative of u is not used
-    because it has none at a node of linear elements. `rows` evaluate the differences of u there to
-    u at 0, shape (places, n); `column` is the position of the shift in q.
+    The spline interpolates u at the shifts `places`, which extend to `REACH` standard deviations or
+    to the end of the mesh on each side, and is linear beyond. If the mesh extends to neither side,
+    as at the top of a disc, the shift has no effect. Derivatives of u are not used, because they do
+    not exist at nodes of linear elements. `rows`, (places, n), evaluate differences of u to its
+    value at d = 0. `column` is the index of the shift in q.
     """
 
     sensor: int
@@ -302,7 +300,7 @@ class _Shift:
 
     @cached_property
     def _spline(self) -> Any:
-        from scipy.interpolate import CubicSpline  # slow to import, and seldom needed
+        from scipy.interpolate import CubicSpline  # slow to import and rarely needed
 
         return CubicSpline(self.places, np.eye(len(self.places)))
 
@@ -321,7 +319,7 @@ class _Shift:
 
 
 class PlacedObserved(Observed):
-    """Bound `Points` at uncertain positions: linear in u, a spline in each shift."""
+    """Bound `Points` at uncertain positions: linear in u, and a spline in each shift."""
 
     observation: Points
     linear = False
@@ -351,7 +349,7 @@ class PlacedObserved(Observed):
                     )
                 start, reach = at[sensor], REACH * std
                 low, high = (_reached(block, start, axis, step) for step in (-reach, reach))
-                # Between the nodes of linear elements u has no second derivative.
+                # Between nodes of linear elements, u has no curvature to resolve.
                 step = min(std, max(float(block.widths(start)[axis]), std / PER_STD))
                 places = _spaced(low[axis] - start[axis], high[axis] - start[axis], step)
                 rows = differences(sensor, axis, places)
@@ -381,18 +379,18 @@ class PlacedObserved(Observed):
 
     @cached_property
     def _sensors(self) -> IntArray:
-        """Number of the sensor of each row of `_differences`."""
+        """Index of the sensor for each row of `_differences`."""
         counts = [len(shift.places) for shift in self.shifts]
         return np.repeat([shift.sensor for shift in self.shifts], counts)
 
     @cached_property
     def _differences(self) -> sp.csr_array:
-        """Rows of each shift in turn, shape (places, n)."""
+        """Rows of all shifts, stacked: shape (all places, n)."""
         return sp.csr_array(sp.vstack([shift.rows for shift in self.shifts], format="csr"))
 
     @cached_property
     def _parts(self) -> tuple[sp.csr_array, Array]:
-        """Pattern of G at shifted positions, and values on it of G and of each difference."""
+        """Pattern of G at shifted positions, and values of G and of each difference on it."""
         rows = self._sensors
         sums = sp.csr_array(
             (np.ones(len(rows)), (rows, np.arange(len(rows)))), shape=(self.size, len(rows))
@@ -408,14 +406,14 @@ class PlacedObserved(Observed):
 
 
 def _spaced(low: float, high: float, step: float) -> Array:
-    """Return 0 and numbers from low to high, no farther apart than a step."""
+    """Return numbers from low to high, including 0, at distances of at most a step."""
     ends = (np.linspace(0.0, end, 1 + math.ceil(abs(end) / step - NEAR)) for end in (low, high))
     return np.unique(np.concatenate([*ends, [0.0]]))
 
 
 def _reached(block: FieldBlock, start: Array, axis: int, step: float) -> Array:
-    """Return start + step along an axis, or the last point on the way that is in the mesh."""
-    least, most = 0.0, 1.0  # a share below `NEAR` counts as zero: on the end of the mesh
+    """Return start + step along an axis, or the last point before it inside the mesh."""
+    least, most = 0.0, 1.0  # if the share is below `NEAR`, the start is at the end of the mesh
 
     def at(share: float) -> Array:
         point: Array = start.copy()
@@ -434,14 +432,13 @@ def _reached(block: FieldBlock, start: Array, axis: int, step: float) -> Array:
 class Averages(Observation):
     """Mean values over regions or boundaries, z_k = (integral of u over omega_k) / |omega_k|.
 
-    Volumes are those of the coordinates, see `Field.weight`.
+    Integrals use the volume element of the state, see `Field.weight`.
 
     Parameters
     ----------
     regions
         Mapping from sensor name to the name of a subdomain or boundary of the mesh, or to a
-        predicate on x. Cells that its border crosses are divided, so that the border need not
-        follow cells.
+        predicate on x. Cells that its border crosses are divided, so it need not align with cells.
 
     Examples
     --------
@@ -495,10 +492,10 @@ class Averages(Observation):
 
 
 def _integral_inside(block: FieldBlock, measure: Measure, region: Predicate) -> tuple[float, Array]:
-    """Return the integrals over a region; cells that its border crosses are divided."""
+    """Return the size of a region and integrals over it; cells at its border are divided."""
     mesh, cut = block.field.mesh, crossed(measure, region)
     size, row = _integral(block, measure, lambda x, cells: region(x) * ~np.isin(cells, cut))
-    # A region between the quadrature points of one cell is looked for on finer parts.
+    # A region that contains no quadrature point is searched for on finer parts of all cells.
     members = cut if size > 0 or len(cut) else np.arange(mesh.nelements)
     if len(members):
         fine = FineMeasure(mesh, measure.order, members=members, weight=measure.weight)
@@ -510,9 +507,9 @@ def _integral_inside(block: FieldBlock, measure: Measure, region: Predicate) -> 
 def _integral(
     block: FieldBlock, measure: Measure, density: Callable[[Array, IntArray], Any]
 ) -> tuple[float, Array]:
-    """Return integrals of a density, and of its product with each shape function, shape (size,).
+    """Return the integrals of a density and of its product with each shape function, (size,).
 
-    The density is a function of points and of the numbers of their cells, shape (cells, 1).
+    The density is a function of points and of the indices of their cells, shape (cells, 1).
     """
     size, row = 0.0, np.zeros(block.size)
     for at, piece in measure.pieces():
@@ -528,15 +525,16 @@ def _integral(
 class LineIntegrals(Observation):
     """Integrals along straight lines, z_k = integral of u from a_k to b_k: beams, fibres.
 
-    Exact to rounding for finite element functions: the line is cut at cell boundaries, and Gauss
-    points are used in between.
+    Exact up to rounding for finite element functions: the line is split at cell boundaries, with
+    Gauss quadrature in between.
 
     Parameters
     ----------
     lines
-        Mapping from sensor name to (start, end); numbers in 1D, else sequences of d coordinates.
+        Mapping from sensor name to (start, end): numbers in 1D, otherwise sequences of d
+        coordinates.
     mean
-        True: divide by the length.
+        Whether to divide by the length.
 
     Examples
     --------
@@ -564,8 +562,7 @@ class LineIntegrals(Observation):
         length = float(np.linalg.norm(b - a))
         if not length > 0:
             raise ObservationError(f"LineIntegrals: line '{name}' has no length.")
-        # This number of Gauss points is exact for the degree of the element on each straight
-        # segment.
+        # This number of Gauss points is exact for polynomials of the degree of the element.
         nodes, weights = np.polynomial.legendre.leggauss(int(block.field.element.maxdeg) // 2 + 1)
         cuts = _cuts(mesh, a, b)
         width = np.diff(cuts)[:, None]
@@ -578,7 +575,7 @@ class LineIntegrals(Observation):
 def _cuts(mesh: Any, a: Array, b: Array) -> Array:
     """Return the intersections of a line with facets, as increasing fractions of its length.
 
-    A crossing of the bounding box of a facet counts, too: additional cuts are harmless.
+    Only bounding boxes of facets are tested, since additional cuts are harmless.
     """
     corners = mesh.p[:, mesh.facets].transpose(2, 0, 1)  # (facets, d, vertices)
     d = len(a)
@@ -595,7 +592,7 @@ def _cuts(mesh: Any, a: Array, b: Array) -> Array:
         s = np.einsum("fd,fd->f", normals, corners[:, :, 0] - a) / across
     s, corners = s[np.isfinite(s)], corners[np.isfinite(s)]
     points = a + s[:, None] * (b - a)
-    # A line along a facet or through a vertex must not miss its cut by rounding.
+    # Rounding must not remove the cut of a line along a facet or through a vertex.
     slack = 1e-9 * (mesh.p.max() - mesh.p.min())
     low, high = corners.min(axis=2) - slack, corners.max(axis=2) + slack
     hit = s[np.all((points >= low) & (points <= high), axis=1) & (s > 0) & (s < 1)]
@@ -604,7 +601,7 @@ def _cuts(mesh: Any, a: Array, b: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Matrix(Observation):
-    """Linear observation by its matrix G, (sensors, n), dense or sparse; a label for each row."""
+    """Linear observation with a dense or sparse matrix G, (sensors, n), and labels of its rows."""
 
     G: Any
     labels: Sequence[str] | None = None

@@ -1,4 +1,4 @@
-"""Sensors that respond slowly: each adds a coefficient to the state."""
+"""Sensors with a slow response: each adds a coefficient to the state."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ TIME_CONSTANT = "time_constant"
 
 @dataclass(frozen=True, eq=False)
 class Slow(Observation):
-    """Sensors that respond with a delay of first order, such as thermometers in a tube.
+    """Sensors with a first-order lag, such as thermometers in a tube.
 
         tau z' = y - z,      y = readings of `base`
 
-    The state z of each sensor is a coefficient of the state of the model, and begins at y. An
-    `Identifier` adds these states to its model; elsewhere use `model.with_sensors`.
+    The state z of each sensor is a coefficient of the state of the model, with initial value y. An
+    `Identifier` adds these states to its model; otherwise use `model.with_sensors`.
 
     Parameters
     ----------
     base
-        The underlying sensors: `Points`, `Averages` or `LineIntegrals`. Its own `noise` is not
-        used.
+        The underlying sensors: `Points`, `Averages` or `LineIntegrals`, without `noise`.
     time_constant
-        tau of each sensor, in the unit of time of the model: a positive number, or a prior. With a
-        prior it is the unknown `time_constant[NAME]`.
+        tau of each sensor, in the unit of time of the model: a positive number, or a prior of the
+        unknown `time_constant[NAME]`.
 
     Raises
     ------
     ObservationError
-        Other sensors, uncertain positions, or a time constant that is not positive.
+        The base is another kind of sensor or has uncertain positions, or a time constant is not
+        positive.
 
     Examples
     --------
@@ -108,5 +108,5 @@ class Slow(Observation):
 
 
 def _row(base: Any, number: int, state: FunctionSpace) -> sp.csr_array:
-    """Return the row by which a sensor of an observation reads a state, (1, n)."""
+    """Return the row of G for one sensor of an observation, (1, n)."""
     return sp.csr_array(base.matrix(state))[[number]]

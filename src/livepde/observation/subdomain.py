@@ -18,8 +18,8 @@ from livepde.observation.operator import Observation
 if TYPE_CHECKING:
     import xarray as xr
 
-# Quadrature order of the points at which the predicate is evaluated. All are inside of the element,
-# so that its boundary nodes do not decide.
+# Quadrature order of the points at which the predicate is evaluated. All points are inside the
+# element, so that the result does not depend on boundary nodes.
 INTERIOR = 3
 
 
@@ -27,13 +27,13 @@ INTERIOR = 3
 class Subdomain(Observation):
     """Observation of the state on omega, z = u|_omega (obsdiff), a union of elements.
 
-    An element belongs to omega if the predicate holds at its inner quadrature points. The data z
-    are the free coefficients of these elements in their order (values and slopes for Hermite
-    elements), including those of nodes on the boundary of omega. Coefficients on the Dirichlet
-    boundary are known and not part of z.
+    An element is part of omega if the predicate holds at its inner quadrature points. The data z
+    are the free coefficients of these elements in increasing order (values and slopes for Hermite
+    elements), including nodes on the boundary of omega. Coefficients on the Dirichlet boundary are
+    known and not part of z.
 
-    Elements cut by the boundary of omega are excluded. If that strip matters, place mesh nodes at
-    the ends of omega: `interval(0, 1, 30, through=(0.3, 0.87))`.
+    Elements that the boundary of omega cuts are excluded. If this strip matters, place mesh nodes
+    at the ends of omega: `interval(0, 1, 30, through=(0.3, 0.87))`.
 
     Examples
     --------
@@ -55,7 +55,7 @@ class Subdomain(Observation):
             )
 
     def elements(self, state: FieldBlock) -> IntArray:
-        """Return the elements that lie in omega."""
+        """Return the indices of the elements in omega."""
         inside = np.zeros(state.field.mesh.nelements, dtype=bool)
         for at, piece in Measure(state.field.mesh, INTERIOR).pieces():
             x = piece.points
@@ -70,7 +70,7 @@ class Subdomain(Observation):
         return inside
 
     def selected(self, state: FieldBlock) -> IntArray:
-        """Return the free coefficients of the elements that lie in omega."""
+        """Return the indices of the free coefficients of elements in omega."""
         inside = np.zeros(state.size, dtype=bool)
         inside[state.element_dofs[:, self.elements(state)]] = True
         inside[state.fixed] = False
@@ -83,25 +83,25 @@ class Subdomain(Observation):
         return found
 
     def sample(self, given: Callable[[Array], Any] | xr.DataArray, state: FunctionSpace) -> Array:
-        """Return the data z of a sample, or of several, from values by coordinates.
+        """Return the data z of one or several samples from values in space.
 
-        At the nodes of elements of first order; for other elements the L2 projection on omega.
+        Elements of first order use the values at nodes, other elements the L2 projection on omega.
 
         Parameters
         ----------
         given
-            Function of x, shape (d, points), with a value for each point, of a vector field a row
-            for each component; or a `DataArray` over the coordinates `x`, `y`, `z` of the mesh,
-            between which it is linear, and over one dimension more for several samples, as time:
-            then z has the shape (samples, sensors). A value that is missing is NaN.
+            Function of x, shape (d, points), that returns a value for each point; for a vector
+            field, a row for each component. Or a `DataArray` over the coordinates `x`, `y`, `z` of
+            the mesh, which is interpolated linearly. If it has an additional dimension for samples,
+            such as time, z has the shape (samples, sensors). Missing values are NaN.
         state
-            The state of the model, `model.state_space`.
+            State space of the model, `model.state_space`.
 
         Raises
         ------
         ObservationError
-            Values of another shape, or for another part of the domain; infinity; for elements that
-            are not of first order, also NaN.
+            The values have a wrong shape, do not cover omega, or are infinite. For elements that
+            are not of first order, a value is NaN.
 
         Examples
         --------
@@ -186,7 +186,7 @@ def _everywhere(x: object) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Full(Subdomain):
-    """Observation of the whole state, omega = Omega: P is zero except on the Dirichlet boundary.
+    """Observation of the full state, omega = Omega: P is zero except on the Dirichlet boundary.
 
     Examples
     --------
