@@ -1,4 +1,4 @@
-"""Sparse matrices of fixed pattern and the engines that factorise them."""
+"""Sparse matrices with fixed patterns, and solvers that factorise them."""
 
 from __future__ import annotations
 

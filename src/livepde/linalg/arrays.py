@@ -1,4 +1,4 @@
-"""Array types, products with rows, sparse matrices of fixed pattern, and a bounded memo."""
+"""Array types, products with rows, sparse matrices with fixed patterns, and a bounded cache."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Array: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.integer[Any]]
 Mask: TypeAlias = NDArray[np.bool_]
-Sparse: TypeAlias = Any  # any SciPy sparse array: the stubs know no common 2D class
+Sparse: TypeAlias = Any  # any SciPy sparse array: the stubs have no common 2D class
 
 
 P = ParamSpec("P")
@@ -23,10 +23,10 @@ R = TypeVar("R")
 
 
 class nonfinite_allowed:
-    """A context, or a decorator, without warnings of numbers that are not finite.
+    """A context or decorator that suppresses warnings about numbers that are not finite.
 
-    Not `np.errstate` as a decorator, which with NumPy 1 keeps the old state of all threads in one
-    place; nor `contextlib.contextmanager`, whose generator costs a step of a small model more.
+    With NumPy 1, `np.errstate` as a decorator stores the old state for all threads in one place.
+    `contextlib.contextmanager` would noticeably slow down a step of a small model.
     """
 
     def __enter__(self) -> None:
@@ -50,10 +50,10 @@ Value = TypeVar("Value")
 
 
 class Memo(Generic[Key, Value]):
-    """A bounded memo of a function: cleared when it would grow beyond `most` values.
+    """A bounded cache, which is cleared before it would exceed `most` values.
 
-    Two threads that ask for the same key at once both compute it, and get equal values. Values must
-    be immutable.
+    If two threads request the same key at the same time, both compute it and receive equal values.
+    Values must be immutable.
 
     >>> squares = Memo(most=2)
     >>> sum(squares.get(k, lambda k=k: k**2) for k in (1, 2, 3))
@@ -62,8 +62,8 @@ class Memo(Generic[Key, Value]):
 
     def __init__(self, most: int) -> None:
         self._most = most
-        # The dictionary is replaced as a whole and never mutated, so that a thread may keep reading
-        # the one it has: no lock is needed.
+        # The dictionary is replaced as a whole and never mutated, so that threads can read it
+        # without a lock.
         self._values: Mapping[Key, Value] = {}
 
     def get(self, key: Key, make: Callable[[], Value]) -> Value:
@@ -80,29 +80,29 @@ class Memo(Generic[Key, Value]):
         return len(self._values)
 
 
-# Entries up to which a dense product costs less than one by diagonals, and than a sparse one.
+# Entries up to which a dense product is faster than one by diagonals, and than a sparse product.
 DENSE, WIDE = 2_500, 10_000
-# Entries up to which a dense product is faster than a sparse one with the same pattern.
+# Number of entries up to which a dense product is faster than a sparse product of one pattern.
 SMALL = 10_000
-# Diagonals up to which they cost less than a sparse product.
+# Number of diagonals up to which a product by diagonals is faster than a sparse product.
 MOST_DIAGONALS = 5
 
 
 class RowProduct(ABC):
-    """The product of a matrix M, (m, n), with rows.
+    """Product of a matrix M, (m, n), with rows.
 
-    If `separate`, the numbers of a row do not depend on the other rows, not even in their rounding.
+    If `separate`, a row of the result does not depend on the other rows, including its rounding.
     """
 
     separate: ClassVar[bool] = False
 
     @abstractmethod
     def __call__(self, x: Array, out: Array | None = None) -> Array:
-        """Return x M^T, (rows, m), for x of shape (rows, n); in `out` if it is given."""
+        """Return x M^T, (rows, m), for x of shape (rows, n), stored in `out` if given."""
 
 
 class DenseRows(RowProduct):
-    """Product with a matrix that is stored as a whole."""
+    """Product with a dense matrix."""
 
     def __init__(self, matrix: sp.csr_array) -> None:
         self._transposed = np.ascontiguousarray(matrix.toarray().T)
@@ -126,7 +126,7 @@ class SparseRows(RowProduct):
 
 
 class DiagonalRows(RowProduct):
-    """Product with a square matrix of few diagonals."""
+    """Product with a square matrix with few diagonals."""
 
     separate = True
 
@@ -157,21 +157,21 @@ def row_product(matrix: sp.csr_array) -> RowProduct:
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Structural non-zeros of a matrix, in CSR order; columns are sorted in each row."""
+    """Structural non-zeros of a matrix in CSR order, with sorted columns in each row."""
 
     shape: tuple[int, int]
     indptr: IntArray
     indices: IntArray
 
     def __post_init__(self) -> None:
-        # Matrices share these arrays: they are read-only, so that an in-place operation fails
+        # Matrices share these arrays, so they are read-only: an in-place operation must fail
         # instead of corrupting all matrices of the pattern.
         self.indptr.setflags(write=False)
         self.indices.setflags(write=False)
 
     @classmethod
     def from_entries(cls, rows: IntArray, cols: IntArray, shape: tuple[int, int]) -> Pattern:
-        """Return the pattern that holds every (row, column) given; repeated entries are merged."""
+        """Return the pattern with the given entries (row, column); repeated ones are merged."""
         entries = sp.coo_array((np.ones(len(rows), dtype=bool), (rows, cols)), shape=shape)
         return cls.of(entries)
 
@@ -190,7 +190,7 @@ class Pattern:
 
     @property
     def small(self) -> bool:
-        """True if a dense matrix multiplies faster than a sparse one."""
+        """Whether a product with the dense matrix is faster."""
         return self.shape[0] * self.shape[1] <= SMALL
 
     @cached_property
@@ -234,7 +234,7 @@ class Pattern:
 
     def product(self, data: Array, x: Array) -> Array:
         """Return `matrix(data) @ x`, for x of shape (columns,) or (columns, k)."""
-        # No buffer is kept between two products: a pattern may be used by several threads at once.
+        # No buffer is reused, because several threads may share a pattern.
         return self.compact(data) @ x
 
     def gather(self, rows: IntArray, cols: IntArray) -> sp.csr_array:
@@ -254,12 +254,12 @@ def sandwich(
 ) -> tuple[IntArray, IntArray, sp.csr_array]:
     """Return the linear dependence of `left @ inner @ right` on the data of `inner`.
 
-    Rows and columns of the entries of the product, repeated if several terms contribute, and a
-    sparse matrix, (entries, inner.nnz), which gives their values from the data of `inner`.
+    Returns rows and columns of the entries of the product, repeated if several terms contribute,
+    and the sparse matrix, (entries, inner.nnz), that maps the data of `inner` to their values.
     """
     a, b = sp.csc_array(left), sp.csr_array(right)
     i, j = inner.rows, inner.indices
-    # An entry (i, j) of `inner` meets every entry of column i of `left` and of row j of `right`.
+    # Entry (i, j) of `inner` is multiplied by all entries of column i of `left`, row j of `right`.
     count_a, count_b = np.diff(a.indptr)[i], np.diff(b.indptr)[j]
     counts = count_a * count_b
     item = np.repeat(np.arange(len(counts)), counts)
@@ -275,7 +275,7 @@ def sandwich(
 class Assembler:
     """Assembler of a square block matrix, with linear maps from block data to its data.
 
-    Every block is `left @ K @ right` at an offset, with K of a fixed pattern. After `build`,
+    Every block is `left @ K @ right` at an offset, where K has a fixed pattern. After `build`,
     `maps[name] @ data_of_K` is the contribution of a block to the data of the assembled matrix.
     """
 
@@ -292,7 +292,7 @@ class Assembler:
         at: tuple[int, int] = (0, 0),
         transposed: bool = False,
     ) -> None:
-        """Add a block; one name may be added at several places, also as left @ K^T @ right."""
+        """Add a block, or left @ K^T @ right if transposed; a name may be used several times."""
         block = _MatrixBlock(inner, left, right, at, transposed)
         known = (other for group in self._blocks.values() for other in group)
         same = next((other for other in known if other.alike(block)), block)
@@ -305,7 +305,7 @@ class Assembler:
         """
         blocks = {id(block): block for group in self._blocks.values() for block in group}
         entries = [block.entries for block in blocks.values()]
-        # The diagonal is part of every pattern, so that rows of fixed coefficients can hold ones.
+        # The diagonal is part of every pattern, so that rows of fixed coefficients can be units.
         diagonal = np.arange(self.size, dtype=np.int32)
         rows = np.concatenate([diagonal, *(rows for rows, _, _ in entries)])
         cols = np.concatenate([diagonal, *(cols for _, cols, _ in entries)])
@@ -322,7 +322,7 @@ class Assembler:
 
 @dataclass(frozen=True, eq=False)
 class _MatrixBlock:
-    """Block left @ K @ right or left @ K^T @ right, with K of a fixed pattern."""
+    """Block left @ K @ right or left @ K^T @ right, where K has a fixed pattern."""
 
     inner: Pattern
     left: Sparse | None
@@ -347,7 +347,7 @@ class _MatrixBlock:
     def _scaled(
         self, left: Sparse, right: Sparse
     ) -> tuple[IntArray, IntArray, sp.csr_array] | None:
-        """Return the entries if both factors are diagonal, when no entries are summed."""
+        """Return the entries if both factors are diagonal, in which case no entries are summed."""
         a, b = _diagonal(left), _diagonal(right)
         if a is None or b is None:
             return None
@@ -355,7 +355,7 @@ class _MatrixBlock:
         if self.transposed:
             rows, cols = cols, rows
         scale = a[rows] * b[cols]
-        # Each entry of the block is one entry of K, scaled: a map with one value in each row.
+        # Each entry of the block is a scaled entry of K, so the map has one value in each row.
         kept = np.flatnonzero(scale).astype(np.int32)
         starts = np.arange(len(kept) + 1, dtype=np.int32)
         shape = (len(kept), self.inner.nnz)
@@ -376,7 +376,7 @@ class _MatrixBlock:
 
 
 def _diagonal(matrix: Sparse) -> Array | None:
-    """Return the diagonal of a matrix that has no other entries, else None."""
+    """Return the diagonal of a diagonal matrix, otherwise None."""
     if matrix.shape[0] != matrix.shape[1]:
         return None
     coo = sp.coo_array(matrix)

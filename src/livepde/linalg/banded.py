@@ -1,4 +1,4 @@
-"""Banded LU by LAPACK after a bandwidth-reducing permutation: one matrix, or many at once."""
+"""Banded LU by LAPACK after a bandwidth-reducing permutation, for one or many matrices."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from livepde.errors import LinearAlgebraError
 from livepde.linalg.arrays import Array, IntArray, Pattern
 
-# Number of entries of a triangle up to which copying it costs more than the faster solve saves.
+# Number of entries of a triangle up to which its copy costs more than the faster solve saves.
 FEW = 300
 
 
@@ -47,7 +47,7 @@ class BandedFactor:
     @cached_property
     def _triangles(self) -> tuple[Array, Array] | None:
         """L and U in band storage, if no rows were exchanged and triangular solves are faster."""
-        # With row exchanges L is a product with permutations, and no triangle in band storage.
+        # With row exchanges, L includes permutations and is not a triangle in band storage.
         if self.lower * len(self.pivots) < FEW or not np.array_equal(
             self.pivots, np.arange(len(self.pivots))
         ):
@@ -62,9 +62,9 @@ class BandedFactor:
 class BandedSolver:
     """Banded LU of one sparsity pattern; n·b² operations to factorise, n·b to solve.
 
-    With `units`, powers of two of shape (n,), the scaled matrix units K units is factorised: with a
-    diagonal of about one it needs few row exchanges, and a factorisation without them takes a third
-    of the time.
+    With `units`, powers of two of shape (n,), the scaled matrix units K units is factorised. If its
+    diagonal is about one, few rows are exchanged, and a factorisation without row exchanges takes a
+    third of the time.
     """
 
     pattern: Pattern
@@ -75,9 +75,9 @@ class BandedSolver:
 
     @cached_property
     def order(self) -> IntArray:
-        """Reverse Cuthill-McKee order of the unknowns; the natural one if its band is no wider."""
+        """Reverse Cuthill-McKee order, or the natural order if its band is not wider."""
         structure = self.pattern.matrix(np.ones(self.pattern.nnz))
-        # The pattern is symmetrised, as the algorithm needs an undirected graph.
+        # The pattern is symmetrised, because the algorithm requires an undirected graph.
         found: IntArray = reverse_cuthill_mckee(structure + structure.T, symmetric_mode=True)
         rows, cols, place = self.pattern.rows, self.pattern.indices, np.argsort(found)
         natural = np.abs(rows - cols).max(initial=0)
@@ -87,7 +87,7 @@ class BandedSolver:
 
     @cached_property
     def natural(self) -> bool:
-        """True if unknowns are not reordered."""
+        """Whether unknowns are not reordered."""
         return bool(np.array_equal(self.order, np.arange(len(self.order))))
 
     @cached_property
@@ -103,10 +103,10 @@ class BandedSolver:
 
     @cached_property
     def storage(self) -> tuple[tuple[int, int], IntArray]:
-        """Shape of LAPACK's band storage, and position in it of each entry of the pattern."""
+        """Shape of LAPACK's band storage, and flat position of each entry of the pattern in it."""
         lower, upper = self.band
         row, col = self.inverse[self.pattern.rows], self.inverse[self.pattern.indices]
-        # LAPACK's band storage is column major: flat positions count down the columns.
+        # LAPACK's band storage is column-major: flat positions run down the columns.
         height = 2 * lower + upper + 1
         return (self.pattern.shape[0], height), col * height + (lower + upper + row - col)
 
@@ -138,10 +138,10 @@ NONE = np.zeros(0, dtype=np.intp)
 class BlockFactor(NamedTuple):
     """Factors of the diagonal blocks of a block-diagonal matrix."""
 
-    solver: BandedSolver  # order of the band and its width
-    bad: IntArray  # numbers of the blocks that could not be factorised
-    # lu, pivots: LAPACK's LU factors of the whole matrix, in the order of the band; None if
-    # `symmetric`, the main diagonal of D and lower diagonal of L of L D L^T, is there.
+    solver: BandedSolver  # order and width of the band
+    bad: IntArray  # indices of the blocks that could not be factorised
+    # lu, pivots: LAPACK's LU factors of the whole matrix, in the order of the band. They are None
+    # if there is `symmetric`: the main diagonal of D and the lower diagonal of L in L D L^T.
     lu: Array | None
     pivots: IntArray | None
     symmetric: tuple[Array, Array] | None = None
@@ -149,16 +149,16 @@ class BlockFactor(NamedTuple):
     def solve(self, b: Array) -> Array:
         """Return x with K x = b for each block, of shape (columns, blocks, n); overwrites b.
 
-        NaN for blocks with a singular matrix; not finite where b is not. If a solution overflows,
-        other blocks may become NaN with it; finite values are correct.
+        A block is NaN if its matrix is singular, or if its b is not finite. If a solution
+        overflows, other blocks may also become NaN; finite values are correct.
         """
         columns, count, n = b.shape
         bad = self.bad
-        if count > 1 and not math.isfinite(b.sum()):  # one block has no neighbours to disturb
+        if count > 1 and not math.isfinite(b.sum()):  # a single block cannot affect others
             bad = np.union1d(bad, np.flatnonzero(~np.isfinite(b).all(axis=(0, 2))))
         if len(bad):
-            # A NaN would spread to the neighbouring blocks in the band solve (0 * NaN = NaN): bad
-            # blocks are solved with zeros and marked afterwards.
+            # In the band solve, NaN would spread to neighbouring blocks (0 * NaN = NaN). Therefore
+            # bad blocks are solved with zeros and set to NaN afterwards.
             b[:, bad] = 0.0
         x = b if self.solver.natural else np.take(b, self.solver.order, axis=2)
         x = x.reshape(columns, count * n).T
@@ -178,10 +178,10 @@ class BlockFactor(NamedTuple):
 class BandedBlocks:
     """Banded factorisation of many matrices with one sparsity pattern.
 
-    The matrices are the blocks of one block-diagonal matrix with the bandwidth of a block: no pivot
-    is taken from another block, because the coupling entries are zero. LU with partial pivoting. If
-    all are `symmetric` and tridiagonal, L D L^T costs a third; storage is then the main diagonal,
-    and the lower one with a zero at the end.
+    The matrices are the blocks of one block-diagonal matrix with the bandwidth of a block, which is
+    factorised by LU with partial pivoting. Pivots never cross blocks, because the coupling entries
+    are zero. If all matrices are tridiagonal and `symmetric`, L D L^T takes a third of the time.
+    Storage is then the main diagonal, and the lower diagonal with a zero at the end.
     """
 
     solver: BandedSolver
@@ -189,13 +189,13 @@ class BandedBlocks:
 
     @classmethod
     def of(cls, solver: BandedSolver, *data: Array) -> BandedBlocks:
-        """Return the blocks of sums of matrices, each with data of shape (nnz,)."""
+        """Return the factorisation of sums of matrices with given data, each of shape (nnz,)."""
         whole = cls(solver)
         tridiagonal = solver.band == (1, 1)
         return cls(solver, tridiagonal and all(whole._mirrored(part) for part in data))
 
     def _mirrored(self, data: Array) -> bool:
-        """Return True if a tridiagonal matrix is symmetric to the bit."""
+        """Return whether a tridiagonal matrix is exactly symmetric."""
         _, upper, _, lower = self.band(data).reshape(self.solver.storage[0]).T
         return np.array_equal(upper[1:], lower[:-1])
 
@@ -212,9 +212,9 @@ class BandedBlocks:
     def factorise(self, storage: Array) -> BlockFactor:
         """Factorise matrices in band storage, shape (blocks, size), which is overwritten."""
         (n, height), blocks, bad = self.solver.storage[0], len(storage), NONE
-        if not math.isfinite(np.vdot(storage, storage)):  # one of its squares may overflow, too
+        if not math.isfinite(np.vdot(storage, storage)):  # a quick test: squares may also overflow
             bad = np.flatnonzero(~np.isfinite(storage).all(axis=1))
-            # A block that is not finite is replaced by the identity, so that the others can be
+            # Replace blocks that are not finite by the identity, so that the others can be
             # factorised.
             storage[bad] = 0.0
             if self.symmetric:
@@ -235,7 +235,7 @@ class BandedBlocks:
         """Return LU factors of a whole matrix in band storage, shape (blocks n, height)."""
         lower, upper = self.solver.band
         lu, pivots, info = lapack.dgbtrf(storage.T, lower, upper, overwrite_ab=1)
-        if info > 0:  # a pivot is zero: mark its block, and go on without dividing by it
+        if info > 0:  # a pivot is zero: mark its block, and replace the pivot by one
             middle = lower + upper
             zero = lu[middle] == 0.0
             lu[middle, zero] = 1.0

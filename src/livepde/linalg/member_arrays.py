@@ -1,6 +1,6 @@
-"""States of several members: dataclasses of arrays whose leading axis is the members.
+"""States of several members: dataclasses of arrays whose leading axis is over members.
 
-Arrays without members stay empty.
+Arrays that a state does not use are empty, with a leading axis of length zero.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ State = TypeVar("State")
 
 
 def changed(state: State, **parts: Any) -> State:
-    """Return a state with some fields exchanged: `dataclasses.replace` in a tenth of its time."""
-    # Neither __init__ nor __post_init__ runs, and a cached property would be copied with the
-    # fields: states have none.
+    """Return a state with new values of fields, ten times faster than `dataclasses.replace`."""
+    # Neither __init__ nor __post_init__ is called. States must not have cached properties, because
+    # these would be copied.
     new: State = object.__new__(type(state))
     object.__setattr__(new, "__dict__", {**state.__dict__, **parts})
     return new
 
 
 def product(one: Array, other: Array) -> Array:
-    """Return the product of stacks of matrices, (members, ., .): a call for one costs less."""
+    """Return the product of stacks of matrices, (members, ., .), faster for a single member."""
     return one[0].dot(other[0])[None] if len(one) == 1 else one @ other
 
 
 def _each(function: Callable[..., Any], first: Any, *others: Any) -> Any:
-    """Return a state whose arrays are a function of those of some states."""
+    """Return a state whose arrays are a function of the corresponding arrays of states."""
     if isinstance(first, np.ndarray):
         return function(first, *others)
     parts = {
@@ -47,9 +47,9 @@ def _members(state: Any) -> int:
 
 
 def take(state: State, which: Any) -> State:
-    """Return the state of some members, by an index array; of one for a number, as one member.
+    """Return the state of the members in an index array, or of one member by its index.
 
-    The only member is the state itself: no step writes into the arrays of a state.
+    For a state with one member it is the state itself, because arrays of states are immutable.
     """
     if isinstance(which, int) and _members(state) == 1:
         return state
@@ -59,7 +59,7 @@ def take(state: State, which: Any) -> State:
 
 
 def join(*states: State) -> State:
-    """Return the states one after the other."""
+    """Return the concatenation of states along the axis of members."""
 
     def joined(*arrays: Array) -> Array:
         return np.concatenate(_widened(arrays))
@@ -69,9 +69,9 @@ def join(*states: State) -> State:
 
 
 def join_fields(states: Sequence[State], names: Sequence[str]) -> State:
-    """Return some fields of states one after the other; the only state as it is.
+    """Return the concatenation of states for some fields; a single state is returned unchanged.
 
-    The others are not there: whoever reads them finds an error, and no wrong number.
+    Other fields are not set, so that access to them is an error instead of a wrong value.
     """
     if len(states) == 1:
         return states[0]
@@ -82,9 +82,9 @@ def join_fields(states: Sequence[State], names: Sequence[str]) -> State:
 
 
 def put(state: State, which: Any, part: State) -> State:
-    """Return a state with some members exchanged, by an index array or a number.
+    """Return a state with members replaced by `part`, at an index array or a single index.
 
-    The only member is the other state itself: no step writes into the arrays of a state.
+    For a state with one member it is `part` itself, because arrays of states are immutable.
     """
     if isinstance(which, int) and _members(state) == 1:
         return part
@@ -103,14 +103,14 @@ def put(state: State, which: Any, part: State) -> State:
 
 
 def put_each(state: State, parts: Mapping[int, State]) -> State:
-    """Return a state with some members exchanged: all at once, since each copies all members."""
+    """Return a state with members replaced, by index, with a single copy of the arrays."""
     if len(parts) < 2:
         return next((put(state, k, one) for k, one in parts.items()), state)
     return put(state, np.array([*parts]), join(*parts.values()))
 
 
 def where(chosen: Mask, state: State, other: State) -> State:
-    """Return one state for the members chosen, another for the rest."""
+    """Return a state with the chosen members of `state` and the other members of `other`."""
     if chosen.all():
         return state
     if not chosen.any():
@@ -127,13 +127,13 @@ def where(chosen: Mask, state: State, other: State) -> State:
 
 
 def zeros(state: State) -> State:
-    """Return a state of zeros, which takes no memory for each member of a fleet."""
+    """Return a state of zeros with the shapes of a state."""
     nothing: State = _each(np.zeros_like, state)
     return nothing
 
 
 def _widened(arrays: tuple[Array, ...]) -> list[Array]:
-    """Return arrays of members, those with fewer rows of a square root filled up with zeros."""
+    """Return arrays of members with the rows of square roots padded to a common number."""
     # Rows of zeros do not change the covariance [U C]^T [U C].
     if arrays[0].ndim < 3 or len({array.shape[1] for array in arrays}) == 1:
         return list(arrays)

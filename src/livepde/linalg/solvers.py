@@ -1,8 +1,8 @@
 """Solvers of sparse systems: factorisations, Krylov methods with multigrid, and their choice.
 
-The criterion of choice is the half bandwidth after reverse Cuthill-McKee ordering: about sqrt(n) in
-2D and n^(2/3) in 3D, twice that for quadratic elements. The dense blocks of a sparse factor have
-about this size in any dimension:
+The choice depends on the half bandwidth after reverse Cuthill-McKee ordering: about sqrt(n) in 2D
+and n^(2/3) in 3D, twice as large for quadratic elements. In any dimension, the dense blocks of a
+sparse factor have about this size:
 
     band          2D P1       3D P1       engine
     to 48         2 000         300       banded LU
@@ -10,16 +10,15 @@ about this size in any dimension:
     to 2500   5 000 000     120 000       CHOLMOD or Pardiso if installed, else multigrid
     beyond                                multigrid
 
-Of CHOLMOD the simplicial factor serves up to 500, the supernodal one beyond. On one thread, for 2D
-P1 and 10 201 nodes: CHOLMOD simplicial 12 ms for a factor, 0.3 ms for one column and 1.2 for five;
-supernodal 21, 0.8 and 4.2; SuperLU 40, 1.3 and 3.0; Pardiso 9, 6.4 and 13. For 3D P1 and 13 824
-nodes: 790, 6.9 and 17; 550, 9.5 and 28; 1220, 14 and 29; 110, 18 and 37. Pardiso is the fastest to
-factorise and the slowest to solve with, so it pays where a factor costs many solves.
+CHOLMOD uses the simplicial factor up to 500 and the supernodal factor beyond. Times on one thread,
+for 2D P1 and 10 201 nodes: CHOLMOD simplicial 12 ms for a factor, 0.3 ms to solve for one column
+and 1.2 for five; supernodal 21, 0.8 and 4.2; SuperLU 40, 1.3 and 3.0; Pardiso 9, 6.4 and 13. For 3D
+P1 and 13 824 nodes: 790, 6.9 and 17; 550, 9.5 and 28; 1220, 14 and 29; 110, 18 and 37. Pardiso has
+the fastest factorisation and the slowest solve, so it pays if a factor costs many solves.
 
-CHOLMOD serves symmetric positive definite matrices only; others have SuperLU up to a band of 150,
-beyond it Pardiso if it is installed. Multigrid serves symmetric positive definite matrices only, if
-PyAMG is installed. SuperLU, which needs no package, factorises all matrices; it is slow and needs
-much memory at large sizes.
+CHOLMOD and multigrid (PyAMG) require symmetric positive definite matrices. For other matrices, the
+solver is SuperLU up to a band of 150, and Pardiso beyond if it is installed. SuperLU requires no
+package and factorises all matrices; for large ones, it is slow and requires much memory.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ class Factor(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Inverse:
-    """A `Factor` by a function, which raises `LinearAlgebraError` where it has no solution."""
+    """A `Factor` from a function, which raises `LinearAlgebraError` if there is no solution."""
 
     solve: Callable[[Array], Array]
 
@@ -68,25 +67,25 @@ class Solver(Protocol):
 
     @property
     def definite(self) -> bool:
-        """True if it refuses a matrix that is not positive definite, at the latest in a solve."""
+        """Whether it rejects matrices that are not positive definite, at the latest in a solve."""
 
     @property
     def price(self) -> float:
-        """Approximate cost of a factorisation in solves; 0: reusing a factor does not pay.
+        """Approximate cost of a factorisation in solves; 0 if reusing a factor does not pay.
 
-        A constant, not a measured time: timings must not influence the numbers computed.
+        It is a constant instead of a measured time, because timings must not influence results.
         """
 
     def factorise(self, data: Array) -> Factor:
         """Factorise the matrix `pattern.matrix(data)`.
 
-        Raises `LinearAlgebraError`: the matrix is singular to working precision or holds a value
-        that is not finite.
+        Raises `LinearAlgebraError`: the matrix is singular to working precision, or a value is not
+        finite.
         """
 
 
 def check_finite(data: Array) -> None:
-    """Raise `LinearAlgebraError` for data of a matrix that are not finite."""
+    """Raise `LinearAlgebraError` if data of a matrix are not finite."""
     if not np.isfinite(data).all():
         raise LinearAlgebraError("The matrix holds values that are not finite.")
 
@@ -103,7 +102,7 @@ def _refusal(pattern: Pattern, definite: bool) -> LinearAlgebraError:
 class Leading:
     """Factor of the Schur complement on the leading `size` unknowns of a factorised matrix.
 
-    `factor` is of the larger matrix, shape (total, total).
+    `factor` is the factor of the larger matrix, shape (total, total).
     """
 
     factor: Factor
@@ -123,21 +122,21 @@ SYMMETRIC: dict[str, Any] = {
     "diag_pivot_thresh": 0.0,
     "options": {"SymmetricMode": True},
 }
-# Bound on the backward error of a test solve. A factor without pivot growth is far below it.
+# Bound on the backward error of a test solve. Without pivot growth, the error is far below it.
 STABLE = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
 class SuperLUFactor:
-    """LU factors of the transpose: a CSR matrix read as CSC is its transpose, without a copy."""
+    """LU factors of the transpose, which is the CSR matrix read as CSC, without a copy."""
 
     lu: Any
     symmetric: bool = False
 
     def solve(self, b: Array) -> Array:
         """Return x with K x = b."""
-        # SuperLU solves the transposed system column by column; the other one takes all columns at
-        # once, which is up to 1.5 times faster, but slower for a single column.
+        # SuperLU solves the transposed system column by column, and the system itself for all
+        # columns at once. The latter is up to 1.5 times faster, but slower for a single column.
         several = b.ndim > 1 and b.shape[1] > 1
         return np.asarray(self.lu.solve(b, trans="N" if self.symmetric and several else "T"))
 
@@ -147,12 +146,12 @@ class SuperLUSolver:
     """Sparse LU of one pattern; `symmetric` for symmetric positive definite matrices.
 
     The symmetric mode orders A + A^T and does not pivot, which is 1.6 to 9 times cheaper. If the
-    residual of a test solve is large, the matrix is not positive definite, and is refused.
+    residual of a test solve is large, the matrix is not positive definite and is rejected.
     """
 
     pattern: Pattern
     symmetric: bool = False
-    definite: bool = False  # it does not check the signs of pivots
+    definite: bool = False  # the signs of pivots are not checked
     price: float = 30.0
 
     @property
@@ -162,7 +161,7 @@ class SuperLUSolver:
     def factorise(self, data: Array) -> SuperLUFactor:
         """Factorise; raise `LinearAlgebraError` for a singular or non-finite matrix.
 
-        In symmetric mode it is also raised for an indefinite matrix, unless its factor is accurate.
+        In symmetric mode, an indefinite matrix is also an error, unless its factor is accurate.
         """
         check_finite(data)
         transpose = sp.csc_array(self.pattern.transposed(data))
@@ -173,9 +172,9 @@ class SuperLUSolver:
         except RuntimeError as error:
             raise refusal from error
         if self.symmetric:
-            # Without pivoting, an indefinite matrix can have a factor with large element growth. A
-            # test solve detects that; SuperLU itself reports exact zeros only.
-            b = np.cos(np.arange(n))  # of no symmetry that could hide an error
+            # Without pivoting, the factor of an indefinite matrix can have large element growth,
+            # which a test solve detects. SuperLU itself reports only exact zeros.
+            b = np.cos(np.arange(n))  # without a symmetry that could hide an error
             x = factor.solve(b)
             size = np.abs(data).max() * np.abs(x).max() + 1.0
             if not np.abs(self.pattern.matrix(data) @ x - b).max() <= STABLE * size:
@@ -184,9 +183,9 @@ class SuperLUSolver:
 
 
 def positive_definite(matrix: sp.csr_array) -> bool:
-    """Return True if a symmetric matrix is positive definite: all its pivots are positive.
+    """Return whether a symmetric matrix is positive definite: all its pivots are positive.
 
-    By Sylvester's law of inertia, which applies if rows and columns are permuted together.
+    Sylvester's law of inertia applies if rows and columns have the same permutation.
     """
     try:
         lu = splu(sp.csc_array(matrix), **SYMMETRIC)
@@ -195,9 +194,9 @@ def positive_definite(matrix: sp.csr_array) -> bool:
     return bool(np.array_equal(lu.perm_r, lu.perm_c) and np.all(lu.U.diagonal() > 0))
 
 
-# Columns that CHOLMOD solves for at a time. It takes four of them through the factor together, so
-# that the numbers do not depend on a multiple of four. Of 60 columns on 3249 nodes, 8 at a time
-# take 3.0 ms, all at once 4.6.
+# Number of columns per call of CHOLMOD. It processes four columns together, so a multiple of four
+# does not change the results. For 60 columns on 3249 nodes, 8 per call take 3.0 ms, all at once
+# 4.6.
 COLUMNS = 8
 
 
@@ -206,8 +205,8 @@ class CholmodSolver:
     """Sparse Cholesky of one pattern with a fixed fill-reducing order; needs scikit-sparse.
 
     A successful factorisation proves that the matrix is positive definite. With `blocks` the factor
-    has dense blocks (supernodal, L L^T), else none (simplicial, L D L^T): blocks are faster to
-    compute for wide bands, and slower to solve with at any size.
+    has dense blocks (supernodal, L L^T), otherwise none (simplicial, L D L^T). Blocks are faster to
+    compute for wide bands, but the solve is slower at any size.
     """
 
     pattern: Pattern
@@ -227,7 +226,7 @@ class CholmodSolver:
         return analyze(self._matrix(np.ones(self.pattern.nnz)), mode=mode)
 
     def _matrix(self, data: Array) -> sp.csc_matrix:
-        # A symmetric matrix is its transpose; scikit-sparse knows no sparse arrays.
+        # A symmetric matrix equals its transpose. scikit-sparse does not support sparse arrays.
         return sp.csc_matrix((data, self.pattern.indices, self.pattern.indptr), self.pattern.shape)
 
     def factorise(self, data: Array) -> Inverse:
@@ -247,7 +246,7 @@ class CholmodSolver:
 
 
 def _by_blocks(factor: Any, b: Array) -> Array:
-    """Return the solution for some columns at a time, which stay in the cache."""
+    """Return the solution, computed for `COLUMNS` columns at a time, which fit into the cache."""
     if b.ndim == 1 or b.shape[1] <= COLUMNS:
         x: Array = factor(b)
         return x
@@ -259,21 +258,21 @@ def _by_blocks(factor: Any, b: Array) -> Array:
 
 POSITIVE_DEFINITE, GENERAL = 2, 11  # Pardiso's types of a matrix
 FACTORISE, REFACTORISE, SOLVE = 12, 22, 33  # its phases
-# The value of MKL_CBWR_AUTO: results do not depend on the alignment of arrays in memory, so that
-# runs are reproducible to the last digit.
+# MKL_CBWR_AUTO: results do not depend on the alignment of arrays in memory, so that runs are
+# reproducible bit by bit.
 REPRODUCIBLE = 2
 
 
 @dataclass(frozen=True, eq=False)
 class PardisoFactor:
-    """Factors held by a Pardiso handle, which returns to the solver with this object."""
+    """Factors in a Pardiso handle, which returns to the solver when this object is deleted."""
 
     solver: PardisoSolver
     handle: Any
     matrix: sp.csr_array
 
-    # A handle works in memory of its own, and pypardiso lets other threads run meanwhile. A factor
-    # that a model keeps (of X, say) is asked by every thread: one after the other.
+    # A handle has its own work memory, and pypardiso releases the GIL during a call. Threads that
+    # share a factor, such as the factor of X in a model, must use it one after the other.
     turn: Lock = field(default_factory=Lock, repr=False)
 
     def solve(self, b: Array) -> Array:
@@ -289,10 +288,10 @@ class PardisoSolver:
     """Sparse factors of one pattern by MKL Pardiso; needs pypardiso.
 
     `symmetric` is for symmetric positive definite matrices: a successful factorisation proves
-    definiteness, and the fill-reducing order is computed once. The order of other matrices depends
-    on their values and is recomputed for each, since the numbers of a factor must not depend on
-    earlier factorisations. pypardiso's own `solve` takes no symmetric storage and compares the
-    whole matrix each time; hence its phases are called one by one.
+    definiteness, and the fill-reducing order is computed once. For other matrices the order depends
+    on the values. It is recomputed for each matrix, because a factor must not depend on earlier
+    factorisations. pypardiso's `solve` does not support symmetric storage and compares the whole
+    matrix in each call, so the phases are called separately.
     """
 
     pattern: Pattern
@@ -312,7 +311,7 @@ class PardisoSolver:
 
     @property
     def definite(self) -> bool:
-        """True for symmetric matrices, which have a Cholesky factor."""
+        """Whether matrices have a Cholesky factor: they do if `symmetric`."""
         return self.symmetric
 
     @cached_property
@@ -336,7 +335,7 @@ class PardisoSolver:
         matrix = pattern.matrix(data[kept])
         kind = POSITIVE_DEFINITE if self.symmetric else GENERAL
         try:
-            handle, known = self._idle.pop(), True  # at once: another thread may take the last one
+            handle, known = self._idle.pop(), True  # no test first: other threads pop, too
         except IndexError:
             handle, known = PyPardisoSolver(mtype=kind), False
         handle.libmkl.MKL_CBWR_Set(REPRODUCIBLE)
@@ -373,17 +372,17 @@ def conjugate_gradients(
     tolerance, limit
         Bound on the residual, relative to each right-hand side; maximum number of iterations.
     remedy
-        Advice for the message of the error if they do not suffice.
+        Advice for the error message if there is no convergence.
 
     Returns
     -------
     x, iterations
-        The solution, and how many it took.
+        The solution, and the number of iterations.
 
     Raises
     ------
     LinearAlgebraError
-        The matrix or the preconditioner is not positive definite, or `limit` was reached.
+        The matrix or the preconditioner is not positive definite, or there is no convergence.
     """
     x, r = np.zeros_like(b), b.copy()
     goal = tolerance * np.linalg.norm(b, axis=0)
@@ -394,7 +393,7 @@ def conjugate_gradients(
             return x, iteration
         z = precondition(r)
         new = np.einsum("i...,i...->...", r, z)
-        # beta is (r, z) over that of the iteration before: zero in the first one, by infinity.
+        # beta is (r, z) over its previous value; infinity makes it zero in the first iteration.
         p = z + _ratio(new, rz if iteration else np.full_like(rz, np.inf)) * p
         Kp = apply(p)
         curvature = np.einsum("i...,i...->...", p, Kp)
@@ -417,7 +416,7 @@ def conjugate_gradients(
 
 
 def _ratio(a: Array, b: Array) -> Array:
-    """Return a/b, zero where b is zero."""
+    """Return a/b, and zero if b is zero."""
     return np.asarray(np.divide(a, b, out=np.zeros_like(np.asarray(b, dtype=float)), where=b != 0))
 
 
@@ -426,11 +425,11 @@ def gmres(
 ) -> tuple[Array, int]:
     """Solve with any nonsingular matrix by GMRES with a left preconditioner.
 
-    In contrast to SciPy's, it applies the preconditioner only once for b and once per iteration.
-    Parameters and results are those of `conjugate_gradients`, with b of shape (n,), but `tolerance`
-    bounds the preconditioned residual, an estimate of the error, relative to that of x = 0.
+    Unlike SciPy's version, it applies the preconditioner only once to b and once per iteration. See
+    `conjugate_gradients` for parameters and results. b has shape (n,), and `tolerance` bounds the
+    preconditioned residual, an estimate of the error, relative to its value for x = 0.
 
-    Raises `LinearAlgebraError`: a value is not finite, or `limit` was reached.
+    Raises `LinearAlgebraError`: a value is not finite, or there is no convergence.
     """
     first = precondition(b)
     size = float(np.linalg.norm(first))
@@ -443,7 +442,7 @@ def gmres(
     left = 1.0
     for k in range(limit):
         new = precondition(apply(basis[k]))
-        # Arnoldi's method by modified Gram-Schmidt: each product uses what is left.
+        # Arnoldi's method by modified Gram-Schmidt: each product uses the current remainder.
         for j, vector in enumerate(basis):
             H[j, k] = new @ vector
             new -= H[j, k] * vector
@@ -456,7 +455,7 @@ def gmres(
         if left <= tolerance:
             x = sum(size * w * vector for w, vector in zip(weights, basis, strict=True))
             return np.asarray(x), k + 1
-        # The Krylov space is exhausted, and dividing would not be defined.
+        # The Krylov space is exhausted, so the division below would not be defined.
         if H[k + 1, k] == 0.0:
             break
         basis.append(new / H[k + 1, k])
@@ -490,7 +489,7 @@ class MultigridFactor:
         return np.stack([self.levels(column) for column in b.T], axis=1)
 
     def solve(self, b: Array) -> Array:
-        """Return x with K x = b to a relative residual of 1e-10; raises `LinearAlgebraError`."""
+        """Return x with K x = b to a relative residual of 1e-10; raise `LinearAlgebraError`."""
         return conjugate_gradients(
             self.matrix.__matmul__, self.precondition, b, TOLERANCE, ITERATIONS, REMEDY
         )[0]
@@ -506,7 +505,7 @@ class MultigridSolver:
     price: float = 1.0
 
     def factorise(self, data: Array) -> MultigridFactor:
-        """Build the hierarchy; raises `LinearAlgebraError` for a non-finite or zero diagonal."""
+        """Build the hierarchy; raise `LinearAlgebraError` without a finite, positive diagonal."""
         with optional("solvers", "Multigrid needs PyAMG"):
             from pyamg import ruge_stuben_solver
 
@@ -522,14 +521,14 @@ class MultigridSolver:
 
 
 def approximate_inverse(factor: Factor) -> Callable[[Array], Array]:
-    """Return the preconditioner of a factor: one V-cycle of multigrid, else an exact solve."""
+    """Return the preconditioner of a factor: a V-cycle of multigrid, or an exact solve."""
     cycle: Callable[[Array], Array] = getattr(factor, "precondition", factor.solve)
     return cycle
 
 
-# Largest half bandwidth of banded LU; the limits are those of the table above.
+# Largest half bandwidth of banded LU; see the table above for all limits.
 WIDEST_BAND = 48
-# Half bandwidth up to which Pardiso is not faster than SuperLU for general matrices.
+# Largest half bandwidth for which Pardiso is not faster than SuperLU for general matrices.
 SMALL = 150
 WIDEST_SUPERLU = 500
 WIDEST_FACTOR = 2500
@@ -537,7 +536,7 @@ WIDEST_FACTOR = 2500
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """A solver bound to a pattern, and the reason of its choice."""
+    """A solver bound to a pattern, and the reason for its choice."""
 
     solver: Solver
     reason: str
@@ -551,8 +550,8 @@ def analyse(pattern: Pattern, *, symmetric: bool = False, approximate: bool = Fa
 def choose(pattern: Pattern, *, symmetric: bool = False, approximate: bool = False) -> Choice:
     """Choose the solver for a pattern by its bandwidth and the installed packages.
 
-    `symmetric`: every matrix is symmetric positive definite. `approximate`: only
-    `approximate_inverse` is needed; then multigrid serves from a bandwidth of 500.
+    `symmetric`: whether all matrices are symmetric positive definite. `approximate`: whether only
+    `approximate_inverse` is required; then multigrid is used from a bandwidth of 500.
     """
     banded = BandedSolver(pattern)
     band = max(banded.band)
@@ -570,13 +569,13 @@ def choose(pattern: Pattern, *, symmetric: bool = False, approximate: bool = Fal
 
 
 def _choose_definite(pattern: Pattern, band: int, wide: str, approximate: bool) -> Choice:
-    """Return the solver of symmetric positive definite matrices."""
+    """Return the solver for symmetric positive definite matrices."""
     superlu, cholmod = SuperLUSolver(pattern, True), _installed("sksparse")
     if band <= WIDEST_SUPERLU:
         if cholmod:
             return Choice(CholmodSolver(pattern), f"{wide}; scikit-sparse is installed")
         return Choice(superlu, f"{wide}, at most {WIDEST_SUPERLU}")
-    # One V-cycle is enough for an approximate inverse, so multigrid pays for smaller matrices.
+    # A V-cycle suffices as an approximate inverse, so multigrid pays for smaller matrices.
     most = WIDEST_SUPERLU if approximate else WIDEST_FACTOR
     multigrid = _installed("pyamg")
     if multigrid and band > most:
@@ -594,7 +593,7 @@ def _choose_definite(pattern: Pattern, band: int, wide: str, approximate: bool) 
 
 
 def _superlu(solver: SuperLUSolver, band: int, wide: str) -> Choice:
-    """Return the solver that needs no package, where no other one is installed."""
+    """Return SuperLU, which requires no package, if no faster solver is installed."""
     if band <= WIDEST_SUPERLU:
         return Choice(solver, f"{wide}, at most {WIDEST_SUPERLU}")
     return Choice(
