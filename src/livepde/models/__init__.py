@@ -1,4 +1,4 @@
-"""Predefined equations: functions that return a `Model`, each with an entry in `EQUATIONS`."""
+"""Predefined equations: functions that return a `Model`, with descriptions in `EQUATIONS`."""
 
 from __future__ import annotations
 

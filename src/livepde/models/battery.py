@@ -25,13 +25,13 @@ def battery_particle(
 ) -> Model:
     """Return r^2 c_t = (D(c) r^2 c_r)_r in a sphere that is charged by a current I(t).
 
-    This is the single-particle model of an electrode: all of its particles are represented by one,
-    and the current is distributed evenly over their surface,
+    This is the single-particle model of an electrode: one particle represents all particles, and
+    the current is distributed evenly over their surface,
 
         -D(c) c_r = I/(F area)  at the surface,      D(c) = D exp(slope (c/c_max - 1/2)).
 
     The current in A is the input channel "I"; I > 0 extracts lithium, as in the negative electrode
-    during discharge. The concentration at the surface is the state at the right end of the mesh; a
+    during discharge. The state at the right end of the mesh is the concentration at the surface. A
     voltage is a function of it, see `livepde.observation.Calibrated`.
 
     Parameters
@@ -40,20 +40,20 @@ def battery_particle(
         Radius in m, from 0 ("left") to the surface ("right"), with cells of size sqrt(D h) at the
         surface for time steps h.
     D
-        Diffusivity of lithium at half filling in m^2/s; positive: a `LogNormal`.
+        Diffusivity of lithium at half filling in m^2/s. It is positive, so use `LogNormal`.
     slope
         Derivative of the logarithm of the diffusivity by the filling; default 0, a constant D.
     area
-        Surface of all particles in m^2: 3/R times their volume.
+        Total surface of all particles in m^2: 3/R times their volume.
     c_max
         Concentration of the full particle in mol/m^3.
     element
-        As for `heat`.
+        See `heat`.
 
     Raises
     ------
     ModelError
-        area or c_max is not positive, or the mesh does not begin at 0.
+        area or c_max is not positive, or the mesh does not start at 0.
 
     Examples
     --------
@@ -73,7 +73,7 @@ def battery_particle(
     R = float(mesh.p.max())
     unknowns = {"D": D} if slope is None else {"D": D, "slope": slope}
 
-    # It is of order one, which keeps the matrices well scaled.
+    # The scaled weight is of order one, so that matrices are well scaled.
     def shell(x: Any) -> Any:
         return (x[0] / R) ** 2
 

@@ -23,8 +23,8 @@ from livepde.models.description import (
     one_number,
 )
 
-# Of r^2/diffusivity: from then on a line source errs by 2.5 % at most, from 5 on by 10 %
-# (S. Gehlin, Thermal Response Test, Lulea 2002).
+# Time in units of r^2/diffusivity after which the error of a line source is at most 2.5 %; after 5
+# it is at most 10 % (S. Gehlin, Thermal Response Test, Lulea 2002).
 SETTLED = 20.0
 
 
@@ -33,19 +33,19 @@ def borehole(
 ) -> Model:
     """Return rho_c r T_t - (k r T_r)_r = 0 around a borehole heated by the power Q(t).
 
-    At the wall -2 pi r k H T_r = Q, and T = T0 at the far end. The power in W is the input channel
-    "Q". The mean temperature of the fluid is T(wall) + R_b Q/H: observe it with
+    At the wall, -2 pi r k H T_r = Q; at the far end, T = T0. The power in W is the input channel
+    "Q". The mean temperature of the fluid, T(wall) + R_b Q/H, is observed by
     `Points({"T": r_wall}, direct={"T": fluid(H)})`.
 
     Parameters
     ----------
     mesh
-        Radius in m, from the wall ("left") to beyond the influence of the test ("right"); best
-        graded: `livepde.interval(r_wall, r_far, 40, geometric=True)`.
+        Radius in m, from the wall ("left") to beyond the influence of the test ("right"),
+        preferably graded: `livepde.interval(r_wall, r_far, 40, geometric=True)`.
     k
         Conductivity of the ground in W/(m K).
     R_b
-        Resistance between fluid and wall in m K/W. It enters the sensor only, not the PDE.
+        Resistance between fluid and wall in m K/W. It is part of the sensor, not of the PDE.
     H
         Length of the borehole in m.
     rho_c
@@ -56,7 +56,7 @@ def borehole(
     Raises
     ------
     ModelError
-        rho_c is unknown by region or as a field.
+        rho_c is an unknown that varies in space.
     """
     one_number("borehole", rho_c=rho_c)
     ends = {"right": T0}
@@ -86,12 +86,12 @@ def borehole(
 
 
 def _heating(x: Place, H: float) -> Any:
-    """Return the power that enters through the wall, in W/m^2."""
+    """Return the heat flux through the wall, in W/m^2."""
     return x.inputs["Q"] / (2 * pi * H * x[0])
 
 
 def fluid(H: float) -> Callable[[Any, Place], Any]:
-    """Return the direct part of a fluid temperature sensor, R_b Q/H in addition to T(wall)."""
+    """Return the direct part of a fluid temperature sensor: R_b Q/H, which is added to T(wall)."""
     return lambda q, x: q.R_b * x.inputs["Q"] / H
 
 
@@ -154,24 +154,24 @@ def grouted_borehole(
         ground   rho_c r T_t = (k r T_r)_r,       r_b < r                        (1 - share) R_b
 
     and T = T0 at the right end. The state at the left end of the mesh is the temperature of the
-    fluid, for sensors there. On a two-dimensional mesh, radius times height, heat also flows along
-    the borehole: the bottom is the plane of its end, where the ground is at T0, and the top that of
-    its middle. The power in W, the input channel "Q", is distributed evenly, and the mean over
-    "left" is the temperature of the fluid.
+    fluid. On a two-dimensional mesh, radius times height, heat also flows along the borehole. The
+    bottom is the plane of its end, where the ground has T0, and the top is the plane of its middle.
+    The power in W, the input channel "Q", is distributed evenly, and the mean over "left" is the
+    temperature of the fluid.
 
     All unknowns are positive: use `LogNormal`, and `LogitNormal` for the share.
 
-    The capacity of the ground may be unknown because radii there are replaced by a coordinate that
-    measures the heat content: x^2 - r_b^2 = (rho_c/rho_0) (r^2 - r_b^2), with the prior rho_0. In x
-    the capacity is known, and k appears as k (rho_c/rho_0) r^2/x. The right end in r moves with
-    rho_c. A source that is added there counts per heat content of rho_0.
+    To allow for an unknown capacity of the ground, its radii are replaced by a coordinate x that
+    measures heat content: x^2 - r_b^2 = (rho_c/rho_0) (r^2 - r_b^2), with the prior centre rho_0.
+    In x the capacity is known, and the conductivity is k (rho_c/rho_0) r^2/x. The right end in r
+    depends on rho_c. A source that is added there is per heat content of rho_0.
 
     Parameters
     ----------
     mesh
-        Radius in m, best graded: `livepde.interval(0.9 * r_p, r_far, 60, geometric=True)`. It
-        begins a bit below r_p, the fluid; the nodes next to r_p and r_b are moved onto them. Or
-        radius and height in m, `livepde.fem.grid(r, z)` with z from 0 to H/2, graded to 0.
+        Radius in m, preferably graded: `livepde.interval(0.9 * r_p, r_far, 60, geometric=True)`.
+        It starts slightly below r_p, with the fluid; the nodes next to r_p and r_b are moved there.
+        Or radius and height in m, `livepde.fem.grid(r, z)` with z from 0 to H/2, graded to 0.
     k
         Conductivity of the ground in W/(m K).
     rho_c
@@ -179,15 +179,15 @@ def grouted_borehole(
     R_b
         Resistance between fluid and wall of the borehole in m K/W.
     share
-        Share of the pipes (film and wall) in R_b. The rest is the grout.
+        Share of R_b that is due to the pipes (film and wall). The rest is due to the grout.
     H
         Length of the borehole in m.
     r_p, r_b
         Equivalent radius of the pipes, and radius of the borehole in m. Two pipes of diameter d
         with axes at a distance s have the equivalent radius sqrt(d s/2) (Gu and O'Neal 1998).
     C_f, C_p, C_c
-        Heat capacities per metre of borehole, in J/(m K), of the fluid with everything else within
-        r_p, of the walls of the pipes, and of a casing at r_b.
+        Heat capacities per metre of borehole, in J/(m K): of everything within r_p, including the
+        fluid, of the walls of the pipes, and of a casing at r_b.
     C_g
         Volumetric heat capacity of the grout in J/(m^3 K).
     T0
@@ -196,7 +196,7 @@ def grouted_borehole(
     Raises
     ------
     ModelError
-        The radii are not inside of the mesh in this order, or rho_c is not one number.
+        The radii are not inside the mesh in this order, or rho_c is not one number.
     """
     if not isinstance(heat := declared(rho_c), Scalar):
         raise ModelError("grouted_borehole: rho_c must be one number: a prior, or a Scalar.")
@@ -212,7 +212,7 @@ def grouted_borehole(
         return around / (2 * pi * (1 - q.share) * q.R_b) * dot(grad(u), grad(v))
 
     def ground(q: Any, u: Any, v: Any, x: Place) -> Any:
-        # The weak form in the coordinate x of constant heat content, see above.
+        # Weak form in the coordinate x, see the docstring.
         more, radial = q.rho_c / rho_0, _outwards(u, v)
         square = r_b**2 + (x[0] ** 2 - r_b**2) / more
         along = dot(grad(u), grad(v)) - radial
@@ -243,14 +243,14 @@ def _outwards(u: Any, v: Any) -> Any:
 def _layered(mesh: Any, r_p: float, r_b: float) -> Any:
     """Return the mesh with nodes at both radii and names for its layers.
 
-    Subdomains "pipes", "grout" and "ground", the facets "wall" at r_b, and in a plane "end", the
-    bottom of the ground.
+    The names are the subdomains "pipes", "grout" and "ground", the boundary "wall" at r_b, and in
+    two dimensions the boundary "end", the bottom of the ground.
     """
     points = mesh.p.copy()
     radii = points[0]
     first, last = float(radii.min()), float(radii.max())
-    # The nearest nodes are moved onto the radii, so that layers end at nodes: a coefficient that
-    # jumps inside of a cell would cost an order of convergence.
+    # The nearest nodes are moved to the radii, so that layers end at nodes: a coefficient that
+    # jumps inside a cell would reduce the order of convergence.
     inner, wall = (float(radii[np.abs(radii - r).argmin()]) for r in (r_p, r_b))
     if not first < r_p < r_b < last or not first < inner < wall < last:
         raise ModelError(

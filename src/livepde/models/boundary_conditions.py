@@ -1,7 +1,7 @@
-"""Boundary fluxes and sources added to a process: known, measured or unknown.
+"""Known, measured or unknown boundary fluxes and sources that are added to a process.
 
-In the weak form of M u_t - div(D grad u) = f, a flux J into the domain is the boundary integral of
-J v, in the unit of D u_n.
+In the weak form of M u_t - div(D grad u) = f, a flux J into the domain contributes the boundary
+integral of J v. J has the unit of D u_n.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from livepde.fem import Channel, On, Place, Unknown, ignores
 from livepde.fem.measure import Measure, sizes
 from livepde.model import Model
 
-# Share of the size of a source that a mesh may miss without a warning.
+# Largest relative error of the size of a source on the mesh without a warning.
 MISSED = 0.01
 
 
 @dataclass(frozen=True)
 class Multiple:
-    """The unknown of a name, times a number."""
+    """Product of a number and the unknown of a given name."""
 
     unknown: str
     factor: float
 
 
 Amount: TypeAlias = "float | Channel | str | Multiple"
-"""A number, an input channel, an unknown by its name, or a multiple of one."""
+"""A number, an input channel, the name of an unknown, or a multiple of an unknown."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Flux:
 class Exchange:
     """Robin (Newton) condition, exchange through a boundary: D u_n = coefficient (ambient - u).
 
-    The transfer coefficient is in W/(m^2 K) for heat conduction; `ambient` is u outside.
+    The coefficient is in W/(m^2 K) for heat conduction; `ambient` is the value of u outside.
     """
 
     coefficient: Amount
@@ -61,8 +61,8 @@ Condition: TypeAlias = Flux | Exchange
 class Source:
     """Source in a part of the domain, per volume and time: W/m^3 for heat conduction.
 
-    `over` is a predicate on x or the name of a subdomain of the mesh; None: all of the domain. Its
-    border should follow cells of the mesh, as they integrate the source.
+    `over` is a predicate on x or the name of a subdomain of the mesh; None for the whole domain.
+    Its border should align with cells of the mesh, because the source is integrated by cells.
     """
 
     value: Amount
@@ -76,7 +76,7 @@ def with_conditions(
     unknowns: Mapping[str, Unknown] | None = None,
     per: str | None = None,
 ) -> Model:
-    """Return a process with added boundary fluxes and sources.
+    """Return a process with additional boundary fluxes and sources.
 
     Parameters
     ----------
@@ -87,11 +87,11 @@ def with_conditions(
     sources
         Mapping from name, for messages, to source.
     unknowns
-        Unknowns named by these conditions, in addition to those of the model.
+        Unknowns that the conditions name, in addition to the unknowns of the model.
     per
-        Unknown of the model by which its equation is divided, as an unknown heat capacity:
-        conditions are divided by it, too. A model with the coefficient per_NAME, one over this
-        unknown, stays linear where they are known.
+        Unknown that divides the equation of the model, such as an unknown heat capacity; the
+        conditions are also divided by it. If the model has the coefficient per_NAME, which is 1
+        over this unknown, it remains linear for known conditions.
 
     Raises
     ------
@@ -131,7 +131,7 @@ def _everywhere(x: Place) -> float:
 
 
 class _Terms:
-    """Additional terms of A, which contain unknowns, and of B, which do not."""
+    """Additional terms of A, with unknowns, and of B, without unknowns."""
 
     def __init__(self, model: Model, unknowns: tuple[str, ...], per: str | None) -> None:
         if per is not None and per not in model.parameter_space.labels:
@@ -147,7 +147,7 @@ class _Terms:
         self.B: list[Any] = []
 
     def through(self, boundary: str, given: Condition | Sequence[Condition]) -> None:
-        """Add fluxes and exchanges."""
+        """Add fluxes and exchanges at a boundary."""
         known = self.model.mesh.boundaries or {}
         if boundary not in known:
             raise ModelError(
@@ -171,8 +171,8 @@ class _Terms:
                 "expected 0 or more. The flux into the domain is coefficient (ambient - u)."
             )
         h, outside = self._divided(coefficient), self._amount(ambient)
-        # Two terms: a term in u that reads an input would make the matrix of a stage depend on
-        # time, and prevent the reuse of its factor.
+        # Two terms, so that the term in u depends on no input: otherwise the matrix of a stage
+        # would depend on time, and its factor could not be reused.
         self._add(boundary, lambda q, u, v, x: h(q, x) * u * v, coefficient)
         self._add(boundary, lambda q, _, v, x: -h(q, x) * outside(q, x) * v, coefficient, ambient)
 
@@ -181,7 +181,7 @@ class _Terms:
     ) -> None:
         """Add a flux or a source."""
         amount = self._divided(value)
-        # In M u_t + A(u) q + B(u) = f the terms stand on the left side, hence the sign.
+        # The terms are on the left-hand side of M u_t + A(u) q + B(u) = f, hence the sign.
         self._add(where, lambda q, _, v, x: -amount(q, x) * inside(x) * v, value)
 
     def _add(self, where: str | None, plain: Callable[..., Any], *amounts: Amount) -> None:
@@ -191,7 +191,7 @@ class _Terms:
         def driving(_: Any, v: Any, x: Place) -> Any:
             return plain(None, None, v, x)
 
-        # B and f may not read q, so a term belongs to A as soon as one amount is an unknown.
+        # B and f must not depend on q, so a term with an unknown amount is part of A.
         form: Callable[..., Any]
         if self.per is not None or any(isinstance(one, str | Multiple) for one in amounts):
             form, terms = plain, self.A
@@ -200,7 +200,7 @@ class _Terms:
         terms.append(form if where is None else On(where, form))
 
     def _divided(self, value: Amount) -> Callable[[Any, Place], Any]:
-        """Return an amount over the unknown that divides the equation, if one does."""
+        """Return an amount, divided by the unknown that divides the equation, if any."""
         amount, per, inverse = self._amount(value), self.per, self.inverse
         if per is None:
             return amount
@@ -234,14 +234,14 @@ class _Terms:
 
 
 def _region(model: Model, name: str, over: Any) -> tuple[str | None, Callable[[Any], Any]]:
-    """Return the subdomain of a source, None for all, and its indicator function."""
+    """Return the subdomain of a source, None for the whole domain, and its indicator function."""
     if over is None:
         return None, _everywhere
     if isinstance(over, str):
         if over not in (model.mesh.subdomains or {}):
             raise ModelError(f"source '{name}': the mesh has no subdomain '{over}'.")
         return over, _everywhere
-    # The predicate is tried at the mean of the vertices of each cell.
+    # The predicate is evaluated at the mean of the vertices of each cell.
     if not np.any(over(model.mesh.p[:, model.mesh.t].mean(axis=1))):
         raise ModelError(f"source '{name}': no cell of the mesh lies in it.")
     measure = Measure(model.mesh, model.order, weight=model.state_space.weight)

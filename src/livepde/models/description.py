@@ -1,4 +1,4 @@
-"""Descriptions of predefined equations, and common parts of nonlinear wave equations."""
+"""Descriptions of predefined equations, and common parts of their models."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ AMBIENT = "ambient"  # input of an exchange with the surroundings
 
 
 def exchange(coefficient: Callable[[Any], Any]) -> list[Any]:
-    """Return coefficient (u - ambient) v as two terms, so that the term in u reads no input."""
+    """Return coefficient (u - ambient) v as two terms: the term in u must not depend on inputs."""
     return [
         lambda q, u, v, x: coefficient(q) * u * v,
         lambda q, _, v, x: -coefficient(q) * x.inputs[AMBIENT] * v,
@@ -27,7 +27,7 @@ def exchange(coefficient: Callable[[Any], Any]) -> list[Any]:
 
 
 def around_axis(x: Any) -> Any:
-    """Return the volume element of a mesh whose first coordinate is the distance from an axis."""
+    """Return the volume element for a first coordinate that is the distance from an axis."""
     return x[0]
 
 
@@ -38,8 +38,8 @@ class Variable:
     Attributes
     ----------
     transform
-        Transform of an unknown in a case that `livepde init` writes: "log" for a positive quantity,
-        "logit" for a share between 0 and 1; empty for a quantity that may be negative.
+        Transform of the unknown in a case from `livepde init`: "log" for a positive quantity,
+        "logit" for a share between 0 and 1, empty for a quantity that may be negative.
     """
 
     unit: str
@@ -50,9 +50,9 @@ class Variable:
 
 @dataclass(frozen=True)
 class Option:
-    """Known number of an equation; `default` None means that it is required.
+    """Known number of an equation; it is required if `default` is None.
 
-    An option whose default is text or a boolean, or that has `choices`, takes such a value.
+    The value is text or a boolean if the default is, and text if there are `choices`.
     """
 
     unit: str
@@ -62,7 +62,7 @@ class Option:
 
     @property
     def kind(self) -> type[float] | type[str] | type[bool]:
-        """Type of its value."""
+        """Type of the value."""
         if isinstance(self.default, bool):
             return bool
         return str if self.choices or isinstance(self.default, str) else float
@@ -75,10 +75,10 @@ class Quantity:
     Attributes
     ----------
     at
-        Function (left end, right end) of the mesh -> position at which the state is read.
+        Function (left end, right end) of the mesh -> position of the state in it.
     direct
-        Function of the options that returns the direct dependence on the parameter, (q, x), linear
-        in q.
+        Function of the options that returns the direct dependence on the parameter, a function
+        (q, x) that is linear in q.
     """
 
     text: str
@@ -87,7 +87,7 @@ class Quantity:
 
 
 class Fluxes(NamedTuple):
-    """Units in a case: of D u_n, of h in an exchange h (ambient - u), and of a source density."""
+    """Units of a flux D u_n, of h in an exchange h (ambient - u), and of a source density."""
 
     flux: str
     transfer: str
@@ -101,7 +101,7 @@ class Equation:
     Attributes
     ----------
     name, summary, formula
-        Name in a case file, one line about it, and the equation as text.
+        Name in a case file, a one-line summary, and the equation as text.
     state
         Unit and meaning of u.
     unknowns, inputs, options
@@ -109,34 +109,34 @@ class Equation:
     build
         Function (mesh, unknowns, dirichlet, **options) -> `Model`.
     quantities
-        Measured quantities besides the state itself.
+        Measured quantities other than the state.
     element
-        Function mesh -> element of the state, and of unknown fields.
+        Function mesh -> element of the state and of unknown fields.
     fluxes
-        Units of fluxes and sources (`livepde.models.with_conditions`); None: it takes none.
+        Units of fluxes and sources (`livepde.models.with_conditions`); None if not supported.
     conductivity
-        Unknown D of the flux -D u_x, measured by sensors with `quantity = "flux"`; empty: none.
+        Unknown D of the flux -D u_x, for sensors with `quantity = "flux"`; empty if none.
     storage
-        Option that may be an unknown instead, by which the equation is divided then: only the
-        ratio of other unknowns to it is determined without a known flux or source.
+        Option that may be an unknown instead. The equation is then divided by it, and only ratios
+        of other unknowns to it are determined without a known flux or source.
     loss
-        Unknown that exchanges with the surroundings.
+        Unknown of the exchange with the surroundings.
     capacity
-        Unknowns and options whose product with a rate of the state is a source, or with a rate of
-        decay a loss.
+        Unknowns and options whose product with a rate of change of the state is a source, and with
+        a rate of decay a loss.
     spacing
-        Of an interval's mesh: "geometric" where u changes most at the left end, as around a well.
+        Spacing of an interval's mesh: "geometric" if u changes most at the left end (a well).
     alternatives
-        Unknowns of which a case needs at least one -> the inputs and options that belong to it.
+        Unknowns of which a case requires at least one -> their inputs and options.
     components
-        Names of the components of u; empty if it has one.
+        Names of the components of u; empty if there is only one.
     omits
-        What the equation leaves out while the process begins, and the equation that contains it.
+        Effect at the start of the process that the equation omits, and the equation with it.
     settles
-        Function (values of unknowns and options, left end of the mesh) -> time after which that
-        has faded; None: unknown.
+        Function (values of unknowns and options, left end of the mesh) -> time after which the
+        omitted effect is negligible; None if unknown.
     dimension
-        Of the mesh that `livepde init` writes: 1 an interval, 2 a rectangle.
+        Dimension of the mesh that `livepde init` writes: 1 for an interval, 2 for a rectangle.
     """
 
     name: str
@@ -164,12 +164,12 @@ class Equation:
     dimension: Literal[1, 2] = 1
 
     def about(self, unknowns: Collection[str] = ()) -> dict[str, Any]:
-        """Return units and formula of a model, without terms of unknowns that it does not have."""
+        """Return units and formula of a model, without the terms of optional unknowns it lacks."""
         left = [
             name for name, one in self.unknowns.items() if one.optional and name not in unknowns
         ]
         main, comma, rest = self.formula.partition(",  ")
-        # Only terms outside of brackets are left out: of a sum in brackets another term remains.
+        # Omit only terms outside brackets, because a sum in brackets has other terms.
         first, *more = re.split(r" ([+-]) (?![^(]*\))", main)
         parts = zip(more[::2], more[1::2], strict=True)
         kept = [
@@ -187,10 +187,10 @@ class Equation:
 
 @dataclass(frozen=True)
 class by_name:
-    """The `build` of a function with unknowns, `dirichlet` and options as keywords.
+    """The `build` of an equation whose function takes unknowns, `dirichlet` and options by keyword.
 
-    An unknown replaces the option of its name. `closed` is the reason why a function has no
-    `dirichlet`, for the error if a case gives values.
+    An unknown replaces the option of the same name. `closed` is the reason why a function has no
+    `dirichlet`, for the error message if a case has boundary values.
     """
 
     function: Callable[..., Model]
@@ -215,13 +215,13 @@ class by_name:
 Number: TypeAlias = Unknown | float
 """A coefficient of an equation: unknown, or a known number."""
 
-# Unknowns that are several numbers: an equation that is divided by one has the gradient of its
-# inverse as a further term.
+# Unknowns with several numbers. If an equation is divided by such an unknown, the gradient of its
+# inverse is an additional term.
 VARYING = (Field, Piecewise, Scalars)
 
 
 def one_number(equation: str, **unknowns: Any) -> None:
-    """Refuse unknowns by region or as a field, by which an equation is divided."""
+    """Raise an error if an unknown that divides the equation varies in space."""
     for name, unknown in unknowns.items():
         if isinstance(unknown, VARYING):
             text = f"an unknown {name} must be one number; give a Scalar or a prior."
@@ -229,9 +229,9 @@ def one_number(equation: str, **unknowns: Any) -> None:
 
 
 def everywhere(equation: str, mesh: Any, **unknowns: Any) -> None:
-    """Refuse a coefficient by region if a cell lies in no region or in two.
+    """Raise an error if a cell is not in exactly one region of a piecewise coefficient.
 
-    The coefficient would be zero there, or the sum of two numbers.
+    The coefficient would be zero there, or the sum of several numbers.
     """
     middle = mesh.p[:, mesh.t].mean(axis=1)
     for name, unknown in unknowns.items():
@@ -242,7 +242,7 @@ def everywhere(equation: str, mesh: Any, **unknowns: Any) -> None:
             here = np.zeros(mesh.nelements, dtype=bool)
             if callable(region):
                 here[:] = region(middle)
-            else:  # a name that the mesh does not have is refused where forms are evaluated
+            else:  # an unknown name is an error when forms are evaluated
                 here[(mesh.subdomains or {}).get(region, [])] = True
             if callable(region) and not here.any():
                 raise ModelError(
@@ -262,7 +262,7 @@ INITIAL = Variable("", "initial state, a field; else the case's `initial`", opti
 
 
 def state(mesh: Any, element: Any, dirichlet: Mapping[str, Any] | None, unit: str = "") -> Field:
-    """Return the field of the state: periodic, or with Dirichlet values."""
+    """Return the field of the state: with Dirichlet values, or periodic if they are None."""
     if dirichlet is not None:
         return Field(mesh, element, dirichlet=dict(dirichlet), unit=unit)
     pairs = [pair for pair in SIDES[-1] if set(pair) <= set(mesh.boundaries or {})]
@@ -276,7 +276,7 @@ def autonomous(
     form: Callable[[Any, Any, Any], Any],
     about: Mapping[str, Any],
 ) -> Model:
-    """Return u_t + A(u) = 0 with A by a form (c, u, v) of its coefficients c, known or unknown."""
+    """Return u_t + A(u) = 0, with A from a form (c, u, v) with known or unknown coefficients c."""
     known = {k: float(v) for k, v in coefficients.items() if isinstance(v, int | float)}
     unknown: dict[str, Any] = {k: v for k, v in coefficients.items() if k not in known}
     begun, initial = _beginning(u0, u)
@@ -288,9 +288,9 @@ def autonomous(
 
 
 def _beginning(u0: Unknown | None, u: Field) -> tuple[dict[str, Unknown], Integrand | None]:
-    """Return an unknown initial state by name, and the form `initial` of a model.
+    """Return name -> unknown initial state, and the form `initial` of a model.
 
-    A field inherits the boundaries of the state: periodic, or zero where that is fixed at zero.
+    A field inherits periodic boundaries and zero Dirichlet values from the state.
     """
     if u0 is None:
         return {}, None

@@ -40,29 +40,29 @@ def heat(
     """Return u_t - div(alpha grad u) + loss (u - ambient) = source in any dimension.
 
     Boundaries without a value have a Robin condition, -alpha u_n = transfer (u - ambient) (Newton's
-    law of cooling). Omitted terms are zero: without `transfer` these boundaries are insulated. With
-    `loss` or `transfer` the temperature of the surroundings is the input channel "ambient".
+    law of cooling). Omitted terms are zero: without `transfer`, these boundaries are insulated. The
+    input channel "ambient", for `loss` or `transfer`, is the temperature of the surroundings.
 
     Parameters
     ----------
     mesh
-        Any mesh of scikit-fem, or `livepde.interval(...)`; coordinates in m.
+        Any mesh of scikit-fem, or `livepde.interval(...)`, with coordinates in m.
     alpha
-        Diffusivity in m^2/s: a number, a `Piecewise` by layer, or a `Field`. The flux alpha u_n
-        is continuous between layers, so all layers have the same heat capacity (else:
-        `conduction`).
+        Diffusivity in m^2/s: a number, a `Piecewise` by layer, or a `Field`. The flux alpha u_n is
+        continuous between layers, so all layers must have the same heat capacity; otherwise use
+        `conduction`.
     dirichlet
         Boundary -> number, function g(x, t), or `Channel`.
     loss
-        Rate of exchange with the surroundings over the whole domain, in 1/s, as for a rod without
+        Rate of exchange with the surroundings in the whole domain, in 1/s: a rod without
         insulation.
     transfer
         Heat-transfer coefficient over volumetric heat capacity, in m/s.
     source
         Heat source, in K/s. With `evolution=MeanReverting(...)` it represents all unmodelled
-        effects: rain, evaporation, lateral flow.
+        effects, such as rain, evaporation or lateral flow.
     element
-        Element of the state; default of first order.
+        Element of the state; by default of first order.
     unit
         Unit of u.
 
@@ -96,15 +96,15 @@ def conduction(
 ) -> Model:
     """Return C u_t - div(k grad u) + loss (u - ambient) = source with heat capacity C.
 
-    With an unknown C the equation is divided by it. Temperatures alone determine k/C: add a known
-    flux or source by `with_conditions(..., per="C")`.
+    If C is unknown, the equation is divided by it. Temperatures alone determine only k/C, so add a
+    known flux or source by `with_conditions(..., per="C")`.
 
-    At boundaries without a value -k u_n = transfer (u - ambient).
+    At boundaries without a Dirichlet value, -k u_n = transfer (u - ambient).
 
     Parameters
     ----------
     mesh, dirichlet, element, unit
-        As for `heat`.
+        See `heat`.
     k
         Conductivity in W/(m K).
     C
@@ -115,7 +115,7 @@ def conduction(
     Raises
     ------
     ModelError
-        C is not positive, or unknown by region or as a field; or `transfer` is given, but every
+        C is not positive, or an unknown that varies in space; or `transfer` is given, but every
         boundary has a value.
 
     Examples
@@ -158,10 +158,10 @@ def _model(
 ) -> Model:
     everywhere(equation.name, mesh, **{equation.conductivity: unknowns[equation.conductivity]})
     field = fem.Field(mesh, element or fem.linear(mesh), dirichlet=dict(dirichlet or {}), unit=unit)
-    # A term without an unknown of its own is left out of the form, and its input with it.
+    # Omit terms whose unknown is not given, and their inputs.
     given = {key: unknown for key, unknown in unknowns.items() if unknown is not None}
-    # The equation is divided by an unknown heat capacity. The ratios are coefficients of the form,
-    # which stays linear in them.
+    # The equation is divided by an unknown heat capacity. The form is linear in the ratios, which
+    # are its coefficients.
     divided = "C" in given
     part = {key: attrgetter(key + "_per_C" * divided) for key in given}
     return Model(
@@ -176,14 +176,14 @@ def _model(
 
 
 def _ratios(q: Any, names: Iterable[str]) -> dict[str, Any]:
-    """Return one over C, and other unknowns over C."""
+    """Return 1/C, and the other unknowns divided by C."""
     return {"per_C": 1.0 / q.C, **{f"{k}_per_C": getattr(q, k) / q.C for k in names if k != "C"}}
 
 
 def _terms(
     equation: Equation, part: Mapping[str, Callable[[Any], Any]], field: fem.Field
 ) -> list[Any]:
-    """Return the terms of A for unknowns by name, each a function of q."""
+    """Return the terms of A; `part`: name of an unknown or ratio -> function of q."""
     D = part[equation.conductivity]
     terms: list[Any] = [lambda q, u, v, x: D(q) * fem.dot(fem.grad(u), fem.grad(v))]
     if "loss" in part:
@@ -197,7 +197,7 @@ def _terms(
 
 
 def _free_sides(equation: Equation, field: fem.Field) -> list[str]:
-    """Return the named boundaries without a value, at which heat transfer acts."""
+    """Return the named boundaries without a Dirichlet value, where heat transfer acts."""
     held = field.dirichlet
     sides = [] if "boundary" in held else [*(field.mesh.boundaries or {})]
     free = [side for side in sides if side not in held]

@@ -35,31 +35,31 @@ def pumping_test(
 ) -> Model:
     """Return Ss r s_t - (k r s_r)_r + r leakance s/b = 0 for the drawdown around a well.
 
-    At the wall of the well -2 pi r b k s_r = Q, and s = 0 at the far end. For a small well radius
-    and a constant rate this is the problem of Theis (1935), s = Q/(4 pi k b) E1(r^2 Ss/(4 k t)),
-    and with a leaky layer above that of Hantush and Jacob (1955). The rate Q may also change (step
-    tests, recovery): in m^3/s, positive for extraction, it is the input channel "Q". The unknowns
+    At the wall of the well, -2 pi r b k s_r = Q; at the far end, s = 0. For a small radius and a
+    constant rate, this is the problem of Theis (1935), s = Q/(4 pi k b) E1(r^2 Ss/(4 k t)), and
+    with a leaky layer above, the problem of Hantush and Jacob (1955). The rate Q is the input
+    channel "Q" in m^3/s, positive for extraction. It may vary (step tests, recovery). The unknowns
     are positive: use `LogNormal`.
 
     Parameters
     ----------
     mesh
         Radius in m, from the wall ("left") to beyond the influence of the test ("right"), a few
-        times sqrt(4 k t/Ss); best graded: `livepde.interval(0.1, 5000.0, 80, geometric=True)`.
+        times sqrt(4 k t/Ss). Grade it: `livepde.interval(0.1, 5000.0, 80, geometric=True)`.
     k
         Hydraulic conductivity in m/s.
     Ss
         Specific storage in 1/m.
     leakance
         Vertical conductivity over thickness of a leaky layer above, in 1/s: the inverse of its
-        resistance. Without it the aquifer is confined.
+        resistance. Without it, the aquifer is confined.
     b
-        Thickness of the aquifer in m; for 1 m the unknowns are transmissivity and storativity.
+        Thickness of the aquifer in m. With 1 m, the unknowns are transmissivity and storativity.
 
     Raises
     ------
     ModelError
-        The thickness is not positive, or Ss is unknown by region or as a field.
+        The thickness is not positive, or Ss is an unknown that varies in space.
     """
     one_number("pumping_test", Ss=Ss)
     everywhere("pumping_test", mesh, k=k)
@@ -102,34 +102,33 @@ def groundwater(
 ) -> Model:
     """Return S h_t - div(T grad h) = recharge - sum of Q_w delta_w for the head h of an aquifer.
 
-    The equation is divided by S, so that the storativity may be unknown, too. Each well is a
-    smooth, round source (see `well`): the head equals that of a point source only beyond its
-    radius, so place no sensor within it. T and S are positive: use `LogNormal`.
+    The equation is divided by S, so that the storativity may also be unknown. Each well is a
+    smooth, round source (see `well`). The head equals the head of a point source only beyond its
+    radius, so place no sensor inside. T and S are positive: use `LogNormal`.
 
     Parameters
     ----------
     mesh, element
-        As for `heat`, in a plane.
+        See `heat`; the mesh is two-dimensional.
     T
         Transmissivity in m^2/s: a number, by region, or a `Field`.
     S
         Storativity, dimensionless: a number or a `Field`. A `Piecewise` would violate the water
-        balance where S jumps.
+        balance at jumps of S.
     dirichlet
-        As for `heat`, heads in m. Other boundaries have no flow.
+        See `heat`; heads in m. Other boundaries have no flow.
     wells
         Mapping from name to (x, y). The name is the input channel of the rate in m^3/s, positive
         for extraction.
     radius
-        Radius of the wells' sources in m: at least the diameter of the cells around them.
+        Radius of the source of a well in m: at least the diameter of the cells around it.
     recharge
         Recharge from above, in m/s.
 
     Raises
     ------
     ModelError
-        A well is outside of the mesh or in cells wider than its radius, or S has an unsupported
-        type.
+        A well is outside the mesh or in cells wider than its radius, or S is a `Piecewise`.
 
     Examples
     --------
@@ -141,7 +140,7 @@ def groundwater(
     ('Q',)
     """
     sources = {name: _place(mesh, name, at, radius) for name, at in (wells or {}).items()}
-    # The term grad(1/S) would be a delta function at the jumps of S.
+    # The term grad(1/S) would be a delta function at jumps of S.
     if isinstance(S, Piecewise):
         raise ModelError("groundwater: S by region is not possible; take a number or a Field.")
     everywhere("groundwater", mesh, T=T)
@@ -161,7 +160,7 @@ def groundwater(
 
     held = dict(dirichlet or {})
     return Model(
-        # The well sources are polynomials of degree four.
+        # The source of a well is a polynomial of degree four.
         Field(mesh, element or linear(mesh), dirichlet=held, unit="m", quadrature=4),
         {"T": T, "S": S},
         A=[flow, taken],
@@ -171,16 +170,16 @@ def groundwater(
 
 
 def well(x: Place, at: Sequence[float], radius: float) -> Array:
-    """Return the density of a round source of mass one, 3/(pi R^2) (1 - r^2/R^2)^2, in 1/m^2.
+    """Return the density of a round source of unit mass, 3/(pi R^2) (1 - r^2/R^2)^2, in 1/m^2.
 
-    It is zero beyond the radius R in m around the position (x, y) of the well.
+    It is zero beyond the radius R in m around the position `at` of the well.
     """
     distance = ((x[0] - at[0]) ** 2 + (x[1] - at[1]) ** 2) / radius**2
     return 3 / (pi * radius**2) * np.maximum(1 - distance, 0.0) ** 2
 
 
 def _place(mesh: Any, name: str, at: Sequence[float], radius: float) -> tuple[float, float]:
-    """Return the position of a well after checking it against the mesh."""
+    """Return the position of a well; raise an error if the mesh does not fit."""
     if mesh.dim() != 2 or len(at) != 2:
         raise ModelError(f"groundwater: well '{name}' needs a mesh of a plane and a place (x, y).")
     place = float(at[0]), float(at[1])
@@ -268,10 +267,10 @@ def advection_dispersion(
 ) -> Model:
     """Return R c_t = D c_xx - v c_x - decay c in a column with inflow on the left.
 
-    The inflow concentration is the channel "c_in". With inlet = "flux" the tracer enters with the
-    water, v c - D c_x = v c_in (third type; c is the concentration in the column); with "fixed" c =
-    c_in (first type). On the right the tracer leaves with the water, c_x = 0: if the front does not
-    reach this end, the column is semi-infinite as in the analytic solutions (Toride, Leij, van
+    The inflow concentration is the channel "c_in". With inlet = "flux", the tracer enters with the
+    water, v c - D c_x = v c_in (third type; c is the concentration in the column). With "fixed", c
+    = c_in (first type). On the right, the tracer leaves with the water, c_x = 0. If the front does
+    not reach this end, the column is semi-infinite as in the analytic solutions (Toride, Leij, van
     Genuchten 1999, CXTFIT 2.1, USDA Research Report 137).
 
     Parameters
@@ -287,19 +286,19 @@ def advection_dispersion(
     inlet
         "flux" or "fixed".
     element, unit
-        As for `heat`.
+        See `heat`.
 
     Raises
     ------
     ModelError
-        R is below 1, or the inlet is unknown.
+        R is below 1, or `inlet` has another value.
     """
     _check("advection_dispersion", inlet, R)
     everywhere("advection_dispersion", mesh, D=D)
     state = _column(mesh, inlet, element, unit)
 
-    # Advection and dispersion are integrated by parts together, so that the natural condition is
-    # the third type: a given total flux v c - D c_x.
+    # Advection and dispersion are both integrated by parts, so that the natural boundary condition
+    # is of the third type: a given total flux v c - D c_x.
     def flux(q: Any, c: Any, w: Any, x: Any) -> Any:
         return (q.D * grad(c)[0] - q.v * c) * grad(w)[0]
 
@@ -337,31 +336,31 @@ def mobile_immobile(
         phi c_t = phi D c_xx - v c_x - omega (c - s)
         (1 - phi) s_t = omega (c - s)
 
-    (Coats and Smith 1964; van Genuchten and Wierenga 1976). Sensors name their component, as in
-    `Points([11.0], of="c")`. For omega -> infinity this is `advection_dispersion` with phi D.
+    (Coats and Smith 1964; van Genuchten and Wierenga 1976). Sensors specify their component, as in
+    `Points([11.0], of="c")`. For omega -> infinity, this is `advection_dispersion` with phi D.
 
     Parameters
     ----------
     mesh, inlet, element, unit
-        As for `advection_dispersion`, with the same channel "c_in".
+        See `advection_dispersion`, also for the channel "c_in".
     D
         Coefficient of dispersion in the mobile water, cm^2/h.
     v
-        Mean pore velocity in cm/h: flux over total water content. The mobile water moves at v/phi.
+        Mean pore velocity in cm/h: flux over total water content. Mobile water moves at v/phi.
     phi
-        Mobile share of the water, in (0, 1): a `LogitNormal`.
+        Mobile share of the water, in (0, 1): use `LogitNormal`.
     omega
         Rate of exchange in 1/h.
 
     Raises
     ------
     ModelError
-        The inlet is unknown, or phi is unknown by region or as a field.
+        `inlet` has another value, or phi is an unknown that varies in space.
     """
     _check("mobile_immobile", inlet)
     one_number("mobile_immobile", phi=phi)
 
-    # The equations are divided by phi and 1 - phi: the mass form is free of unknowns.
+    # The equations are divided by phi and 1 - phi, so that the mass form contains no unknowns.
     def transport(q: Any, u: Any, w: Any, x: Any) -> Any:
         return (q.D * grad(u.c)[0] - q.velocity * u.c) * grad(w.c)[0]
 
@@ -399,7 +398,7 @@ def _column(mesh: Any, inlet: str, element: Any, unit: str) -> Field:
 
 def _ends(velocity: Any, solute: Any, inlet: str) -> list[On]:
     """Return the boundary terms of inflow on the left and outflow on the right."""
-    # With c_x = 0 the total flux on the right is v c; that on the left is v c_in.
+    # With c_x = 0, the total flux is v c on the right; on the left it is v c_in.
     out = On("right", lambda q, u, w, x: velocity(q) * solute(u) * solute(w))
     into = On("left", lambda q, _, w, x: -velocity(q) * x.inputs["c_in"] * solute(w))
     return [out, into] if inlet == "flux" else [out]

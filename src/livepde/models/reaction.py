@@ -39,13 +39,13 @@ def reaction_diffusion(
     q
         Reaction coefficient, usually a `Field`.
     dirichlet
-        As for `heat`; default zero on all boundaries.
+        See `heat`; default zero on all boundaries.
     D
         Diffusivity: a number or a function of x.
     f
         Source density: a number or f(x, t).
     element
-        Element of the state; default cubic Hermite on a line, as in the paper, else first order.
+        Element of the state; default cubic Hermite on an interval (as in the paper) or first order.
     """
     values = {"boundary": 0.0} if dirichlet is None else dict(dirichlet)
     state = Field(mesh, element or hermite(mesh), dirichlet=values)
@@ -89,11 +89,11 @@ def fisher_kpp(
     Parameters
     ----------
     mesh, dirichlet, element, unit
-        As for `heat`, with coordinates in mm. Boundaries without a value have no flux.
+        See `heat`, with coordinates in mm. Boundaries without a value have no flux.
     D, r
         Diffusivity in mm^2/d and growth rate in 1/d: numbers, by region, or fields.
     K
-        Carrying capacity, the density at which growth ends, in the unit of u.
+        Carrying capacity: the density at which growth ends, in the unit of u.
 
     Examples
     --------
@@ -125,19 +125,19 @@ def porous_fisher(
 ) -> Model:
     """Return u_t = div(D (u/K)^m grad u) + r u (1 - u/K): Gurney and Nisbet (1975).
 
-    The diffusivity is zero where u is negative, which can happen by discretisation errors only.
+    The diffusivity is zero for negative u, which only discretisation errors can cause.
 
     Parameters
     ----------
     mesh, D, r, dirichlet, K, element, unit
-        As for `fisher_kpp`; D is the diffusivity at u = K.
+        See `fisher_kpp`; D is the diffusivity at u = K.
     m
         Exponent, at least 1.
 
     Raises
     ------
     ModelError
-        m is below 1, when the derivative of the diffusivity at u = 0 is infinite; or K is not
+        m is below 1, so that the derivative of the diffusivity at u = 0 is infinite, or K is not
         positive.
     """
     require_positive("porous_fisher: the carrying capacity K", K, ModelError)
@@ -147,7 +147,7 @@ def porous_fisher(
     return Model(
         _state(mesh, dirichlet, element, unit),
         {"D": D, "r": r},
-        # `positive` keeps the equation parabolic where discretisation errors make u negative.
+        # `positive` keeps the equation parabolic if discretisation errors make u negative.
         A=lambda q, u, v, x: (
             q.D * positive(u / K) ** m * dot(grad(u), grad(v)) - q.r * u * (1 - u / K) * v
         ),
@@ -157,7 +157,7 @@ def porous_fisher(
 
 def _state(mesh: Any, dirichlet: Mapping[str, Any] | None, element: Any, unit: str) -> Field:
     element = element or linear(mesh)
-    # This order integrates u^2 v exactly.
+    # The quadrature is exact for u^2 v.
     order = 3 * int(element.maxdeg)
     return Field(mesh, element, dirichlet=dict(dirichlet or {}), unit=unit, quadrature=order)
 
@@ -207,15 +207,15 @@ def allen_cahn(
     Parameters
     ----------
     mesh
-        Any mesh. A front is about 4 (2 D/r)^(1/2) wide and must be resolved by several cells.
+        Any mesh. Several cells must resolve a front, whose width is about 4 (2 D/r)^(1/2).
     D, r
-        Diffusivity and rate of reaction: unknown or numbers.
+        Diffusivity and rate of reaction: unknowns or numbers.
     u0
-        As for `burgers`.
+        See `burgers`.
     dirichlet
-        As for `heat`, {} for no flux everywhere; None: periodic.
+        See `heat`. {}: no flux on all boundaries; None: periodic.
     element
-        Element of the state; default cubic Hermite on a line, else first order.
+        Element of the state; by default cubic Hermite on an interval, otherwise first order.
     """
     u = state(mesh, element or hermite(mesh), dirichlet)
     return autonomous(

@@ -55,43 +55,43 @@ def advection_diffusion(
 ) -> Model:
     """Return u_t + w u_z - div(D grad u) + loss (u - ambient) = source, along z = x[0].
 
-    D is kappa + dispersivity |w|, and w the velocity ratio (flow + v + K dH/L): a measured flux, an
-    unknown flux v, the Darcy flux of a measured head difference dH, or their sum. Examples are heat
-    in a stream bed (Stallman 1965), a pipe that loses heat, and solutes.
+    D = kappa + dispersivity |w|, with the velocity w = ratio (flow + v + K dH/L): a measured flux,
+    an unknown flux v, the Darcy flux of a measured head difference dH, or their sum. Examples are
+    heat in a stream bed (Stallman 1965), a pipe that loses heat, and solutes.
 
     Parameters
     ----------
     mesh, element, unit
-        As for `heat`, with the flow along the first axis of the mesh.
+        See `heat`; the flow is along the first axis of the mesh.
     kappa
         Diffusivity in m^2/s: a number, a `Piecewise` by layer, or a `Field`.
     dirichlet
-        As for `heat`. Other boundaries have no diffusive flux.
+        See `heat`. Other boundaries have no diffusive flux.
     v
-        Flux in m/s, positive along z; a time-dependent one has an `evolution`. It is a number,
-        since the same water passes all layers of a column.
+        Flux in m/s, positive along z; a time-dependent flux has an `evolution`. It is one number,
+        because the same water passes all layers of a column.
     K
         Hydraulic conductivity in m/s. dH in m is the input channel "dH".
     dispersivity
         Dispersivity in m.
     loss, source
         Rate of exchange in 1/s with surroundings at the input channel "ambient", and source in
-        unit/s, as in `heat`.
+        unit/s. See `heat`.
     L
-        Length in m of the head drop dH.
+        Length in m over which the head drops by dH.
     ratio
-        Ratio of velocity to flux: for heat the volumetric heat capacity of water over that of the
-        saturated bed (about 1.5), for a solute 1/porosity.
+        Ratio of velocity to flux. For heat, it is the volumetric heat capacity of water over the
+        heat capacity of the saturated bed (about 1.5); for a solute, 1/porosity.
     flow
         Whether the flux, or a part of it, is the input channel "flow" in m/s, positive along z.
     stabilise
-        True: add the artificial diffusion of `livepde.fem.upwind`, for flows with a cell Peclet
-        number |w| h/(2 kappa) above 1.
+        Whether to add the artificial diffusion of `livepde.fem.upwind`, for flows with a cell
+        Peclet number |w| h/(2 kappa) above 1.
 
     Raises
     ------
     ModelError
-        None of v, K and flow is given, or a length or ratio is not positive.
+        None of v, K and flow is given, or L or ratio is not positive.
 
     Examples
     --------
@@ -131,7 +131,7 @@ def advection_diffusion(
         w = velocity(q, x)
         spread = q.kappa
         if dispersivity is not None:
-            # `absolute` instead of abs: complex steps must differentiate the term by w.
+            # `absolute` instead of abs, because complex steps differentiate the term by w.
             spread = spread + q.dispersivity * absolute(w)
         moved = spread * dot(grad(u), grad(test)) + w * grad(u)[0] * test
         if stabilise:  # along the flow only
@@ -203,7 +203,7 @@ def wave(
     Parameters
     ----------
     mesh, element
-        As for `heat`; the element is that of both components.
+        See `heat`; both components have the same element.
     c2
         Squared speed in m^2/s^2: a number, a `Piecewise`, or a `Field`.
     d
@@ -212,14 +212,14 @@ def wave(
         Mapping from boundary to the value of w: a number, a function g(x, t), or a `Channel`. Other
         boundaries are free ends.
     velocity
-        Mapping from boundary to the value of p where w changes in time: its time derivative.
+        Mapping from boundary to the value of p, which is required if w changes in time there.
     f
         Force per mass: a number or f(x, t).
 
     Raises
     ------
     ModelError
-        A boundary value of w may change in time, but its velocity is not given.
+        A boundary value of w may change in time, but there is no velocity.
 
     Examples
     --------
@@ -246,7 +246,7 @@ def wave(
         stiffness = q.c2 * dot(grad(u.w), grad(v.p))
         return stiffness + q.d * u.p * v.p if unknown else stiffness
 
-    # First-order form: implicit one-step schemes and the laws need a single time derivative.
+    # First-order form, because implicit one-step schemes and laws require a single time derivative.
     return Model(
         {
             "w": Field(mesh, element, dirichlet=held, unit="m"),
@@ -289,16 +289,16 @@ def burgers(
     Parameters
     ----------
     mesh
-        `livepde.interval(...)` or `livepde.fem.line(...)`. A shock is about 4 nu/(a jump) wide and
-        must be resolved by several cells of the default element.
+        `livepde.interval(...)` or `livepde.fem.line(...)`. Several cells of the default element
+        must resolve a shock, whose width is about 4 nu/(a jump).
     nu, advection
-        Viscosity, and the coefficient a: unknown or numbers.
+        Viscosity, and the coefficient a: unknowns or numbers.
     u0
         Unknown initial state, usually a `Field` on the same mesh; None: given to the `Identifier`.
     dirichlet
-        As for `heat`; None: periodic.
+        See `heat`; None: periodic.
     element
-        Element of the state; default cubic Hermite.
+        Element of the state; by default cubic Hermite.
     """
     u = state(mesh, element or hermite(mesh), dirichlet)
     return autonomous(
@@ -330,21 +330,21 @@ BURGERS = Equation(
 def kdv(mesh: Any, advection: Number, dispersion: Number, u0: Unknown | None = None) -> Model:
     """Return the Korteweg-de Vries equation u_t + a u u_x + b u_xxx = 0 on a periodic interval.
 
-    The weak form -b (u_xx, v_x) needs elements of class C^1: cubic Hermite. Use the scheme
-    `Alexander2`, which hardly damps resolved waves; implicit Euler damps solitons.
+    The weak form -b (u_xx, v_x) requires elements of class C^1: cubic Hermite. Use the scheme
+    `Alexander2`, which barely damps resolved waves; implicit Euler damps solitons.
 
     Parameters
     ----------
     mesh
-        `livepde.interval(...)`, with its ends identified.
+        `livepde.interval(...)`, whose ends are identified.
     advection, dispersion
-        The coefficients a and b: unknown or numbers.
+        The coefficients a and b: unknowns or numbers.
     u0
-        As for `burgers`.
+        See `burgers`.
     """
     u = state(mesh, smooth(mesh), None)
-    # Integration by parts is applied once to the third derivative, so that second derivatives of u
-    # remain: hence C^1 elements.
+    # The third derivative is integrated by parts once, so that second derivatives of u remain,
+    # which require C^1 elements.
     return autonomous(
         u,
         {"advection": advection, "dispersion": dispersion},
@@ -378,17 +378,17 @@ def kuramoto_sivashinsky(
 ) -> Model:
     """Return u_t + a u u_x + b u_xx + c u_xxxx = 0 on a periodic interval.
 
-    Waves longer than 2 pi (c/b)^(1/2) grow, shorter ones decay. The dynamics are chaotic, and state
+    Waves longer than 2 pi (c/b)^(1/2) grow, and shorter waves decay. The dynamics are chaotic and
     errors grow quickly, so the state must be observed at several points and at short intervals.
 
     Parameters
     ----------
     mesh
-        `livepde.interval(...)`, with its ends identified.
+        `livepde.interval(...)`, whose ends are identified.
     advection, instability, damping
-        The coefficients a, b and c: unknown or numbers.
+        The coefficients a, b and c: unknowns or numbers.
     u0
-        As for `burgers`.
+        See `burgers`.
     """
     u = state(mesh, smooth(mesh), None)
     return autonomous(
