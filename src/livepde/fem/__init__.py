@@ -1,4 +1,4 @@
-"""Fields on meshes and weak forms: the only subpackage that imports scikit-fem."""
+"""Fields on meshes, and weak forms: the only subpackage that imports scikit-fem."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
 """Scatter maps of element matrices, and matrix-free trilinear forms.
 
-The integrals of all products of local functions over an element form a small tensor. The tensors of
-all elements are, to rounding, linear combinations of few: on triangles with straight sides,
-whatever their size and shape, those of q u v are multiples of a single one. So only the r basis
-tensors, r coefficients of each element, and the positions of element matrices are stored: with P1
-functions in the plane about 200 bytes per node, for all three matrices of a form.
+The integrals of all products of local functions over an element form a small tensor. Up to
+rounding, the tensors of all elements are linear combinations of a few basis tensors. For example,
+the tensors of q u v on triangles with straight sides are multiples of a single tensor. Therefore
+only r basis tensors, r coefficients for each element, and the positions of element matrices are
+stored: for P1 functions in 2D, about 200 bytes per node for all three matrices of a form.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ import scipy.sparse as sp
 from livepde.linalg import Array, IntArray, Pattern
 
 Pairs = Sequence[tuple[IntArray, IntArray]]
-# Forms on one mesh repeat the same connectivity many times; on large meshes it would dominate the
-# memory. Weak references: entries vanish with their last user.
+# Forms on one mesh have equal connectivity arrays, whose copies would dominate the memory on large
+# meshes. They are weakly referenced, so that entries are deleted with their last user.
 _arrays: WeakValueDictionary[bytes, IntArray] = WeakValueDictionary()
 _known: WeakValueDictionary[bytes, Scatter] = WeakValueDictionary()
 
 
 def shared(array: IntArray) -> IntArray:
-    """Return a canonical array equal to this one: the same object for all equal arrays."""
+    """Return a canonical array: the same object for all equal arrays."""
     return _arrays.setdefault(_digest(array), array)
 
 
 def scatter(pairs: Pairs, shape: tuple[int, int]) -> Scatter:
     """Return the canonical scatter map of element matrices: one object for equal arguments.
 
-    `pairs` are row and column numbers of local functions for each term, shapes (i, elements) and
+    `pairs` are row and column indices of local functions for each term, shapes (i, elements) and
     (j, elements).
     """
     key = _digest(np.array(shape), *(dofs for pair in pairs for dofs in pair))
@@ -49,8 +49,8 @@ def _digest(*arrays: Any) -> bytes:
     digest = blake2b()
     for array in arrays:
         digest.update(f"{array.dtype}{array.shape}{array.strides}".encode())
-        # A broadcast array has the stride zero: its first column represents it, and the large array
-        # is never formed.
+        # A broadcast array has stride zero. Its first column represents it, so that the large array
+        # is not formed.
         repeated = array[:, :1] if array.ndim == 2 and array.strides[1] == 0 else array
         digest.update(np.ascontiguousarray(repeated).data)
     return digest.digest()
@@ -76,8 +76,7 @@ class Scatter:
 
         `keep` caches the positions of this term's entries, for repeated assembly.
         """
-        # Elements share positions: np.add.at sums repeated ones, which `data[at] += local` would
-        # not.
+        # Elements share positions. np.add.at sums repeated positions, unlike `data[at] += local`.
         np.add.at(data, self._at(term, at, keep).ravel(), local.ravel())
 
     def places(self, term: int) -> IntArray:
@@ -108,9 +107,9 @@ def _members(dofs: IntArray, count: int) -> sp.csr_array:
     return sp.csr_array((np.ones(len(flat), dtype=bool), flat, starts), shape=(elements, count))
 
 
-# Relative error of an element tensor in the common basis: rounding level.
+# Relative error of an element tensor in the common basis, at rounding level.
 EXACT = 1e-13
-# Number of elements multiplied at once, which bounds the size of temporary arrays.
+# Number of elements that are processed at once, which bounds the size of temporary arrays.
 BLOCK = 8_000
 
 
@@ -118,7 +117,7 @@ BLOCK = 8_000
 class TensorTerm:
     """Basis tensors, shape (i, j, n, r), and coefficients of each element, shape (r, elements).
 
-    `dofs` are the coefficient numbers of the three arguments, shape (local, elements) each.
+    `dofs` are the coefficient indices of the three arguments, each of shape (local, elements).
     """
 
     tensors: Array
@@ -127,15 +126,15 @@ class TensorTerm:
 
     @classmethod
     def of(cls, dofs: Sequence[IntArray], parts: Iterable[tuple[slice, Array]]) -> TensorTerm:
-        """Collect the tensors of slices of elements, shape (i, j, n, elements) each."""
+        """Return the term for tensors of slices of elements, each of shape (i, j, n, elements)."""
         shape: tuple[int, ...] = ()
         basis = np.zeros((0, 0))
         shares: list[Array] = []
         for _, local in parts:
             shape, flat = local.shape[:-1], local.reshape(-1, local.shape[-1])
             basis = basis if basis.size else np.zeros((len(flat), 0))
-            # Only tensors outside of the present span extend the basis, by their leading singular
-            # vectors, so that it stays as small as possible.
+            # Only tensors outside the current span extend the basis. Their leading singular vectors
+            # keep it as small as possible.
             left = flat - basis @ (basis.T @ flat)
             size = np.linalg.norm(flat, axis=0)
             missed = np.linalg.norm(left, axis=0) > EXACT * size
@@ -145,8 +144,8 @@ class TensorTerm:
                 )
                 known = basis.shape[1]
                 more = np.hstack([basis, vectors[:, values > EXACT * values.max()]])
-                # QR keeps the span of the known vectors but may flip their signs, to which shares
-                # of earlier parts refer: the signs are restored.
+                # QR preserves the span of the known vectors but may flip their signs. They are
+                # restored, because shares of earlier parts depend on them.
                 basis = np.linalg.qr(more)[0]
                 basis[:, :known] *= np.sign((basis[:, :known] * more[:, :known]).sum(axis=0))
             shares.append(basis.T @ flat)
@@ -160,10 +159,10 @@ class TensorTerm:
 
 @dataclass(frozen=True, eq=False)
 class ElementTensor:
-    """Matrix-free T such that T @ w is the data of a matrix linear in the coefficients w.
+    """Matrix-free T such that T @ w is the data of a matrix that is linear in the coefficients w.
 
-    `slots` are the numbers of the arguments of the rows, of the columns, and of w; `places` are the
-    positions of the entries of element matrices in the data.
+    `slots` are the indices of the arguments for rows, columns, and w; `places` are the positions of
+    the entries of element matrices in the data.
     """
 
     terms: Sequence[TensorTerm]
@@ -171,7 +170,7 @@ class ElementTensor:
     places: Scatter
 
     def _blocks(self) -> Iterator[tuple[int, slice, Array, list[IntArray], Array]]:
-        """Yield term, elements, tensors with axes in order of `slots`, coefficients, shares."""
+        """Yield term, elements, tensors with axes in the order of `slots`, coefficients, shares."""
         for number, term in enumerate(self.terms):
             tensors = np.ascontiguousarray(term.tensors.transpose(*self.slots, 3))
             for start in range(0, term.shares.shape[1], BLOCK):
@@ -180,7 +179,7 @@ class ElementTensor:
                 yield number, at, tensors, dofs, term.shares[:, at]
 
     def __matmul__(self, w: Array) -> Array:
-        """Return the data, in the order of the pattern."""
+        """Return the data of the matrix in the order of the pattern."""
         data = np.zeros(self.places.pattern.nnz)
         for number, at, tensors, (_, _, third), shares in self._blocks():
             i, j, n, r = tensors.shape

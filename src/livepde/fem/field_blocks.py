@@ -1,4 +1,4 @@
-"""Blocks: coefficients and local shape functions of each kind of unknown on a measure."""
+"""Blocks: coefficients and local shape functions for each kind of unknown on a measure."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from livepde.fem.priors import Normal
 from livepde.linalg import Array, Factor, IntArray, Pattern, analyse, conjugate_gradients
 
 JETS = ("value", "grad", "hess")
-# Relative residual of an L2 projection on a large mesh, solved by conjugate gradients.
+# Relative residual of an L2 projection on a large mesh, which uses conjugate gradients.
 PROJECTED = 1e-13
 ITERATIONS = 1000
-# Number of pairs of a point and a cell that are examined at once, which bounds the size of
+# Number of pairs of a point and a cell that are searched at once, which bounds the size of
 # temporary arrays.
 SEARCHED = 5_000_000
 FINER = "give coefficients, or an element of first order."
@@ -37,8 +37,8 @@ class Local:
     """Shape functions of a block on a measure.
 
     `dofs` are the coefficients of the local shape functions, shape (local, elements). `parts` are
-    the derivatives passed to a form as (name, tensor shape), such as ("value", ()), ("grad", (d,)),
-    with `components` numbers in total.
+    the derivatives that a form receives, as (name, tensor shape), such as ("value", ()) and
+    ("grad", (d,)). They have `components` numbers in total.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Local:
         self.parts = tuple(parts)
         self.sizes = [int(np.prod(tensor, dtype=int)) for _, tensor in parts]
         self.components = sum(self.sizes)
-        self._evaluate = evaluate  # part -> shape (components of it, local, elements, points)
+        self._evaluate = evaluate  # part -> array (its components, local, elements, points)
         self._known: dict[str, Array] = {}
 
     def part(self, name: str) -> Array:
@@ -81,7 +81,7 @@ class Block(ABC):
         """Return the argument of a form for component values of shape (components, ..., E, P)."""
 
     def prolongation(self, finer: Any) -> sp.csr_array:
-        """Return the matrix from coefficients to those of the same unknown on a finer mesh."""
+        """Return the matrix that maps coefficients to coefficients on a finer mesh."""
         return sp.csr_array(sp.eye_array(self.size))
 
     def prior(self) -> Array:
@@ -90,11 +90,11 @@ class Block(ABC):
 
     @abstractmethod
     def labels(self, name: str) -> tuple[str, ...]:
-        """Return labels of coefficients that are scalar unknowns (none for fields)."""
+        """Return a label for each coefficient that is a scalar unknown (none for fields)."""
 
 
 class ScalarBlock(Block):
-    """Numbers that are constant on the domain (`Scalar`) or on each region (`Piecewise`)."""
+    """Numbers that are constant in the domain (`Scalar`) or in each region (`Piecewise`)."""
 
     def __init__(self, unknown: Scalar | Piecewise) -> None:
         self.unknown = unknown
@@ -130,7 +130,7 @@ class ScalarBlock(Block):
 
 
 class NamesBlock(Block):
-    """Named numbers (`Scalars`), constant on the domain."""
+    """Named numbers (`Scalars`), constant in the domain."""
 
     def __init__(self, unknown: Scalars) -> None:
         self.unknown = unknown
@@ -153,7 +153,7 @@ class NamesBlock(Block):
 
 
 def _values(function: Callable[[Array], Any], x: Array) -> Array:
-    """Return the values of a function of x at points, (d, ...)."""
+    """Return the values of a function of x at points of shape (d, ...)."""
     given = np.asarray(function(x))
     try:
         if given.dtype.kind not in "biuf":
@@ -179,7 +179,7 @@ class FieldBlock(Block):
         self.size = int(self.dofs.N if self._tie is None else self._tie.max() + 1)
 
     def _tied(self, dofs: IntArray) -> IntArray:
-        """Return coefficients after identification of periodic ones."""
+        """Return coefficients for scikit-fem's degrees of freedom; periodic ones coincide."""
         return dofs if self._tie is None else self._tie[dofs]
 
     @cached_property
@@ -193,7 +193,7 @@ class FieldBlock(Block):
 
     @cached_property
     def places(self) -> Array:
-        """Location of each of scikit-fem's degrees of freedom, shape (d, degrees of freedom)."""
+        """Position of each of scikit-fem's degrees of freedom, shape (d, degrees of freedom)."""
         mesh, element = self.field.mesh, self.element
         found = np.zeros((mesh.dim(), int(self.dofs.N)))
         for at, piece in Measure(mesh, 1).pieces():
@@ -204,7 +204,7 @@ class FieldBlock(Block):
 
     @cached_property
     def doflocs(self) -> Array:
-        """Location of each coefficient, shape (d, size)."""
+        """Position of each coefficient, shape (d, size)."""
         if self._tie is None:
             return self.places
         _, first = np.unique(self._tie, return_index=True)
@@ -227,7 +227,7 @@ class FieldBlock(Block):
 
     @cached_property
     def basis(self) -> Any:
-        """Basis of scikit-fem with shape functions at all quadrature points of `measure`."""
+        """Basis of scikit-fem on the whole mesh, with the quadrature points of `measure`."""
         return Basis(self.field.mesh, self.element, dofs=self.dofs)
 
     @cached_property
@@ -238,17 +238,17 @@ class FieldBlock(Block):
 
     @property
     def vector(self) -> bool:
-        """True if the function has values in R^d."""
+        """Whether the function has values in R^d."""
         return np.ndim(self._one) > 2
 
     def variables(self, name: str) -> list[str]:
-        """Return the names of components: its own, or one for each direction of a vector."""
+        """Return the names of the components: the given name, or one for each axis of a vector."""
         axes = "xyz"[: self.field.mesh.dim()]
         return [f"{name}_{axis}" for axis in axes] if self.vector else [name]
 
     @property
     def bends(self) -> bool:
-        """True if the element provides second derivatives."""
+        """Whether the element provides second derivatives."""
         return self._one.hess is not None
 
     def local(self, measure: Measure) -> Local:
@@ -294,7 +294,7 @@ class FieldBlock(Block):
 
     @property
     def nodal(self) -> bool:
-        """True if coefficients are nodal values: elements of first order."""
+        """Whether coefficients are nodal values: elements of first order."""
         return is_nodal(self.field.element)
 
     def interpolate(self, value: Any) -> Array:
@@ -305,12 +305,11 @@ class FieldBlock(Block):
             except (TypeError, ValueError):
                 text = f"got {value!r}; expected a number, or a function of x."
                 raise SpaceError(text) from None
-            # The coefficients of a constant equal its value only for nodal elements: slopes are
-            # zero.
+            # Only for nodal elements, all coefficients of a constant equal its value.
             if level == 0.0 or self.nodal:
                 return np.full(self.size, level)
             value = lambda x: np.full(np.shape(x[0]), level)  # noqa: E731
-        if not isinstance(self.field.prior, Normal):  # a projection need not stay within the bounds
+        if not isinstance(self.field.prior, Normal):  # a projection could exceed the bounds
             return _values(value, self.doflocs)
         return self._projected(lambda at, piece: _values(value, piece.points))
 
@@ -322,7 +321,7 @@ class FieldBlock(Block):
     def project(self, values: Array) -> Array:
         """Return the coefficients of the L2 projection of a function.
 
-        `values` are at the quadrature points of `measure`, one or more per point.
+        `values`: values at the quadrature points of `measure`, one or several for each point.
         """
         grid = values.reshape(-1, *self.measure.shape)
         return self._projected(lambda at, piece: grid[:, at])
@@ -339,16 +338,16 @@ class FieldBlock(Block):
         return found
 
     def fitted(self, cells: IntArray) -> tuple[Array, Callable[[Array], Array]]:
-        """Return where to evaluate a function that is known in some cells, and its fit.
+        """Return evaluation points for a function on given cells, and its fit.
 
         Returns
         -------
         points
-            Shape (d, points): the nodes of an element of first order, else quadrature points.
+            Shape (d, points): nodes for an element of first order, otherwise quadrature points.
         fit
-            Function that returns coefficients of the cells, shape (size,), 0 elsewhere, from values
-            at the points, shape (components, points): at the nodes, else by the L2 projection on
-            the cells.
+            Function from values at the points, shape (components, points), to coefficients, shape
+            (size,), which are zero outside the cells: interpolation at the nodes, otherwise the L2
+            projection on the cells.
         """
         used = np.unique(self.element_dofs[:, cells])
         found = np.zeros(self.size)
@@ -373,7 +372,7 @@ class FieldBlock(Block):
         return measure.points.reshape(len(measure.points), -1), projected
 
     def _tested(self, measure: Measure, values: Callable[[slice, Measure], Array]) -> Array:
-        """Return the integrals of a function on a measure against all shape functions, (size,)."""
+        """Return the integrals of a function times each shape function on a measure, (size,)."""
         functional = np.zeros(self.size)
         for at, piece in measure.pieces():
             local = self.local(piece)
@@ -397,20 +396,20 @@ class FieldBlock(Block):
         return _factor(self._mass(self.measure))
 
     def _dofs_on(self, name: str, names: list[str] | None) -> IntArray:
-        """Return the coefficients on a boundary; names None: also those of derivatives."""
+        """Return the coefficients on a boundary with given names; None: all coefficients."""
         dofs = self.at(None if name == "boundary" else name, names)
         return np.unique(self._tied(dofs))
 
     def _values_on(self, name: str) -> IntArray:
         """Return the coefficients that an essential condition fixes.
 
-        Derivatives (u_x, u_n, ...) stay free unless the field is clamped.
+        Derivatives (u_x, u_n, ...) are free unless the field is clamped.
         """
         values = [n for n in (self.field.element.dofnames or []) if "_" not in n]
         return self._dofs_on(name, None if self.field.clamped else values)
 
     def _axes(self, where: str) -> list[int]:
-        """Return the axes whose component of a vector is a coefficient."""
+        """Return the axes for which the component of a vector is a coefficient."""
         names = self.field.element.dofnames or []
         axes = [k for k in range(3) if f"u^{k + 1}" in names]
         if not (self.vector and axes):
@@ -421,7 +420,7 @@ class FieldBlock(Block):
         return axes
 
     def _valued(self, name: str, value: Any) -> list[tuple[IntArray, Any]]:
-        """Return the Dirichlet conditions of a boundary, one per component of a vector."""
+        """Return the Dirichlet conditions on a boundary, possibly one for each component."""
         if not (isinstance(value, tuple) or (callable(value) and self.vector)):
             return [(self._values_on(name), value)]
         where = f"dirichlet: '{name}'"
@@ -440,7 +439,7 @@ class FieldBlock(Block):
         ]
 
     def _slope_dofs(self, name: str, axis: int) -> IntArray:
-        """Return the tangential-derivative coefficients on boundary sides parallel to an axis."""
+        """Return the coefficients of tangential derivatives on boundary sides along an axis."""
         if not isinstance(self.field.element, ElementQuadBFS):
             return np.zeros(0, dtype=np.int64)
         mesh = self.field.mesh
@@ -454,10 +453,10 @@ class FieldBlock(Block):
 
     @cached_property
     def conditions(self) -> tuple[tuple[IntArray, Any], ...]:
-        """Dirichlet conditions in the order given: (coefficients, value).
+        """Dirichlet conditions in the given order: (coefficients, value).
 
-        Bogner-Fox-Schmit functions need the tangential derivative of g at the vertices in addition
-        to its values, to interpolate g along the sides.
+        To interpolate g along the sides, Bogner-Fox-Schmit functions require the tangential
+        derivative of g at the vertices in addition to its values.
         """
         found: list[tuple[IntArray, Any]] = []
         for name, value in self.field.dirichlet.items():
@@ -482,7 +481,7 @@ class FieldBlock(Block):
         return np.unique(np.concatenate(parts)) if parts else np.zeros(0, dtype=np.int64)
 
     def impose(self, coefficients: Array, moment: Moment) -> Array:
-        """Return a copy of the coefficients with the Dirichlet values of this moment."""
+        """Return a copy of the coefficients with the Dirichlet values at a moment."""
         u = coefficients.copy()
         for dofs, value in self.conditions:
             if isinstance(value, Channel):
@@ -501,12 +500,12 @@ class FieldBlock(Block):
 
     def traces(self, value: Any, coefficients: Array) -> Iterator[tuple[str, Array]]:
         """Yield each channel of a Dirichlet condition, and the values of a function there."""
-        # A projection differs from the function of x that was given as `value` at the boundary.
+        # At the boundary, a projection differs from the given function of x.
         exact = callable(value) and not self.vector
         for k, (dofs, condition) in enumerate(self.conditions):
             if not isinstance(condition, Channel):
                 continue
-            # Where two boundaries meet, the value may be that of the other condition.
+            # Exclude coefficients that another condition also fixes, where two boundaries meet.
             others = [item for j, (item, _) in enumerate(self.conditions) if j != k]
             own = np.setdiff1d(dofs, np.concatenate([[], *others]))
             own = own if len(own) else dofs
@@ -514,7 +513,7 @@ class FieldBlock(Block):
             yield condition.name, value(x) + 0.0 * x[0] if exact else coefficients[own]
 
     def prolongation(self, finer: FieldBlock) -> sp.csr_array:
-        """Return the matrix from coefficients to those of the same function on a finer mesh.
+        """Return the matrix that maps coefficients to coefficients on a finer mesh.
 
         Raises
         ------
@@ -535,19 +534,19 @@ class FieldBlock(Block):
         return p.min(axis=1), p.max(axis=1)
 
     def contains(self, point: Array) -> bool:
-        """Return True if a point, shape (d,), lies in the mesh."""
+        """Return whether a point, shape (d,), is inside the mesh."""
         return self._located(point[:, None])[1] is None
 
     def widths(self, point: Array) -> Array:
-        """Return the widths along the axes of the cell at a point of the mesh, shape (d,)."""
+        """Return the widths along the axes of the cell that contains a point, shape (d,)."""
         (cell,), _ = self._located(point[:, None])
         mesh = self.field.mesh
         return np.asarray(np.ptp(mesh.p[:, mesh.t[:, cell]], axis=1))
 
     def _located(self, points: Array) -> tuple[IntArray, int | None]:
-        """Return the cell of each point, of shape (d, k), and the number of the first one outside.
+        """Return the cells of points of shape (d, k), and the index of the first point outside.
 
-        There are no cells if a point is outside, and no number if none is.
+        If a point is outside, there are no cells; otherwise the index is None.
         """
         low, high = (corner[:, None] for corner in self.box)
         slack, nowhere = 1e-12 * (high - low), np.zeros(0, dtype=np.int64)
@@ -565,24 +564,24 @@ class FieldBlock(Block):
     def _unnamed(self) -> Mesh:
         """The mesh without boundaries and subdomains.
 
-        To find a cell, scikit-fem makes triangles of quadrilaterals, and searches all of their
-        facets for each one of a boundary.
+        To find a cell, scikit-fem splits quadrilaterals into triangles, and then searches all
+        facets for each facet of a boundary.
         """
         return replace(self.field.mesh, _boundaries=None, _subdomains=None)
 
     def _cells(self, points: Array) -> IntArray:
         """Return the cell of each point, shape (k,); raise ValueError for a point outside."""
         mesh, whole = self._unnamed, Measure(self.field.mesh, 1)
-        if not whole.kept:  # scikit-fem keeps its search tree on the mesh, for good
+        if not whole.kept:  # scikit-fem would store its search tree on the mesh permanently
             mesh = copy(mesh)
         finder = mesh.element_finder(mapping=whole.mapping)
-        width = max(1, SEARCHED // mesh.nelements)  # points that may be sought in all cells
+        width = max(1, SEARCHED // mesh.nelements)  # number of points that are searched at once
         starts = range(0, points.shape[1], width)
         parts = [finder(*points[:, k : k + width]) for k in starts]
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
     def probe(self, points: Array, what: str = "point") -> sp.csr_array:
-        """Return the matrix of point evaluations at points of shape (d, k)."""
+        """Return the matrix that evaluates the function at points of shape (d, k)."""
         points = np.atleast_2d(np.asarray(points, dtype=float))
         low, high = self.box
         if points.shape[0] != len(low):
@@ -607,10 +606,10 @@ class FieldBlock(Block):
 
     @cached_property
     def at_vertices(self) -> sp.csr_array:
-        """Matrix of point evaluations at the vertices of the mesh."""
+        """Matrix that evaluates the function at the vertices of the mesh."""
         element, mesh = self.field.element, self.field.mesh
         names = element.dofnames or []
-        if element.nodal_dofs and names and names[0] == "u":  # a coefficient is the value there
+        if element.nodal_dofs and names and names[0] == "u":  # the first coefficient is the value
             dofs = self._tied(self.dofs.nodal_dofs[0])
             entries = (np.ones(len(dofs)), (np.arange(len(dofs)), dofs))
             return sp.csr_array(entries, shape=(len(dofs), self.size))
@@ -618,7 +617,7 @@ class FieldBlock(Block):
 
 
 def _component(g: Any, axis: int, count: int, where: str) -> Any:
-    """Return one component of boundary values g(x, t), which have a row for each, or one row."""
+    """Return a component of g(x, t); if g returns one row, it is the value of all components."""
 
     def component(x: Array, t: float) -> Any:
         values = g(x, t)
@@ -639,13 +638,13 @@ def _factor(mass: sp.csr_array) -> Factor:
 
 
 def _jet(function: DiscreteField, name: str) -> Any:
-    """Return a derivative of a function by name, None if the element lacks it."""
+    """Return a derivative of a function by name; None if the element does not provide it."""
     return np.asarray(function) if name == "value" else getattr(function, name)
 
 
 def _slope(g: Any, axis: int, width: float) -> Any:
     """Return the derivative of g(x, t) along an axis, by a sixth-order central difference."""
-    # The truncation error of sixth order is (1/100)^6 = 1e-12 for functions that the mesh resolves,
+    # For functions that the mesh resolves, the truncation error is (1/100)^6 = 1e-12, which is
     # about the rounding error of the difference.
     step = 0.01 * width
 
@@ -660,7 +659,7 @@ def _slope(g: Any, axis: int, width: float) -> Any:
 
 
 def base_name(name: str) -> str:
-    """Return the name of an unknown in forms, without its region: k for k[soil]."""
+    """Return the name of an unknown in forms, without its region: "k" for "k[soil]"."""
     return name.partition("[")[0]
 
 

@@ -1,8 +1,8 @@
 """Declarations of unknowns, and functions for weak forms: branches and upwinding.
 
-NumPy's abs of a complex number is its modulus, and max compares imaginary parts: both lose the
-derivative of a complex step. The functions here select the branch by the real part, so that the
-complex step differentiates that branch.
+NumPy's abs of a complex number is its modulus, and max also compares imaginary parts, so that both
+lose the derivative of a complex step. The functions here select the branch by the real part, and
+the complex step differentiates this branch.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from livepde.fem.sobolev import Sobolev
 from livepde.linalg import Array
 from livepde.showing import expression
 
-# Half width of the default trust region in prior standard deviations: a Gaussian value exceeds it
-# with a probability of 2e-23.
+# Half width of the default trust region in prior standard deviations: the probability that a
+# Gaussian value exceeds it is 2e-23.
 WITHIN = 10.0
 STANDARD = Normal()
-RADIAL = 2  # degree of the volume element where a coordinate is the distance from a point
+RADIAL = 2  # degree of the volume element in spherical coordinates, x[0]**2
 
 Integrand: TypeAlias = Callable[..., Any]
-"""A weak form's integrand; see `Model` for the arguments."""
+"""Integrand of a weak form; see `Model` for the arguments."""
 
 Source: TypeAlias = float | Callable[[Any, float], Any] | Mapping[str, Any]
-"""A source density: a number or f(x, t); for several components a mapping of names to those."""
+"""A source density: a number or f(x, t); for several components, a mapping from name to density."""
 
 Predicate: TypeAlias = Callable[[Array], Any]
 """A subset of the domain: x of shape (d, ...) -> booleans of shape (...)."""
@@ -44,7 +44,7 @@ Predicate: TypeAlias = Callable[[Array], Any]
 
 @dataclass(frozen=True)
 class Channel:
-    """A value supplied by the stream, identified by the name of its channel.
+    """A value from the stream, identified by the name of its channel.
 
     Examples
     --------
@@ -79,16 +79,16 @@ def placed(integrand: Integrand | On) -> tuple[Integrand, str | Measure | None]:
 
 
 def ignores(function: Any, position: int) -> bool:
-    """Return whether a function declares by the name `_` that it ignores an argument.
+    """Return whether a function ignores an argument, which it declares by the name `_`.
 
-    Probing could not tell: a term may use an argument only at some times.
+    Evaluation could not determine this, because a term may use an argument only at some times.
 
     >>> ignores(lambda u, v, x: -x.t * v, 0), ignores(lambda _, v, x: -x.t * v, 0)
     (False, True)
     """
     try:
         names = [*signature(function).parameters]
-    except (TypeError, ValueError):  # of a function that is not written in Python
+    except (TypeError, ValueError):  # the function is not written in Python
         return False
     return position < len(names) and names[position] == "_"
 
@@ -101,12 +101,12 @@ SIDES = (
 
 
 def with_sides(mesh: Any, regions: Mapping[str, Predicate] | None = None) -> Any:
-    """Return a mesh of an interval, rectangle or box with names for its sides, and of regions."""
+    """Return a mesh of an interval, rectangle or box with named sides and regions."""
     ends = list(zip(mesh.p.min(axis=1), mesh.p.max(axis=1), strict=True))
 
     def at(axis: int, end: float) -> Predicate:
-        # The slack is that of rounding: a share of the coordinate would take cells next to the end
-        # as well, where coordinates are large, as those of a map, or the mesh is small.
+        # The tolerance is at rounding level. A share of the coordinate would include other nodes if
+        # coordinates are large, as on a map, or if the mesh is small.
         low, high = ends[axis]
         slack = 1e-9 * (high - low) + 8 * float(np.finfo(float).eps) * max(abs(low), abs(high))
         return lambda p: np.abs(p[axis] - end) <= slack
@@ -137,10 +137,10 @@ def interval(
     regions
         Named subdomains, each a predicate on the midpoints of the elements.
     geometric
-        True for elements that grow by a constant ratio, as in radial problems; needs start > 0.
+        Whether elements grow by a constant ratio, as in radial problems; requires start > 0.
     through
-        Points that must be nodes of the mesh: the nearest inner node is moved to each, so that a
-        `Subdomain`, a layer or a sensor ends at a node.
+        Points that must be nodes of the mesh: the nearest inner node is moved to each point, so
+        that a `Subdomain` or a layer ends at a node, or a sensor is at a node.
 
     Examples
     --------
@@ -160,7 +160,7 @@ def interval(
 
 
 def _moved(nodes: Array, through: Sequence[float]) -> Array:
-    """Return the nodes with the nearest inner one moved to each of the points."""
+    """Return the nodes with the nearest inner node moved to each of the points."""
     moved = nodes.copy()
     nearest = [1 + int(np.abs(nodes[1:-1] - x).argmin()) if len(nodes) > 2 else 0 for x in through]
     inside = all(nodes[0] < x < nodes[-1] for x in through)
@@ -182,13 +182,13 @@ def line(nodes: Sequence[float]) -> MeshLine:
 
 
 def is_nodal(element: Element) -> bool:
-    """Return True if coefficients are values at nodes or in cells: elements of first order."""
+    """Return whether coefficients are values at vertices or in cells: elements of first order."""
     inner = element.facet_dofs + element.edge_dofs
     return not inner and element.nodal_dofs + element.interior_dofs == 1
 
 
 class _Declared:
-    """Common base of all declarations: prior, evolution, trust region."""
+    """Base class of all declarations: prior, evolution, trust region."""
 
     prior: Prior
     evolution: Evolution
@@ -196,7 +196,7 @@ class _Declared:
 
     @property
     def reach(self) -> float:
-        """Allowed distance of a latent value from its prior mean, in prior standard deviations."""
+        """Largest distance of a latent value from the prior mean, in prior standard deviations."""
         return np.inf if isinstance(self.evolution, RandomWalk) else self.within
 
     @property
@@ -215,15 +215,15 @@ class _Declared:
         return low, high
 
     def interval(self, value: Any, std: Any, level: float = 0.95) -> tuple[Array, Array]:
-        """Return the ends of the central interval that holds the unknown with probability `level`.
+        """Return the ends of the central interval with probability `level`.
 
-        Those of the prior's kind of distribution (`Prior.interval`) for estimates `value` with
-        standard deviations `std`, for a `LogNormal` and a `LogitNormal` also cut off at the ends of
-        the latent values (`within`).
+        `value` and `std` are estimates and their standard deviations. The ends follow from the kind
+        of distribution of the prior (`Prior.interval`). For `LogNormal` and `LogitNormal` they are
+        also clipped to the trust region (`within`).
         """
         low, high = self.prior.interval(value, std, level)
         if not isinstance(self.prior, Normal):
-            # A value beyond these ends, as another law may report, stays inside of its interval.
+            # Another law may report a value beyond the trust region; the interval must include it.
             value = np.asarray(value, dtype=float)
             least, largest = self._ends
             low = np.maximum(low, np.minimum(least, value))
@@ -248,7 +248,7 @@ class _Declared:
 
 
 def _expected(given: Any) -> str:
-    """Return what to write instead of something that is not a prior."""
+    """Return advice for an error message on a value that is not a prior."""
     number = f"{given}" if isinstance(given, int | float) else "mean"
     return f"write Normal({number}, std), or LogNormal or LogitNormal with a median and a std"
 
@@ -266,28 +266,28 @@ class Field(_Declared):
         Inner product of a parameter: "L2", "H1", "H2", a `Sobolev(s, length)` for H^s of any order,
         or a symmetric bilinear form (u, v, x).
     dirichlet
-        Essential boundary values: name of a boundary ("boundary" for all of it) -> a number, a
-        function g(x, t), or a `Channel` of the stream. For a parameter only 0 (H^1_0). For a vector
-        these hold for all components; a sequence has one of them for each component, None where it
-        is free, and g may return one array for each.
+        Essential boundary values: name of a boundary ("boundary" for the whole boundary) -> a
+        number, a function g(x, t), or a `Channel` of the stream. A parameter admits only 0 (H^1_0).
+        In a vector field the value is for all components, and g may return one array for each; a
+        sequence has one value for each component, None if it is free.
     clamped
-        True: all coefficients on the boundaries of `dirichlet` are zero, including slopes. False:
-        only the values are prescribed.
+        Whether all coefficients on the boundaries of `dirichlet` are zero, including slopes.
+        Otherwise only values are prescribed.
     prior
         Prior of a parameter: the inner product is divided by std**2, so that the prior covariance
-        is the inverse Gram matrix. A `Normal` has no bounds here; a `LogNormal` or `LogitNormal`
-        needs an element of first order, as it holds at each node.
+        is the inverse Gram matrix. A `Normal` must not have bounds. A `LogNormal` or `LogitNormal`
+        requires an element of first order, because it applies to values at nodes.
     evolution, within
-        As for `Scalar`.
+        See `Scalar`.
     unit, name
-        For tables and plots.
+        Unit and name in tables and plots.
     periodic
         Pairs of boundaries of equal shape, as in (("left", "right"),), whose coefficients are
         identified.
     weight
-        Volume element of the coordinates of a state: `lambda x: x[0]` where x[0] is the distance
-        from an axis, its square where it is that from a point. All integrals have this factor,
-        those over a boundary, too: forms, means over regions and functionals are written without
+        Volume element of the coordinates of a state: `lambda x: x[0]` if x[0] is the distance from
+        an axis, its square if it is the distance from a point. All integrals have this factor,
+        including boundary integrals. Forms, means over regions and functionals are written without
         it, as in Cartesian coordinates.
 
     Examples
@@ -316,7 +316,7 @@ class Field(_Declared):
 
     @property
     def order(self) -> int:
-        """Quadrature order of a product of two such functions with the volume element."""
+        """Quadrature order for a product of two such functions with the volume element."""
         if self.quadrature is not None:
             return self.quadrature
         return 2 * int(self.element.maxdeg) + (0 if self.weight is unweighted else RADIAL)
@@ -350,8 +350,7 @@ class Field(_Declared):
             )
         known = set(self.mesh.boundaries or {}) | {"boundary"}
         self._check_dirichlet(known)
-        # Arrays are stored as tuples, because the equality of frozen dataclasses would compare them
-        # entry by entry.
+        # Arrays are stored as tuples, because comparison of arrays is elementwise.
         given: Mapping[str, Any] = self.dirichlet
         plain = {name: v if _is_plain(v) else tuple(v) for name, v in given.items()}
         object.__setattr__(self, "dirichlet", plain)
@@ -389,7 +388,7 @@ class Field(_Declared):
                 )
 
     def _check_pointwise(self) -> None:
-        # A bound on q(x) holds everywhere only if the coefficients are the values at the nodes.
+        # A bound on q(x) holds everywhere only if coefficients are values at nodes.
         if isinstance(self.prior, Normal):
             if not self.prior.symmetric:
                 raise SpaceError("Field: bounds need a LogNormal or LogitNormal, which keeps them.")
@@ -401,18 +400,18 @@ class Field(_Declared):
 
 
 def _is_plain(value: Any) -> bool:
-    """Return True if a boundary value is not a sequence with one value per component."""
+    """Return whether a boundary value is a single value instead of one for each component."""
     return callable(value) or isinstance(value, Channel | _Declared | Prior) or np.ndim(value) == 0
 
 
 def _each_value(value: Any) -> Sequence[Any]:
-    """Return the individual values of a boundary value."""
+    """Return the given values of a boundary, without None."""
     return [value] if _is_plain(value) else [item for item in value if item is not None]
 
 
 @dataclass(frozen=True, eq=False)
 class Scalar(_Declared):
-    """One unknown number; a prior alone means the same, without options.
+    """One unknown number. A prior alone is equivalent, with default options.
 
     Parameters
     ----------
@@ -422,13 +421,13 @@ class Scalar(_Declared):
         Model of the change in time: `RandomWalk`, `MeanReverting`, `Periodic`; default constant.
     within
         Trust region of the sensitivity law: maximum distance of the latent value (q itself, its
-        logarithm or its logit) from the prior mean, in prior standard deviations. Neither the
-        linearisation point nor the reported estimate goes beyond it, and the note "bounded" counts
-        the values held there. inf: no limit. A `RandomWalk` has none, since its prior says nothing
-        about later values.
+        logarithm or its logit) from the prior mean, in prior standard deviations. It limits the
+        linearisation point and the reported estimate, and the note "bounded" counts the values at
+        the limit. inf: no limit. A `RandomWalk` has no limit, because its prior does not apply to
+        later values.
     corrects
-        True for a correction of an input, as an offset of a boundary value. As for those of
-        sensors, how well it is known does not change the level of a verdict.
+        Whether it is a correction of an input, such as an offset of a boundary value. Its
+        uncertainty does not affect the level of a verdict, as with sensor errors.
 
     Examples
     --------
@@ -449,18 +448,18 @@ class Scalar(_Declared):
 
 @dataclass(frozen=True, eq=False)
 class Piecewise(_Declared):
-    """One unknown number for each named region, with a common prior or its own.
+    """One unknown number for each named region, with common or separate priors.
 
     Parameters
     ----------
     regions
-        Name -> predicate on x, or the name of a subdomain of the mesh. A point in no region sees
-        the value zero; in two regions, the sum.
+        Name -> predicate on x, or the name of a subdomain of the mesh. The value is zero at a point
+        in no region, and the sum at a point in several regions.
     prior, unit, evolution, within
-        As for `Scalar`.
+        See `Scalar`.
     own
-        Name of a region -> prior of a constant that holds there instead, or a `Scalar` with prior,
-        evolution and within. The unknown then needs a name: parameter={"k": Piecewise(...)}.
+        Name of a region -> separate prior of a constant there, or a `Scalar` with prior, evolution
+        and within. The unknown then requires a name: parameter={"k": Piecewise(...)}.
 
     Examples
     --------
@@ -490,7 +489,7 @@ class Piecewise(_Declared):
         self._check()
 
     def separated(self, name: str) -> dict[str, Piecewise]:
-        """Return an unknown for each region, as "k[soil]"; this one itself if all share a prior."""
+        """Return name -> unknown for each region, such as "k[soil]"; itself with a common prior."""
         if not self.own:
             return {name: self}
         found = {}
@@ -507,7 +506,7 @@ class Piecewise(_Declared):
 class Scalars(_Declared):
     """One unknown number for each name, with a common prior, such as an offset of each sensor.
 
-    Forms and sensors see a mapping, q.offset["T_10"]. The other options are those of `Scalar`.
+    In forms and sensors it is a mapping, q.offset["T_10"]. See `Scalar` for other options.
 
     Examples
     --------
@@ -532,11 +531,11 @@ Declaration: TypeAlias = Field | Scalar | Piecewise | Scalars
 """An unknown with its options."""
 
 Unknown: TypeAlias = Declaration | Prior
-"""Types that a model accepts as an unknown; a prior alone is that of one number."""
+"""Types that a model accepts as an unknown; a prior alone declares one number."""
 
 
 def declared(unknown: Unknown) -> Declaration:
-    """Return an unknown with its options: the defaults of `Scalar` for a prior alone."""
+    """Return an unknown with its options; a prior alone becomes a `Scalar` with defaults."""
     if isinstance(unknown, Prior):
         return Scalar(unknown)
     if not isinstance(unknown, Declaration):
@@ -548,12 +547,12 @@ def declared(unknown: Unknown) -> Declaration:
 
 
 SERIES = (1 / 3, -1 / 45, 2 / 945, -1 / 4725, 2 / 93555, -1382 / 638512875)
-# Square of the Peclet number below which the truncated series is exact to rounding.
+# Square of the Peclet number below which the truncated series is exact up to rounding.
 SMALL = 0.01
 
 
 def absolute(a: Any) -> Any:
-    """Return |a|; its derivative is the sign of a."""
+    """Return |a|, with the sign of a as its derivative."""
     a = np.asarray(a)
     return np.where(a.real < 0.0, -a, a)
 
@@ -578,15 +577,15 @@ def positive(a: Any) -> Any:
 def upwind(b: Any, kappa: Any, h: Any) -> Any:
     """Return the optimal artificial diffusion, |b| h/2 (coth Pe - 1/Pe) with Pe = |b| h/(2 kappa).
 
-    Added to kappa, it makes elements of first order on a uniform line exact at the vertices for
-    the steady -kappa u'' + b u' = 0, however large the cell Peclet number Pe (Brooks and Hughes
-    1982, section 2); it vanishes like h^2 on fine meshes. In more dimensions it acts along
-    the streamlines only. Smooth also at b = 0, so that derivatives by complex steps hold.
+    If it is added to kappa, elements of first order on a uniform interval are exact at the vertices
+    for the steady -kappa u'' + b u' = 0 with any cell Peclet number Pe (Brooks and Hughes 1982,
+    section 2). It vanishes like h^2 on fine meshes. In more dimensions it acts only along
+    streamlines. It is smooth also at b = 0, so that complex steps are valid.
 
     Parameters
     ----------
     b
-        Velocity: a number or array in 1D, else a tuple or list of d components.
+        Velocity: a number or array in 1D, otherwise a tuple or list of d components.
     kappa
         Diffusivity, positive.
     h
@@ -594,7 +593,7 @@ def upwind(b: Any, kappa: Any, h: Any) -> Any:
 
     Returns
     -------
-    A number for each point in 1D, else the tensor b b^T/|b|^2 times it, shape (d, d, ...).
+    A number for each point in 1D, otherwise its product with b b^T/|b|^2, shape (d, d, ...).
 
     Examples
     --------

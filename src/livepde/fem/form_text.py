@@ -10,12 +10,12 @@ from livepde.showing import expression
 
 
 def no_term(u: Any, v: Any, x: Any) -> Any:
-    """A form that is zero."""
+    """The zero form."""
     return 0.0 * x[0]
 
 
 def terms_text(given: Any) -> list[str]:
-    """Return the terms of a form as code."""
+    """Return the terms of a form as source code."""
     terms = given if isinstance(given, Sequence) else [given]
     return [
         f"{terms_text(one.form)[0]} on {one.name!r}" if isinstance(one, On) else expression(one)

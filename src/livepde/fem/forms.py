@@ -1,19 +1,19 @@
 """Weak forms: evaluation, differentiation and assembly of integrands.
 
 A form is a scalar functional of several functions, `integral of a(q, u, v, x)`. Each function is
-evaluated with the shape functions of *its own* space, so exchanging two spaces of equal size cannot
-pass unnoticed (fact 9 of the design). All that a law needs of a form is a first derivative
-(`vector`) or a mixed second derivative (`data`) of that functional:
+evaluated with the shape functions of *its own* space, so that exchanged spaces of equal size do not
+go unnoticed. Laws only require a first derivative (`vector`) or a mixed second derivative (`data`)
+of this functional:
 
     A(u) q          = vector("v", q=q, u=u)
-    A(u)            = data("v", "q", u=u)          its transpose is the same numbers: exact
+    A(u)            = data("v", "q", u=u)          its transpose has the same data: exact
     d(A(u) q)/du    = data("v", "u", q=q, u=u)
     d(A(u)^T r)/du  = data("q", "u", u=u, v=r)
 
-Arguments in which the form is linear are replaced by unit jets; derivatives in the others are taken
-by a complex step at the quadrature points, exact to rounding, without an automatic differentiation
-library, and only as good as the integrand is analytic: abs, max or comparison of u need a form of
-the derivative from the user, and `check_model` tells when one is missing.
+Arguments in which the form is linear are replaced by unit jets. Derivatives in other arguments use
+a complex step at the quadrature points. It is exact up to rounding if the integrand is analytic,
+and requires no library for automatic differentiation. For abs, max or comparison of u, the user
+provides a form of the derivative; `check_model` reports if it is missing.
 """
 
 from __future__ import annotations
@@ -37,29 +37,29 @@ from livepde.linalg import Array, IntArray, Pattern
 
 Tensor: TypeAlias = sp.csr_array | ElementTensor
 
-# Complex step: its square is below rounding of any value, and no difference cancels digits.
+# Complex step: its square is below the rounding error of any value, and no digits are cancelled.
 STEP = 1e-30
-# Relative magnitude, compared with the largest value or the prior standard deviation of a
-# component, below which a value does not define the scale of a difference.
+# Magnitude below which a value is not the scale of a difference, relative to the largest value or
+# the prior standard deviation of its component.
 SMALL = 1e-3
-# Relative step of a central difference of fourth order: its truncation and rounding errors are
-# about 1e-13.
+# Relative step of a central difference of fourth order: truncation and rounding errors are about
+# 1e-13.
 SHIFT = 1e-3
-# Sizes of random arguments with which an integrand is probed: up to 1e9, so that saturation and
-# thresholds far from one are detected; and times, since a term may act for a while only.
+# Sizes of random arguments for tests of an integrand, up to 1e9 to detect saturation and thresholds
+# far from one; and times for these tests, because a term may act only temporarily.
 MAGNITUDES = (1e-3, 1.0, 1e3, 1e6, 1e9)
 PROBED = (0.0, 0.3, 1.0, 1e3, 1e6)
-# Number of products of local functions up to which a trilinear form is stored as a sparse matrix.
-# Beyond, element tensors need less memory.
+# Largest number of products of local functions for which a trilinear form is stored as a sparse
+# matrix. Beyond, element tensors require less memory.
 LARGEST_TENSOR = 5_000_000
-FEW = 12  # unknown numbers for which a form that is not linear in them is fixed once
+FEW = 12  # most unknown numbers for which a form that is nonlinear in them is cached for fixed q
 
 
 @dataclass(frozen=True, eq=False)
 class _Term:
     """One integrand on one measure, with the local space of every argument.
 
-    `derivative` is the integrand of its derivative in the nonlinear argument, if it is given.
+    `derivative`: integrand of the derivative in the nonlinear argument, or None.
     """
 
     integrand: Integrand
@@ -69,12 +69,12 @@ class _Term:
 
     @cached_property
     def spaces(self) -> dict[str, LocalSpace]:
-        """Local space of each argument; one object for arguments of the same space."""
+        """Local space of each argument; arguments of the same space share one object."""
         found = {id(space): space.local(self.measure) for space in self.over.values()}
         return {key: found[id(space)] for key, space in self.over.items()}
 
     def pieces(self) -> Iterator[tuple[slice, _Term]]:
-        """Yield (slice of elements, term on them), small enough to be evaluated at once."""
+        """Yield (slice of elements, term on them), small enough to evaluate at once."""
         if self.measure.kept:
             yield slice(0, self.measure.shape[0]), self
             return
@@ -82,7 +82,7 @@ class _Term:
             yield at, replace(self, measure=piece)
 
     def samples(self) -> Iterator[_Term]:
-        """Yield the term at one or all points of every element, to probe the integrand."""
+        """Yield the term at one or all points of every element, for tests of the integrand."""
         thin = (
             self if self.measure.kept else replace(self, measure=replace(self.measure, thin=True))
         )
@@ -90,7 +90,7 @@ class _Term:
             yield piece
 
     def drawn(self, rng: np.random.Generator) -> dict[str, Array]:
-        """Return random component values of each argument at all points."""
+        """Return argument -> random component values at all points."""
         return {
             key: rng.standard_normal((local.components, *local.shape))
             for key, local in self.spaces.items()
@@ -109,11 +109,11 @@ class _Term:
 
 
 class FormMatrices(ABC):
-    """Abstract source of matrices of mixed derivatives with fixed sparsity."""
+    """Abstract class of matrices of mixed derivatives with fixed sparsity."""
 
     @abstractmethod
     def pattern(self, rows: str, cols: str) -> Pattern:
-        """Return the sparsity of the matrices `data(rows, cols)`."""
+        """Return the sparsity pattern of the matrices `data(rows, cols)`."""
 
     @abstractmethod
     def data(self, rows: str, cols: str, moment: Moment = START, **coefficients: Array) -> Array:
@@ -141,21 +141,21 @@ class Form(FormMatrices):
     name
         Letter for messages: A, B, M, ...
     integrands
-        One integrand or several; an `On` restricts one to a boundary or subdomain. Each is called
-        with one jet per argument, in the order of `spaces`, and the place x.
+        One or several integrands; `On` restricts an integrand to a boundary or subdomain. Each is
+        called with one jet per argument, in the order of `spaces`, and the place x.
     spaces
         Mapping from argument to function space.
     order
         Quadrature order.
     nonlinear
-        The argument in which the form need not be linear, u.
+        The argument u, in which the form may be nonlinear.
     parameter
-        The argument q, in which the form may be nonlinear; determined by probing.
+        The argument q; a numerical test determines whether the form is linear in it.
     derivative
-        Optional integrand of the derivative in the nonlinear argument: the same arguments, with
-        the direction behind that argument, as in dB(u, du, v, x).
+        Optional integrand of the derivative in the nonlinear argument. The direction follows this
+        argument, as in dB(u, du, v, x).
     inputs
-        Names of the input channels that integrands may read.
+        Names of the input channels that integrands may use.
     """
 
     def __init__(
@@ -188,7 +188,7 @@ class Form(FormMatrices):
             self.terms.append(_Term(integrand, at, self.spaces, one))
         self._inputs = Inputs(dict.fromkeys(inputs, 1.0))
         self._forget()
-        self._moving: list[bool] = []  # terms that read time or inputs, and the nonlinear argument
+        self._moving: list[bool] = []  # whether a term uses time or inputs, and the state
         self.uses: frozenset[str] = self._probe()
         for slot in self.spaces:
             if slot not in (nonlinear, parameter):
@@ -205,10 +205,10 @@ class Form(FormMatrices):
         self._about: FormAbout | None = None
 
     def on(self, cells: IntArray) -> Form:
-        """Return the form integrated over some cells of the mesh, and over their facets.
+        """Return the form restricted to given cells of the mesh, and to their facets.
 
-        Terms without such cells are omitted. The coefficients are those of the whole mesh; the
-        patterns contain only the couplings of these cells.
+        Terms without such cells are omitted. Coefficients refer to the whole mesh; patterns contain
+        only the couplings of these cells.
         """
         part = copy(self)
         terms = [replace(term, measure=term.measure.on(cells)) for term in self.terms]
@@ -217,13 +217,13 @@ class Form(FormMatrices):
         return part
 
     def _probe(self) -> frozenset[str]:
-        """Evaluate once, to find errors early, and return the names of time and inputs it reads."""
+        """Evaluate once, to detect errors early; return which of "t" and "inputs" are used."""
         rng = np.random.default_rng(0)
         used: set[str] = set()
         for term in self.terms:
             read = set().union(*(self._read(piece, rng) for piece in term.samples()))
             used |= read
-            # A term that ignores the nonlinear argument does not move its derivative.
+            # A term that ignores the nonlinear argument does not affect the derivative in it.
             moves = self.nonlinear is not None and not ignores(
                 term.integrand, list(self.spaces).index(self.nonlinear)
             )
@@ -231,7 +231,7 @@ class Form(FormMatrices):
         return frozenset(used)
 
     def _read(self, term: _Term, rng: np.random.Generator) -> set[str]:
-        """Evaluate a term at random values and return the names of time and inputs it reads."""
+        """Evaluate a term at random values; return which of "t" and "inputs" it uses."""
         try:
             with np.errstate(all="ignore"):  # roots and logarithms of random numbers
                 density, place = term.evaluate(term.drawn(rng), Moment(0.0, self._inputs))
@@ -252,7 +252,7 @@ class Form(FormMatrices):
         return place.used
 
     def _check_linear(self, slot: str) -> None:
-        """Refuse a term that is not linear in an argument: one without the test function, say."""
+        """Raise an error if a term is not linear in an argument, such as the test function."""
         rng = np.random.default_rng(3)
         for number, whole in enumerate(self.terms):
             for term in whole.samples():
@@ -262,7 +262,7 @@ class Form(FormMatrices):
                 with np.errstate(all="ignore"):  # roots and logarithms of random numbers
                     parts = at(one), at(other), at(one + other)
                     size = np.abs(parts[0]) + np.abs(parts[1]) + np.abs(parts[2])
-                    wrong = np.abs(parts[2] - parts[0] - parts[1]) > 1e-9 * size  # not of NaN
+                    wrong = np.abs(parts[2] - parts[0] - parts[1]) > 1e-9 * size  # false for NaN
                     if not wrong.any():
                         continue
                     lacks = np.abs(at(np.zeros_like(one)))[wrong].any()
@@ -280,9 +280,9 @@ class Form(FormMatrices):
     def factor(self, of: int, tested: int, u: float, **coefficients: Array) -> Array:
         """Return the factor of component `of` of u and `tested` of v, at points of all elements.
 
-        Of the terms on the whole mesh, where the fields of the state have the value u and all their
-        derivatives are zero; `coefficients` are of the other arguments. Components are those of
-        `LocalSpace.owners`.
+        It is the factor in terms on the whole mesh if the fields of the state have the value u and
+        zero derivatives. `coefficients` are for the other arguments. See `LocalSpace.owners` for
+        components.
         """
         moment, total = Moment(0.3, self._inputs), np.zeros(1)
         for whole in (term for term in self.terms if term.measure.name is None):
@@ -293,7 +293,7 @@ class Form(FormMatrices):
                 level, raised, test = local.zeros(), local.zeros(), local.zeros()
                 level[~local.derivatives] = u
                 raised[of] = test[tested] = 1.0
-                with np.errstate(all="ignore"):  # a root of u, say
+                with np.errstate(all="ignore"):  # such as a root of u
                     steep, flat = (
                         term.evaluate(
                             {key: {**given, "u": at, "v": test}[key] for key in self.spaces}, moment
@@ -306,29 +306,29 @@ class Form(FormMatrices):
 
     @property
     def constant(self) -> bool:
-        """True if the form reads neither time nor inputs."""
+        """Whether the form uses neither time nor inputs."""
         return not self.uses
 
     @property
     def steady(self) -> bool:
-        """True if the derivative in the nonlinear argument reads neither time nor inputs."""
+        """Whether the derivative in the nonlinear argument uses neither time nor inputs."""
         return not any(self._moving)
 
     @cached_property
     def affine(self) -> bool:
-        """True if the form is affine in its nonlinear argument (probed at several magnitudes)."""
+        """Whether the form is affine in its nonlinear argument (tested at several magnitudes)."""
         return self.nonlinear is None or self._affine(self.nonlinear, homogeneous=False)
 
     @cached_property
     def affine_in_parameter(self) -> bool:
-        """True if the form is linear in the parameter but for a part without it (probed alike)."""
+        """Whether the form is affine in the parameter (tested at several magnitudes)."""
         if self.linear_in_parameter or self.parameter is None:
             return True
         return self._affine(self.parameter, homogeneous=False)
 
     def _affine(self, slot: str, homogeneous: bool) -> bool:
-        """Return True if the form is affine (linear, if homogeneous) in an argument."""
-        # With a fixed seed: whether a form counts as affine must not differ between two runs.
+        """Return whether the form is affine (linear, if homogeneous) in an argument."""
+        # The fixed seed makes the result reproducible between runs.
         rng = np.random.default_rng(1)
         for term in (piece for whole in self.terms for piece in whole.samples()):
             values = term.drawn(rng)
@@ -340,19 +340,19 @@ class Form(FormMatrices):
                     change = at(a + b) - at(a) - at(b) + (0 * zero if homogeneous else zero)
                     sizes = np.abs(np.concatenate([at(a).ravel(), at(b).ravel()]))
                     size = max(sizes[np.isfinite(sizes)].max(initial=0.0), 1e-300)
-                # Points at which the form is not finite (the root of a negative number) are not
-                # informative.
+                # Points at which the form is not finite, such as a root of a negative number, are
+                # not informative.
                 finite = np.isfinite(change)
                 if not finite.any() or np.abs(change[finite]).max() > 1e-11 * size:
                     return False
         return True
 
     def differentiates(self, slot: str, test: str = "v") -> bool:
-        """Return True if, integrated by parts, a form contains derivatives of an argument.
+        """Return whether the form contains derivatives of an argument after integration by parts.
 
-        Its integrand then reads a derivative of the argument, or the argument itself in a term with
-        a derivative of the test function, such as the flux q u in `q * u * grad(v)`. Probed at
-        several magnitudes and times, with value and derivatives independent of each other.
+        Its integrand then uses a derivative of the argument, or the argument itself in a term with
+        a derivative of the test function, such as the flux q u in `q * u * grad(v)`. This is tested
+        at several magnitudes and times, with independent values and derivatives.
         """
         rng = np.random.default_rng(2)
         return any(
@@ -365,7 +365,7 @@ class Form(FormMatrices):
     def _reads(
         self, term: _Term, slot: str, test: str, scale: float, rng: np.random.Generator
     ) -> bool:
-        """Return True if derivatives of an argument matter at one magnitude."""
+        """Return whether derivatives of an argument affect a term at one magnitude."""
         values = term.drawn(rng)
         here, there = scale * values[slot], scale * rng.standard_normal(values[slot].shape)
         steep = np.where(term.spaces[slot].derivatives[:, None, None], there, here)
@@ -375,7 +375,7 @@ class Form(FormMatrices):
             moment = Moment(t, self._inputs)
             pair = ({**values, slot: u, test: v} for u in (one, other))
             change = np.subtract(*(term.evaluate(given, moment)[0] for given in pair))
-            return bool(change[np.isfinite(change)].any())  # elsewhere is nothing to compare
+            return bool(change[np.isfinite(change)].any())  # other points are not informative
 
         with np.errstate(all="ignore"):  # roots and logarithms of random numbers
             return any(
@@ -384,7 +384,7 @@ class Form(FormMatrices):
 
     @property
     def _trilinear(self) -> bool:
-        """True if the form is constant, affine in u and linear in all other arguments."""
+        """Whether the form is constant, affine in u and linear in all other arguments."""
         return self.constant and self.linear_in_parameter and self.affine
 
     def vector(self, slot: str, moment: Moment = START, **coefficients: Array) -> Array:
@@ -400,7 +400,7 @@ class Form(FormMatrices):
         return self.product(slot, linear, coefficients[linear], moment, **rest)
 
     def _affine_part(self, slot: str, other: str) -> tuple[sp.csr_array, Array]:
-        """Return the slope and the offset of an affine form of one argument, cached."""
+        """Return the slope and the offset of an affine form of one argument; they are cached."""
         if (slot, other) not in self._affine_parts:
             zero = {key: np.zeros(space.dim) for key, space in self.spaces.items()}
             offset = self.traced(slot, START, **zero)[0]
@@ -410,10 +410,9 @@ class Form(FormMatrices):
     def traced(
         self, slot: str, moment: Moment = START, **coefficients: Array
     ) -> tuple[Array, frozenset[str]]:
-        """Return `vector` by quadrature, with the names of time and inputs that were read.
+        """Return `vector` by quadrature, and which of "t" and "inputs" were used.
 
-        The result is reusable as long as the values of these names are the same, on any branch of
-        the integrand.
+        The result can be reused while their values are unchanged, on any branch of the integrand.
         """
         read: set[str] = set()
         result = np.zeros(self.spaces[slot].dim)
@@ -443,8 +442,8 @@ class Form(FormMatrices):
     def data(self, rows: str, cols: str, moment: Moment = START, **coefficients: Array) -> Array:
         """Return the mixed derivative in `rows` and `cols`, as data of `pattern(rows, cols)`.
 
-        For rows = cols it is the second derivative in one argument. Constant bilinear forms are
-        assembled once; constant trilinear ones become one sparse product with the third
+        For rows = cols, it is the second derivative in one argument. Constant bilinear forms are
+        assembled once; for constant trilinear forms, the data are a sparse product with the third
         coefficients.
         """
         if rows == cols and rows not in self._curved:
@@ -454,8 +453,8 @@ class Form(FormMatrices):
             if not others:
                 return self._constant(rows, cols)
             if len(others) == 1:
-                # A constant trilinear form needs no quadrature in a step: its matrix is linear in
-                # the third coefficients.
+                # A constant trilinear form requires no quadrature in a step, because its matrix is
+                # linear in the third coefficients.
                 product: Array = self._tensor(rows, cols, others[0]) @ coefficients[others[0]]
                 if others[0] == self.nonlinear:
                     product += self._constant(rows, cols)
@@ -464,17 +463,17 @@ class Form(FormMatrices):
 
     @cached_property
     def fixed_by_numbers(self) -> bool:
-        """True if a constant form is affine in u as soon as a few unknown numbers are given."""
+        """Whether the form is constant and affine in u for fixed values of a few unknowns."""
         few = self.parameter is not None and self.spaces[self.parameter].dim <= FEW
         curved = few and not self.linear_in_parameter and self._stores_products
         return curved and self.constant and self.affine
 
     def about(self, q: Array) -> FormAbout:
-        """Return the form about few numbers, cached for the last q; see `fixed_by_numbers`.
+        """Return the form for fixed q, cached for the last q; see `fixed_by_numbers`.
 
-        A process takes many steps with the same numbers, and would integrate the form in each.
+        Many steps have the same q, and each would otherwise integrate the form.
         """
-        kept = self._about  # read once: copies of an identifier may step in other threads
+        kept = self._about  # read only once: copies of an identifier may step in other threads
         if kept is None or not np.array_equal(kept.q, q):
             self._about = kept = FormAbout(self, q.copy())
         return kept
@@ -517,10 +516,10 @@ class Form(FormMatrices):
     ) -> Array:
         """Return the integrand's derivative in `rows`, `cols`: (components, components, E, P).
 
-        By unit jets in arguments in which the form is linear, and a complex step in a nonlinear
-        one. If both are nonlinear (only Jacobians of iterations need this), by a central difference
-        of complex steps, in the argument in which the form is affine if there is one: then it is
-        exact.
+        It uses unit jets in arguments in which the form is linear, and a complex step in a
+        nonlinear argument. If both are nonlinear, which only Jacobians of iterations require, it is
+        a central difference of complex steps. The difference is exact if the form is affine in its
+        argument, which is chosen accordingly.
         """
         place = term.measure.place(moment)
         given = term.derivative if self.nonlinear in (rows, cols) else None
@@ -553,7 +552,7 @@ class Form(FormMatrices):
         key = (rows, cols)[shifted]
         local = term.spaces[key]
         here = local.values(coefficients[key]) if key in coefficients else local.zeros()
-        # Fourth order in SHIFT: each complex step is exact to rounding, so few digits are lost.
+        # Fourth order in SHIFT. Complex steps are exact up to rounding, so few digits are lost.
         near = evaluate(SHIFT) - evaluate(-SHIFT)
         far = evaluate(2.0 * SHIFT) - evaluate(-2.0 * SHIFT)
         difference = (8.0 * near - far) / (12.0 * SHIFT)
@@ -562,8 +561,8 @@ class Form(FormMatrices):
     def _differenced(
         self, rows: str, cols: str, given: Integrand | None
     ) -> tuple[int | None, int | None]:
-        """Return the axis of the complex step and that of the central difference, 0: rows."""
-        # The user's derivative takes the place of the complex step in the nonlinear argument.
+        """Return the axes of the complex step and of the central difference; 0 for rows."""
+        # The user's derivative replaces the complex step in the nonlinear argument.
         curved = [
             axis
             for axis, key in enumerate((rows, cols))
@@ -574,9 +573,9 @@ class Form(FormMatrices):
         return (curved[-1] if curved else None), (curved[0] if len(curved) == 2 else None)
 
     def _scale(self, key: str, local: LocalSpace, values: Array) -> Array:
-        """Return the step scale of each component at each point: (components, 1, 1, E, P).
+        """Return the scale of the step for each component and point: (components, 1, 1, E, P).
 
-        It is bounded from below, for the parameter by its prior standard deviation.
+        It is bounded from below; for the parameter, the prior standard deviation contributes.
         """
         size = np.abs(values)
         whole = size.max(axis=(1, 2), keepdims=True)
@@ -589,7 +588,7 @@ class Form(FormMatrices):
         return np.where(size > SMALL * whole, size, whole)[:, None, None]
 
     def _constant(self, rows: str, cols: str) -> Array:
-        """Return data(rows, cols) of an affine form at zero, cached."""
+        """Return data(rows, cols) of an affine form at zero, which are cached."""
         if (rows, cols) not in self._constants:
             data = self._quadrature(rows, cols, START, {}, keep=False)
             self._constants[rows, cols] = data if data.any() else np.broadcast_to(0.0, data.shape)
@@ -598,8 +597,8 @@ class Form(FormMatrices):
     def tensor(self, rows: str, cols: str) -> Tensor | None:
         """Return T with data(rows, cols) = T @ (coefficients of the third argument).
 
-        A sparse matrix, or for large meshes an `ElementTensor`. None unless the form is trilinear
-        and constant.
+        T is a sparse matrix, or an `ElementTensor` for large meshes. It is None unless the form is
+        trilinear and constant.
         """
         (third,) = [key for key in self.spaces if key not in (rows, cols)]
         if not self._trilinear:
@@ -610,7 +609,7 @@ class Form(FormMatrices):
 
     @property
     def _stores_products(self) -> bool:
-        """True if the products of local functions are few enough for a sparse matrix."""
+        """Whether the products of local functions are few enough for a sparse matrix."""
         sizes = [
             int(np.prod([len(space.dofs_on(term.measure)) for space in term.over.values()]))
             * term.measure.shape[0]
@@ -654,7 +653,7 @@ class Form(FormMatrices):
     def _trilinear_parts(
         self, whole: _Term, first: str, second: str, third: str, *, q: Array | None = None
     ) -> Iterator[tuple[slice, Array]]:
-        """Yield the integrals over elements of products of local functions, (i, j, n, E), at q."""
+        """Yield elements and integrals of triples of local functions, (i, j, n, E), about q."""
         axes = {first: 0, second: 1, third: 2}
         for at, term in whole.pieces():
             values = {key: local.units(axes[key], 3) for key, local in term.spaces.items()}
@@ -672,14 +671,14 @@ class Form(FormMatrices):
 
 @dataclass(frozen=True, eq=False)
 class FormAbout:
-    """A form A(q, u, v) about few numbers q, affine in u."""
+    """A form A(q, u, v) for fixed numbers q, affine in u."""
 
     form: Form
     q: Array
 
     @cached_property
     def at_zero(self) -> Array:
-        """The derivative in v at u = 0, shape (n,)."""
+        """Derivative in v at u = 0, shape (n,)."""
         return self.form.vector("v", q=self.q, u=np.zeros(self.form.spaces["u"].dim))
 
     @cached_property
@@ -694,6 +693,6 @@ class FormAbout:
         return self.form.data("v", "q", q=self.q), slope
 
     def product(self, x: Array, u: Array) -> Array:
-        """Return the derivative in v and q at u times x, shape (m, k)."""
+        """Return the derivative in v and q at u, times x of shape (m, k)."""
         at_zero, slope = self._by_numbers
         return self.form.pattern("v", "q").product(at_zero + slope @ u, x)

@@ -1,7 +1,7 @@
 """Latent coefficients a with a Gaussian prior, the unknowns of laws: q = V T(a).
 
-Without transforms and evolutions, latent coefficients equal those of q. `Coefficients` are numbers
-computed from q in which a form is linear, such as k/C.
+Without transforms and harmonics, the latent coefficients are the coefficients of q. `Coefficients`
+are numbers computed from q in which a form is linear, such as k/C.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from livepde.linalg import Array, IntArray, Pattern, sandwich
 
 
 def numbers(parameter: FunctionSpace, q: Array) -> Any:
-    """Return the parameter in the form of sensor functions: numbers, arrays, mappings by name."""
+    """Return the parameter as an argument of sensor functions: numbers, arrays or mappings."""
     seen: dict[str, Any] = {}
     for name in parameter.names:
         part = q[parameter.part(name)]
@@ -40,16 +40,16 @@ def numbers(parameter: FunctionSpace, q: Array) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Coefficients:
-    """Unknowns q followed by numbers c(q) of which a form reads q.name.
+    """Unknowns q, followed by numbers c(q) that forms use as q.name.
 
     Parameters
     ----------
     parameter
         Space of the unknowns, each with a name.
     function
-        q -> {name: value}, of numbers and of what forms see, point by point; analytic.
+        Analytic function q -> {name: value}, of numbers or of pointwise values in forms.
     typical
-        Unknowns for which the function has values, shape (m,).
+        Unknowns at which the function is defined, shape (m,).
     """
 
     parameter: FunctionSpace
@@ -58,25 +58,25 @@ class Coefficients:
 
     @cached_property
     def _computed(self) -> Mapping[str, Any]:
-        """Values for typical unknowns; arrays of those that are computed from more than numbers."""
+        """Values for typical unknowns; arrays if they depend on unknowns that vary in space."""
         seen = vars(numbers(self.parameter, self.typical))
-        # Regions of one unknown and nodes of another have no common shape.
+        # Reduce arrays to one entry: regions and nodes of different unknowns differ in number.
         one = {name: v[:1] if isinstance(v, np.ndarray) else v for name, v in seen.items()}
         return self.function(Named(**one))
 
     @property
     def names(self) -> list[str]:
-        """Names of the numbers."""
+        """Names of the computed numbers."""
         return list(self._computed)
 
     @property
     def numeric(self) -> bool:
-        """False if one of them varies in space, since an unknown does that it is computed from."""
+        """Whether no computed number depends on an unknown that varies in space."""
         return all(np.ndim(value) == 0 for value in self._computed.values())
 
     @cached_property
     def space(self) -> FunctionSpace:
-        """Space of the unknowns and of the numbers, of dimension p."""
+        """Space of the unknowns and the computed numbers, of dimension p."""
         more = dict.fromkeys(self.names, declared(Normal(0.0, std=1.0)))
         return FunctionSpace({**self.parameter.unknowns, **more}, single=False)
 
@@ -96,12 +96,12 @@ class Coefficients:
         return found
 
     def expanded(self, terms: Integrand | On | Sequence[Integrand | On]) -> list[Integrand | On]:
-        """Return terms of the unknowns alone, which compute the numbers at each point."""
+        """Return terms that depend only on unknowns and compute the numbers at each point."""
 
         def one(term: Any) -> Any:
             form, where = placed(term)
 
-            @wraps(form)  # so that the names of its arguments stay
+            @wraps(form)  # to preserve the names of its arguments
             def integrand(q: Any, *others: Any) -> Any:
                 return form(Named(**vars(q), **self.function(q)), *others)
 
@@ -112,10 +112,10 @@ class Coefficients:
 
 @dataclass(frozen=True, eq=False)
 class LatentPart:
-    """Latent coefficients of one unknown: `copies` times `size`, copy by copy.
+    """Latent coefficients of one unknown, in the order (copies, size).
 
-    `unknown` and `block` are its declaration and block in the function space, `part` is the slice
-    of its coefficients among all latent ones.
+    `unknown` and `block` are its declaration and its block in the function space. `part` is the
+    slice of its coefficients among all latent coefficients.
     """
 
     name: str
@@ -125,7 +125,7 @@ class LatentPart:
 
     @cached_property
     def transform(self) -> Transform:
-        """Transform T of this unknown."""
+        """Transform T of the unknown."""
         return self.unknown.prior.transform
 
     @property
@@ -140,10 +140,10 @@ class LatentPart:
 
 
 class Latent:
-    """Map q = V T(a) from latent to physical coefficients of a function space, and its prior.
+    """Map q = V T(a) from latent to physical coefficients of a function space, and the prior.
 
-    T acts on each coefficient (`Prior.transform`); V sums the components of an unknown
-    with harmonics (`Periodic`).
+    T acts elementwise (`Prior.transform`). V sums the components of unknowns with harmonics
+    (`Periodic`).
     """
 
     def __init__(self, space: FunctionSpace) -> None:
@@ -159,22 +159,22 @@ class Latent:
 
     @cached_property
     def plain(self) -> bool:
-        """True if latent coefficients equal those of q."""
+        """Whether the latent coefficients are the coefficients of q."""
         return self.dim == self.space.dim and self.linear
 
     @cached_property
     def linear(self) -> bool:
-        """True if q is linear in the latent coefficients."""
+        """Whether q is linear in the latent coefficients."""
         return all(isinstance(p.transform, Identity) for p in self.parts.values())
 
     @cached_property
     def moves(self) -> bool:
-        """True if an unknown changes in time."""
+        """Whether an unknown varies in time."""
         return any(p.evolution.moves for p in self.parts.values())
 
     @cached_property
     def random(self) -> tuple[str, ...]:
-        """Names of the unknowns that move at random."""
+        """Names of the unknowns with a random evolution."""
         return tuple(name for name, p in self.parts.items() if p.evolution.growth(1.0, 1.0).any())
 
     @cached_property
@@ -185,8 +185,8 @@ class Latent:
         return sp.csr_array(sp.block_diag(blocks, format="csr"))
 
     def visible(self, each: Array) -> Array:
-        """Return V applied to an array of rows for latent coefficients, (dim,) or (dim, k)."""
-        return each if self.dim == self.space.dim else self.V @ each  # the same but for harmonics
+        """Return V times an array with rows for latent coefficients, (dim,) or (dim, k)."""
+        return each if self.dim == self.space.dim else self.V @ each  # V = 1 without harmonics
 
     def _each(self, a: Array, function: str) -> Array:
         with np.errstate(over="ignore"):
@@ -194,7 +194,7 @@ class Latent:
         return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
 
     def value(self, a: Array) -> Array:
-        """Return the coefficients of q, shape (m,), from latent ones of shape (dim,)."""
+        """Return the coefficients of q, shape (m,), from latent coefficients of shape (dim,)."""
         if self.plain:
             return a
         return self.visible(self._each(a, "value"))
@@ -214,17 +214,17 @@ class Latent:
         return self.visible(self.slopes(a)[:, None] * directions)
 
     def tangents(self, a: Array, directions: Array) -> Array:
-        """Return `tangent` of several a, (members, dim), and their columns: (members, m, k)."""
+        """Return dq/da applied to columns of several a, (members, dim): shape (members, m, k)."""
         if self.plain:
             return directions
-        # Numbers in one piece: NumPy may round strided ones otherwise.
+        # A contiguous copy, because NumPy may round differently for strided arrays.
         each = self.slopes(a.T.copy()).T[:, :, None] * directions
         if self.dim == self.space.dim:
             return np.asarray(each)
         return np.array([self.visible(columns) for columns in each])
 
     def deviation(self, a: Array, std: Array) -> Array:
-        """Return standard deviations of q, (m,), from those of independent latent ones, (dim,)."""
+        """Return standard deviations of q, (m,), for independent latent coefficients, (dim,)."""
         if self.plain:
             return std
         each = self.slopes(a) * std
@@ -239,7 +239,7 @@ class Latent:
         Raises
         ------
         SpaceError
-            q lies outside of the range of a transform.
+            q is outside the range of a transform.
         """
         if self.plain:
             return q
@@ -255,21 +255,21 @@ class Latent:
         return a
 
     def _filled(self, values: Sequence[float]) -> Array:
-        """Return an array with one number per unknown, repeated for its latent coefficients."""
+        """Return one number per unknown, repeated for each of its latent coefficients."""
         return np.repeat(values, [p.part.stop - p.part.start for p in self.parts.values()])
 
     @cached_property
     def prior(self) -> Array:
-        """Prior mean of the latent coefficients, shape (dim,); zero where they are fixed."""
+        """Prior mean of the latent coefficients, shape (dim,); zero for fixed coefficients."""
         prior = self.inverse(self.space.prior).copy()
         prior[self.fixed] = 0.0
         return prior
 
     @cached_property
     def origin(self) -> Array:
-        """Latent coefficients of q = 0, shape (dim,); the prior mean where q has a transform.
+        """Reference of latent coefficients, shape (dim,): zero, or the prior mean with a transform.
 
-        The zero of a logarithm depends on the unit of q.
+        Zero is not a suitable reference of a logarithm, because it depends on the unit of q.
         """
         origin = self.prior.copy()
         for p in self.parts.values():
@@ -284,7 +284,7 @@ class Latent:
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of the latent coefficients, to be respected by laws."""
+        """Lower and upper bounds of the latent coefficients, which laws must respect."""
         lower, upper = zip(
             *(p.unknown.prior.latent_bounds for p in self.parts.values()), strict=True
         )
@@ -292,7 +292,7 @@ class Latent:
 
     @cached_property
     def bounded(self) -> bool:
-        """True if a latent coefficient has a bound."""
+        """Whether a latent coefficient has a bound."""
         return any(bool(np.isfinite(bound).any()) for bound in self.bounds)
 
     def clipped(self, a: Array) -> Array:
@@ -317,7 +317,7 @@ class Latent:
         for p in self.parts.values():
             if p.name in self.space.fields:
                 fixed = self.space.fields[p.name].fixed
-                # All components of a harmonic obey the boundary conditions of the field.
+                # All components of a harmonic satisfy the boundary conditions of the field.
                 found += [fixed + p.part.start + c * p.size for c in range(p.evolution.copies)]
         return np.concatenate(found) if found else np.zeros(0, dtype=np.int64)
 
@@ -331,7 +331,7 @@ class Latent:
         """Return the expected latent coefficients after a time h."""
         if not self.generator.nnz:
             return a
-        # Evolutions are linear about the prior mean, so the difference from it is propagated.
+        # Evolutions are linear about the prior mean, so the difference to it is propagated.
         change = a - self.prior
         for p in self.parts.values():
             parts = change[p.part].reshape(p.evolution.copies, p.size)
@@ -340,7 +340,7 @@ class Latent:
 
 
 class Composed(FormMatrices):
-    """A form composed with q = V T(a): `Form` in latent coefficients instead of q."""
+    """A form composed with q = V T(a): a function of latent coefficients instead of q."""
 
     def __init__(self, form: Form, latent: Latent) -> None:
         self.form = form
@@ -364,7 +364,7 @@ class Composed(FormMatrices):
 
     @property
     def linear_in_parameter(self) -> bool:
-        """True if the form is linear in the latent coefficients."""
+        """Whether the form is linear in the latent coefficients."""
         return self.latent.linear and self.form.linear_in_parameter
 
     def differentiates(self, slot: str, test: str = "v") -> bool:
@@ -429,5 +429,5 @@ class Composed(FormMatrices):
 
 
 def compose(form: Form, latent: Latent) -> Form | Composed:
-    """Return the form in latent coefficients; the form itself if they equal those of q."""
+    """Return the form in latent coefficients; the form itself if they are coefficients of q."""
     return form if latent.plain else Composed(form, latent)

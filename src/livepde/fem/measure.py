@@ -1,4 +1,4 @@
-"""Points where weak forms are evaluated, with time, inputs and quadrature of cells and facets."""
+"""Evaluation points of weak forms, with time and inputs, and quadrature on cells and facets."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from livepde.linalg import Array, IntArray
 
 
 class Inputs(dict[str, float]):
-    """Values of the input channels at one moment, unchangeable; a missing name raises an error."""
+    """Immutable values of the input channels at a time; a missing name is an error."""
 
     def __missing__(self, name: str) -> float:
         known = ", ".join(sorted(self)) or "none"
@@ -46,7 +46,7 @@ class Inputs(dict[str, float]):
     update = setdefault = pop = popitem = clear = _refuse
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Inputs, (dict(self),)  # a copy would set item by item
+        return Inputs, (dict(self),)  # the default would set items, which is an error
 
 
 NO_INPUTS = Inputs({})
@@ -66,10 +66,10 @@ START = Moment()
 class Place:
     """The argument `x` of a weak form.
 
-    `x[0], x[1], ...` are coordinates of the quadrature points; `x.t` the time; `x.inputs["Q"]` the
-    value of an input channel; `x.normal` the outward normal (on boundaries); `x.h` the diameter of
-    the cell, shape (elements, 1), on a boundary of the adjacent cell. Reads of time and inputs are
-    recorded: a form that reads neither is constant in time and assembled once.
+    `x[0], x[1], ...` are coordinates of the quadrature points, `x.t` is the time, `x.inputs["Q"]`
+    the value of an input channel, `x.normal` the outward normal (on boundaries), and `x.h` the
+    diameter of the cell or, on a boundary, of the adjacent cell, shape (elements, 1). The use of
+    time and inputs is recorded: a form that uses neither is assembled once.
     """
 
     def __init__(
@@ -117,14 +117,14 @@ class Place:
 
 
 class _Constants(Mapping[str, float]):
-    """Inputs of a place of which some are constant; only the others are recorded as read."""
+    """Inputs of a place with additional constants, whose use is not recorded."""
 
     def __init__(self, place: Place, constants: Mapping[str, float]) -> None:
         self._place = place
         self._constants = constants
 
     def __getitem__(self, name: str) -> float:
-        # A form that reads constants alone stays constant in time: the place records no read.
+        # A form that uses only constants is constant in time, so the use is not recorded.
         return self._constants[name] if name in self._constants else self._place.inputs[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -135,7 +135,7 @@ class _Constants(Mapping[str, float]):
 
 
 class _PlaceWithConstants:
-    """A place x of which some inputs are constant."""
+    """A place x with additional constants among its inputs."""
 
     def __init__(self, place: Place, constants: Mapping[str, float]) -> None:
         self._place = place
@@ -149,7 +149,7 @@ class _PlaceWithConstants:
 
 
 def with_constants(form: Callable[..., Any], constants: Mapping[str, float]) -> Callable[..., Any]:
-    """Return a function of a place that finds some inputs as constants there."""
+    """Return a form with the given constants among the inputs of its place."""
     if not constants:
         return form
 
@@ -165,10 +165,10 @@ def with_constants(form: Callable[..., Any], constants: Mapping[str, float]) -> 
 
 
 class _LineHermite(ElementLineHermite):  # type: ignore[misc]
-    """Cubic Hermite functions by their formula on the reference element.
+    """Cubic Hermite functions from their formula on the reference element.
 
-    scikit-fem inverts the Vandermonde matrix of global monomials: its values are off by 1e-10 on 30
-    cells of (0, 1), by 1e-5 on 1000 cells, and by 1e-4 on 30 cells of (100, 101).
+    scikit-fem inverts the Vandermonde matrix of global monomials. The error of its values is 1e-10
+    on 30 cells of (0, 1), 1e-5 on 1000 cells, and 1e-4 on 30 cells of (100, 101).
     """
 
     def gbasis(
@@ -184,7 +184,7 @@ class _LineHermite(ElementLineHermite):  # type: ignore[misc]
             (3 * s**2 - 2 * s**3, 6 * s - 6 * s**2, 6 - 12 * s),
             (s**3 - s**2, 3 * s**2 - 2 * s, 6 * s - 2),
         )[i]
-        unit = h if i % 2 else 1.0  # the odd ones stand for du/dx
+        unit = h if i % 2 else 1.0  # coefficients of odd functions are du/dx
         return (
             DiscreteField(
                 value=value * unit,
@@ -197,7 +197,7 @@ class _LineHermite(ElementLineHermite):  # type: ignore[misc]
 def own(element: Element) -> Element:
     """Return a private copy of an element.
 
-    Elements with global degrees of freedom cache their first mesh, and are wrong on another one.
+    Elements with global degrees of freedom cache data of their first mesh and are wrong on others.
     """
     if type(element) is ElementLineHermite:
         return _LineHermite()
@@ -209,11 +209,11 @@ def own(element: Element) -> Element:
 
 
 def unweighted(x: Any) -> float:
-    """Return the volume element of Cartesian coordinates, one."""
+    """Return the volume element of Cartesian coordinates: 1."""
     return 1.0
 
 
-# Number of quadrature points up to which shape functions evaluated on them are cached.
+# Largest number of quadrature points for which values of shape functions are cached.
 KEPT = 300_000
 # Number of quadrature points of a piece of a larger measure, which bounds the size of temporary
 # arrays.
@@ -224,8 +224,8 @@ PIECE = 30_000
 class Measure:
     """Integration domain (whole mesh, subdomain or boundary) with a quadrature order.
 
-    `members`: numbers of its cells, or of its facets on a boundary; default all.
-    `thin`: true: only the first quadrature point of each, to probe an integrand.
+    `members`: indices of its cells, or of its facets on a boundary; default all.
+    `thin`: whether to use only the first quadrature point of each, for tests of an integrand.
     `weight`: volume element of the coordinates, a function of points.
     """
 
@@ -238,12 +238,12 @@ class Measure:
 
     @property
     def on_boundary(self) -> bool:
-        """True if the name is that of a boundary."""
+        """Whether the measure is on a boundary."""
         return self.name is not None and self.name in (self.mesh.boundaries or {})
 
     @cached_property
     def _whole(self) -> IntArray | None:
-        """All cells or facets of the name; None: all cells of the mesh."""
+        """All cells or facets with the name; None for all cells of the mesh."""
         if self.name is None:
             return None
         for named in (self.mesh.boundaries or {}, self.mesh.subdomains or {}):
@@ -258,7 +258,7 @@ class Measure:
         return self._whole if self.members is None else self.members
 
     def on(self, cells: IntArray) -> Measure:
-        """Return the restriction to some cells of the mesh, or to their facets."""
+        """Return the restriction to given cells of the mesh, or to their facets."""
         mine = self.cells
         mine = np.arange(self.mesh.nelements) if mine is None else mine
         at = np.flatnonzero(np.isin(mine, cells))
@@ -267,12 +267,12 @@ class Measure:
 
     @property
     def kept(self) -> bool:
-        """True if it is small enough to cache shape functions evaluated on it."""
+        """Whether it is small enough to cache values of shape functions."""
         elements, points = self.shape
         return elements * points <= KEPT
 
     def pieces(self) -> Iterator[tuple[slice, Measure]]:
-        """Yield (slice of elements, part), the parts being small enough to evaluate at once."""
+        """Yield (slice of elements, part), with parts that are small enough to evaluate at once."""
         elements, points = self.shape
         if self.kept:
             yield slice(0, elements), self
@@ -292,13 +292,13 @@ class Measure:
 
     @cached_property
     def shape(self) -> tuple[int, int]:
-        """Number of elements, and of quadrature points on each."""
+        """Number of elements, and number of quadrature points on each."""
         where = self._where
         return self.mesh.nelements if where is None else len(where), len(self._rule[1])
 
     @cached_property
     def mapping(self) -> Any:
-        """Mapping of scikit-fem; a separate one for a part, without caches of other cells."""
+        """Mapping of scikit-fem; for a part, a separate mapping without caches for other cells."""
         where = self._where
         if where is None and self.kept and not self.thin:
             return self.mesh._mapping()
@@ -309,8 +309,8 @@ class Measure:
     def _empty_mapping(self) -> Any:
         """Return a copy of scikit-fem's mapping for all cells with empty caches."""
         mapping = copy(self.mesh._mapping())
-        # scikit-fem caches Jacobians of all cells on the mapping of the mesh, where they would stay
-        # for the lifetime of the mesh.
+        # scikit-fem caches Jacobians of all cells in the mapping of the mesh, for the lifetime of
+        # the mesh.
         for name in [name for name in vars(mapping) if name.startswith("_")]:
             delattr(mapping, name)
         return mapping
@@ -329,7 +329,7 @@ class Measure:
 
     @property
     def cells(self) -> IntArray | None:
-        """Numbers of the cells, on a boundary those adjacent to its facets; None: all cells."""
+        """Indices of the cells, or of cells adjacent to boundary facets; None for all cells."""
         return self._sides.cells if self.on_boundary else self._where
 
     @cached_property
@@ -383,24 +383,24 @@ class Measure:
         return Place(self.points, self.normal, moment, lambda: self.diameter)
 
 
-# Bisections of the reference cell of a `FineMeasure`, by the number of its coordinates: they leave
-# its cells in 128, 256 and 64 parts.
+# Dimension -> number of bisections of the reference cell of a `FineMeasure`, which result in 128,
+# 256 and 64 parts.
 BISECTIONS = {1: 7, 2: 4, 3: 2}
 MESHES = {kind.elem.refdom: kind for kind in (MeshLine, MeshTri, MeshQuad, MeshTet, MeshHex)}
-# Corners of a cell are moved inwards by this share, since those on a border belong to one side.
+# Share by which corners of a cell are moved inwards, because a corner on a border is ambiguous.
 INWARDS = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class FineMeasure(Measure):
-    """Measure of cells with a rule on each of many parts, for integrands that jump inside them."""
+    """Measure that splits cells into many parts, for integrands that jump inside cells."""
 
     @cached_property
     def _rule(self) -> tuple[Array, Array]:
         X: Array
         W: Array
         X, W = get_quadrature(self.mesh.refdom, self.order)
-        if self.mesh.refdom not in MESHES:  # wedges, which scikit-fem does not refine
+        if self.mesh.refdom not in MESHES:  # wedges, which scikit-fem cannot refine
             return X, W
         parts = MESHES[self.mesh.refdom].init_refdom().refined(BISECTIONS[self.mesh.dim()])
         mapping = parts.mapping()
@@ -410,7 +410,7 @@ class FineMeasure(Measure):
 
 @dataclass(frozen=True, eq=False)
 class _Corners(Measure):
-    """Measure whose points are the corners of cells; it has no weights."""
+    """Measure with the corners of cells as points, without weights."""
 
     @cached_property
     def _rule(self) -> tuple[Array, Array]:
@@ -425,7 +425,7 @@ class _Corners(Measure):
 def crossed(measure: Measure, region: Callable[[Array], Any]) -> IntArray:
     """Return the cells of a mesh that the border of a region crosses.
 
-    A border that leaves all corners and quadrature points of a cell on one side is not seen.
+    A crossing is not detected if all corners and quadrature points of the cell are on one side.
     """
     found = []
     for at, piece in measure.pieces():
@@ -437,7 +437,7 @@ def crossed(measure: Measure, region: Callable[[Array], Any]) -> IntArray:
 
 
 def sizes(measure: Measure, region: Callable[[Array], Any]) -> tuple[float, float]:
-    """Return the size of a region by a measure of all cells, and by finer parts of crossed ones."""
+    """Return the size of a region from a measure, and from finer parts of cells at its border."""
     cut = crossed(measure, region)
     plain, exact = 0.0, 0.0
     for at, piece in measure.pieces():
@@ -461,7 +461,7 @@ class _Sides(NamedTuple):
 
 
 def _chosen(members: IntArray, at: Any) -> IntArray:
-    """Return some members of a measure; facets keep their orientation."""
+    """Return selected members of a measure; facets keep their orientation."""
     chosen: IntArray = np.asarray(members)[at]
     if isinstance(members, OrientedBoundary):
         chosen = OrientedBoundary(chosen, members.ori[at])

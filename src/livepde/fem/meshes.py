@@ -85,7 +85,7 @@ def smooth(mesh: Mesh) -> Element:
 
 
 def hermite(mesh: Mesh) -> Element:
-    """Return cubic Hermite on a line, the element of first order elsewhere."""
+    """Return the cubic Hermite element on an interval, otherwise the element of first order."""
     return ElementLineHermite() if isinstance(mesh, MeshLine) else linear(mesh)
 
 
@@ -121,7 +121,7 @@ def grid(
 ) -> MeshQuad:
     """Return a rectangle with a node at every (x, y) of two increasing lists.
 
-    For graded meshes. Boundaries and regions as for `rectangle`.
+    Use it for graded meshes. See `rectangle` for boundaries and regions.
 
     >>> grid([-100, -10, 0, 10, 100], [0, 1, 4]).nelements
     8
@@ -139,9 +139,9 @@ def box(
     *,
     regions: Mapping[str, Predicate] | None = None,
 ) -> MeshTet:
-    """Return a mesh of tetrahedra of [x0, x1] x [y0, y1] x [z0, z1].
+    """Return a mesh of [x0, x1] x [y0, y1] x [z0, z1] with tetrahedra.
 
-    Its boundaries are "left" and "right" (x), "front" and "back" (y), "bottom" and "top" (z);
+    Its boundaries are "left" and "right" (x), "front" and "back" (y), "bottom" and "top" (z).
     `regions` are named subdomains, each a predicate on the midpoints of the elements.
     """
     sides = (x, y, z)
@@ -154,10 +154,10 @@ def box(
 
 
 def halved(mesh: Mesh) -> Mesh:
-    """Return the mesh whose elements are halved in every direction, with the same subdomains.
+    """Return the mesh with elements halved in every direction and the same subdomains.
 
-    scikit-fem 12 numbers the halves of the cells of a line in another way than their subdomains,
-    so that these would name other cells.
+    In scikit-fem 12, refinement of a line numbers cells and subdomains inconsistently, so the
+    subdomains are recomputed.
 
     >>> line = MeshLine([0.0, 1.0, 2.0, 3.0]).with_subdomains({"left": lambda x: x[0] < 1.0})
     >>> finer = halved(line)
@@ -176,17 +176,17 @@ def halved(mesh: Mesh) -> Mesh:
 def read_mesh(path: str | Path, scale: float = 1.0) -> Mesh:
     """Return a mesh from a file in any format of meshio: Gmsh, VTK, Abaqus, XDMF, MED, ...
 
-    Cells are lines, triangles, quadrilaterals, tetrahedra or hexahedra; those of the highest
-    dimension are the mesh. Named groups (physical groups of Gmsh, sets of Abaqus) of cells become
-    its subdomains and those of sides its boundaries, for `On`, `Piecewise` and `dirichlet`.
-    Needs the extra `mesh`.
+    Cells are lines, triangles, quadrilaterals, tetrahedra or hexahedra; the mesh consists of the
+    cells of the highest dimension. Named groups (physical groups of Gmsh, sets of Abaqus) of cells
+    become subdomains, and groups of sides become boundaries, for `On`, `Piecewise` and `dirichlet`.
+    Requires the extra `mesh`.
 
     Parameters
     ----------
     path
         Path of the file; its extension determines the format.
     scale
-        Unit of length of the file in that of the model: 1e-3 for a drawing in mm and a model in m.
+        Unit of length of the file over that of the model: 1e-3 for a file in mm, a model in m.
 
     Raises
     ------
@@ -207,7 +207,7 @@ def read_mesh(path: str | Path, scale: float = 1.0) -> Mesh:
         from skfem.io.meshio import from_meshio
     with _quiet():
         mesh = _loaded(path, meshio, from_meshio)
-    if type(mesh) in ELEMENTS:  # centres of arcs and the like belong to no cell
+    if type(mesh) in ELEMENTS:  # nodes such as centres of arcs are not part of a cell
         mesh = mesh.remove_unused_nodes()
     if scale != 1.0:
         mesh = mesh.scaled(float(scale))
@@ -216,14 +216,14 @@ def read_mesh(path: str | Path, scale: float = 1.0) -> Mesh:
 
 
 def _groups(found: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return the groups that have members and a name; "gmsh:..." are those of the format itself."""
+    """Return named groups with members, without the internal groups "gmsh:..." of the format."""
     named = {k: v for k, v in (found or {}).items() if k and not str(k).startswith("gmsh:")}
     return {name: members for name, members in named.items() if len(members)} or None
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Suppress the printed output of a reader: problems with a file are raised as errors."""
+    """Suppress the output of a reader: problems with a file are raised as errors."""
     log = logging.getLogger("skfem")
     level = log.level
     log.setLevel(logging.ERROR)
@@ -236,7 +236,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _loaded(path: Path, meshio: Any, from_meshio: Any) -> Mesh:
-    # For an unknown format meshio raises SystemExit, which would end the user's program.
+    # For an unknown format, meshio raises SystemExit, which would end the user's program.
     try:
         read = meshio.read(path)
     except (Exception, SystemExit) as error:
@@ -276,10 +276,10 @@ KINDS: dict[Any, tuple[str, list[int]]] = {
 
 
 def shares(mesh: Mesh, axis: int, x: Array) -> Array:
-    """Return where coordinates lie in the box of a mesh along an axis, from 0 to 1.
+    """Return relative positions of coordinates along an axis of the bounding box, from 0 to 1.
 
-    In one dimension the cells count, not their length: a graded mesh is fine where the state
-    varies.
+    In one dimension they are measured by the number of cells instead of lengths, since a graded
+    mesh is fine where the state varies.
     """
     nodes = np.sort(mesh.p[axis])
     if len(mesh.p) > 1:
@@ -288,9 +288,9 @@ def shares(mesh: Mesh, axis: int, x: Array) -> Array:
 
 
 def lengths(mesh: Mesh, axis: int, x: Array) -> Array:
-    """Return the length of the box along an axis, as the cells at some coordinates measure it.
+    """Return the length of the bounding box along an axis, for each of the coordinates x.
 
-    In one dimension it is the number of cells times the size of the cell there.
+    In one dimension, it is the number of cells times the size of the cell at x.
     """
     nodes = np.sort(mesh.p[axis])
     if len(mesh.p) > 1:
@@ -301,9 +301,9 @@ def lengths(mesh: Mesh, axis: int, x: Array) -> Array:
 
 
 def cells(mesh: Mesh) -> dict[str, Any]:
-    """Return vertices of the cells by meshio's cell type, shape (cells, corners).
+    """Return meshio's cell type -> vertices of the cells, shape (cells, corners).
 
-    Empty for an interval, whose vertices suffice.
+    The mapping is empty for an interval, whose nodes suffice.
     """
     for kind, (name, corners) in KINDS.items():
         if isinstance(mesh, kind):
@@ -311,17 +311,17 @@ def cells(mesh: Mesh) -> dict[str, Any]:
     return {}
 
 
-# Distance of two coefficients that count as the same place, relative to the size of the mesh.
+# Tolerance for coefficients at the same position, relative to the size of the mesh.
 SLACK = 1e-6
 
 
 def tied(field: Field, block: Any) -> IntArray | None:
-    """Return the representative of each of scikit-fem's degrees of freedom; None: no ties.
+    """Return the coefficient of each of scikit-fem's degrees of freedom; None if not periodic.
 
-    Coefficients of a pair of periodic boundaries are identified if they are of the same kind
-    (value, slope) and at the same place up to the translation of one boundary to the other.
+    Degrees of freedom of a pair of periodic boundaries are identified if they have the same kind
+    (value, slope) and the same position up to the translation between the boundaries.
 
-    Raises `SpaceError`: the element has no coefficients on its sides, or those of two boundaries do
+    Raises `SpaceError`: the element has no degrees of freedom on boundaries, or the boundaries do
     not match.
     """
     if not field.periodic:
@@ -338,9 +338,9 @@ def tied(field: Field, block: Any) -> IntArray | None:
     pairs = [_matched(field, block, *pair) for pair in field.periodic]
     i, j = (np.concatenate(side) for side in zip(*pairs, strict=True))
     graph = sp.csr_array((np.ones(len(i)), (i, j)), shape=(count, count))
-    # Chains of ties, as at the corners of a doubly periodic rectangle, form one coefficient each.
+    # Chains of identifications, as at corners of a doubly periodic rectangle, are one coefficient.
     _, labels = connected_components(graph, directed=False)
-    # Coefficients are numbered by first occurrence, which keeps the bandwidth of the mesh.
+    # Coefficients are numbered by first occurrence, which preserves the bandwidth of the mesh.
     _, first, renumbered = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))
     return rank[renumbered]

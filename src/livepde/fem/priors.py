@@ -1,7 +1,7 @@
-"""Priors of unknowns, and their evolution between two samples.
+"""Priors of unknowns, and their evolution between samples.
 
-A prior is Gaussian in a latent value a, and q = T(a): laws work with a, weak forms and sensors see
-q. An evolution is a linear stochastic differential equation of a about its prior mean,
+A prior is Gaussian in a latent value a, with q = T(a). Laws use a; weak forms and sensors use q. An
+evolution is a linear stochastic differential equation for a about its prior mean,
 
     d(a - prior) = K (a - prior) dt + noise.
 """
@@ -20,11 +20,11 @@ from livepde.linalg import Array
 
 @dataclass(frozen=True)
 class Evolution:
-    """Evolution model of an unknown; this base class, `CONSTANT`, does not move."""
+    """Evolution model of an unknown. The base class, with the instance `CONSTANT`, is constant."""
 
     @property
     def copies(self) -> int:
-        """Number of components of the evolution; q is a sum of the `visible` ones."""
+        """Number of components of the evolution; `visible` are their weights in q."""
         return 1
 
     @property
@@ -39,7 +39,7 @@ class Evolution:
 
     @property
     def moves(self) -> bool:
-        """True unless the unknown is constant."""
+        """Whether the unknown varies in time."""
         return self != CONSTANT
 
     def transition(self, h: float) -> Array:
@@ -47,15 +47,15 @@ class Evolution:
         return np.eye(1)
 
     def growth(self, h: float, std: float) -> Array:
-        """Return the variance added to each component in h, relative to the prior's, (copies,)."""
+        """Return the variance added in a time h over the prior variance, shape (copies,)."""
         return np.zeros(1)
 
 
 @dataclass(frozen=True)
 class RandomWalk(Evolution):
-    """Random walk: a standard deviation of rate * sqrt(h) is added in a time h.
+    """Random walk: the increment in a time h has the standard deviation rate * sqrt(h).
 
-    The rate is in the unit of the unknown (of its logarithm for a `LogNormal`) per square root of
+    The rate is in the unit of the unknown (for a `LogNormal`, of its logarithm) per square root of
     the model's unit of time.
 
     Examples
@@ -79,7 +79,7 @@ class RandomWalk(Evolution):
 
 @dataclass(frozen=True)
 class MeanReverting(Evolution):
-    """Ornstein-Uhlenbeck process: relaxation time `time`, stationary law the prior.
+    """Ornstein-Uhlenbeck process with relaxation time `time`; its stationary law is the prior.
 
     Examples
     --------
@@ -102,7 +102,7 @@ class MeanReverting(Evolution):
         return np.array([[np.exp(-h / self.time)]])
 
     def growth(self, h: float, std: float) -> Array:
-        # exp(-2 h/time) of the variance is left; the noise restores that of the prior.
+        # The variance decays by exp(-2 h/time), and the noise restores the prior variance.
         return np.array([-np.expm1(-2.0 * h / self.time)])
 
 
@@ -111,7 +111,7 @@ class Periodic(Evolution):
     """A constant and harmonics: q(t) = q_0 + sum over k of a_k cos(2 pi k t/period + phase_k).
 
     The constant has the prior mean; each harmonic has the prior standard deviation. The amplitudes
-    rotate with time, so that the equation is autonomous and a law needs no clock.
+    rotate with time, so that the evolution is autonomous.
     """
 
     period: float
@@ -128,7 +128,7 @@ class Periodic(Evolution):
 
     @property
     def visible(self) -> Array:
-        # A harmonic is a pair (a cos, a sin) that rotates: q contains its first component.
+        # A harmonic is a rotating pair (a cos, a sin), and q contains its first component.
         return np.array([1.0] + self.harmonics * [1.0, 0.0])
 
     @property
@@ -155,7 +155,7 @@ CONSTANT = Evolution()
 
 
 class Transform(ABC):
-    """A smooth increasing function of one variable with its derivatives and its inverse."""
+    """A smooth increasing function of one variable, with its derivatives and its inverse."""
 
     @abstractmethod
     def value(self, latent: Array) -> Array:
@@ -171,31 +171,29 @@ class Transform(ABC):
 
     @abstractmethod
     def inverse(self, q: Array) -> Array:
-        """Return the latent value of q; not finite where q lies outside the range of T."""
+        """Return the latent value of q; it is not finite if q is outside the range of T."""
 
     def shifted(self, q: Array, std: Array, z: float) -> Array:
         """Return q shifted by z latent standard deviations: a quantile of T(Gaussian).
 
-        `q` is T of the latent mean, `std` T' times the latent standard deviation; NaN stays NaN.
-        Where q equals an end of T's range to rounding, the latent standard deviation cannot be
-        recovered, and the end on the side of z is returned.
+        `q` is T of the latent mean, and `std` is T' times the latent standard deviation. NaN
+        remains NaN. If q equals an end of the range of T up to rounding, the latent standard
+        deviation cannot be recovered, and the end on the side of z is returned.
         """
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             latent = self.inverse(q)
             moved = latent + z * std / self.slope(latent)
-            # A value at an end of the range has an infinite latent value: its quantiles are the
-            # ends themselves.
+            # At an end of the range, the latent value is infinite, and the quantiles are the ends.
             moved = np.where(np.isfinite(moved), moved, np.copysign(np.inf, z))
             return np.where(np.isnan(std), np.nan, self.value(moved))
 
     def moments(self, q: Array, std: Array) -> tuple[Array, Array]:
-        """Return mean and standard deviation of T(Gaussian) from `q` and `std` as for `shifted`.
+        """Return mean and standard deviation of T(Gaussian); see `shifted` for `q` and `std`.
 
-        Where q equals an end of T's range to rounding, that is the mean, and `std` is returned as
-        it is.
+        If q equals an end of the range of T up to rounding, `q` and `std` are returned unchanged.
         """
-        # T is analytic in a strip, so that sums over even steps converge faster than any power of
-        # the step; here to 1e-8 for latent standard deviations up to 20.
+        # T is analytic in a strip, so the trapezoidal rule converges faster than any power of the
+        # step: the error is 1e-8 for latent standard deviations up to 20.
         steps = 0.05 * np.arange(-200, 201)
         weights = np.exp(-0.5 * steps**2)
         weights /= weights.sum()
@@ -233,7 +231,7 @@ class Identity(Transform):
 
 @dataclass(frozen=True)
 class Log(Transform):
-    """Logarithmic transform: q = lower + exp(latent), above a bound."""
+    """Logarithmic transform: q = lower + exp(latent), above a lower bound."""
 
     lower: float = 0.0
 
@@ -253,7 +251,7 @@ class Log(Transform):
     def moments(self, q: Array, std: Array) -> tuple[Array, Array]:
         above = q - self.lower
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            variance = (std / above) ** 2  # of the logarithm
+            variance = (std / above) ** 2  # variance of the logarithm
             factor = np.exp(0.5 * variance)
             mean, found = self.lower + above * factor, above * factor * np.sqrt(np.expm1(variance))
         inside = above > 0.0
@@ -262,13 +260,13 @@ class Log(Transform):
 
 @dataclass(frozen=True)
 class Logit(Transform):
-    """Logistic transform: q = lower + (upper - lower) / (1 + exp(-latent)), between bounds."""
+    """Logistic transform: q = lower + (upper - lower) / (1 + exp(-latent)), between two bounds."""
 
     lower: float
     upper: float
 
     def _share(self, latent: Array) -> Array:
-        # The logistic function by tanh does not overflow for large negative arguments.
+        # The logistic function in terms of tanh does not overflow for large negative arguments.
         return np.asarray(0.5 * (1.0 + np.tanh(0.5 * latent)))
 
     def value(self, latent: Array) -> Array:
@@ -284,14 +282,14 @@ class Logit(Transform):
 
     def inverse(self, q: Array) -> Array:
         with np.errstate(divide="ignore", invalid="ignore"):
-            # Two logarithms, since the quotient could overflow close to a bound.
+            # Two logarithms, because the quotient could overflow near a bound.
             return np.asarray(np.log(q - self.lower) - np.log(self.upper - q))
 
 
 class Prior(ABC):
-    """Belief about a number before the first sample: common base of the distributions.
+    """Abstract prior distribution of a number.
 
-    `std` is the standard deviation in the unit of the unknown; an estimate never leaves `bounds`.
+    `std` is the standard deviation in the unit of the unknown; estimates are within `bounds`.
     """
 
     std: float
@@ -309,7 +307,7 @@ class Prior(ABC):
 
     @property
     def text(self) -> str:
-        """The prior as text, with bounds where they are not those of its kind."""
+        """The prior as text, with bounds if they are not the default bounds of its class."""
         usual = self.bounds == getattr(type(self), "bounds", None)
         bounds = "" if usual else f", bounds={self.bounds}"
         return f"{type(self).__name__}({self.centre:g}, std={self.std:g}{bounds})"
@@ -321,7 +319,7 @@ class Prior(ABC):
 
     @property
     def latent_std(self) -> float:
-        """Standard deviation of the latent value: that of q, to first order."""
+        """Standard deviation of the latent value: `std` over the slope at the latent mean."""
         return float(self.std / self.transform.slope(np.array(self.latent_mean)))
 
     @property
@@ -331,15 +329,15 @@ class Prior(ABC):
 
     @property
     def symmetric(self) -> bool:
-        """True if intervals are value +- multiples of std: neither a transform nor bounds."""
+        """Whether intervals are value +- multiples of std: no transform and no bounds."""
         return False
 
     def interval(self, value: Any, std: Any, level: float = 0.95) -> tuple[Array, Array]:
-        """Return the ends of the central interval that holds q with probability `level`.
+        """Return the ends of the central interval that contains q with probability `level`.
 
-        Quantiles of the Gaussian belief about the latent values, mapped through the transform and
-        cut off at the bounds. `value` are medians, `std` standard deviations to first order (the
-        latent one times the slope at the median), of equal shape.
+        They are quantiles of a Gaussian latent value, mapped by the transform and clipped to the
+        bounds. `value` are medians, and `std` standard deviations to first order (the latent
+        standard deviation times the slope at the median), of equal shape.
         """
         from statistics import NormalDist
 
@@ -351,15 +349,15 @@ class Prior(ABC):
         return low, high
 
     def moments(self, value: Any, std: Any) -> tuple[Array, Array]:
-        """Return mean and standard deviation of q, of the Gaussian belief about its latent value.
+        """Return mean and standard deviation of q for a Gaussian latent value.
 
-        `value` and `std` as for `interval`. Bounds of a `Normal` do not count.
+        See `interval` for `value` and `std`. Bounds of a `Normal` are ignored.
         """
         value, std = np.asarray(value, dtype=float), np.asarray(std, dtype=float)
         return self.transform.moments(value, std)
 
     def _check(self, centre: str) -> None:
-        """Raise an error for numbers that are no distribution; `centre` is its name, as "mean"."""
+        """Raise an error for invalid numbers; `centre` is the name of the centre: "mean"."""
         what, at = type(self).__name__, self.centre
         require_positive(f"{what}: std", self.std, SpaceError)
         lower, upper = self.bounds
@@ -415,7 +413,7 @@ class Normal(Prior):
 
 @dataclass(frozen=True)
 class LogNormal(Prior):
-    """Normal distribution of log(q - lower): q stays positive, or above a finite lower bound.
+    """Normal distribution of log(q - lower): q is positive, or above a finite lower bound.
 
     Parameters
     ----------
@@ -458,7 +456,7 @@ class LogNormal(Prior):
 
 @dataclass(frozen=True)
 class LogitNormal(Prior):
-    """Normal distribution of log((q - lower)/(upper - q)): q stays strictly between two bounds.
+    """Normal distribution of log((q - lower)/(upper - q)): q is strictly between two bounds.
 
     Parameters
     ----------

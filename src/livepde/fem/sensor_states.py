@@ -1,7 +1,7 @@
-"""States of sensors that respond slowly, as coefficients behind those of the fields.
+"""States of slow sensors, as coefficients after the coefficients of fields.
 
-A sensor that sees z = G u shows y with tau y' = z - y. In a form, a measure of one point with
-weight one stands for it: there, u is the pair of what it sees and shows.
+A sensor with the input z = G u has the output y with tau y' = z - y. In a form, it is represented
+by a measure of one point with weight one, where u is the pair of input and output.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class SensorState:
     Attributes
     ----------
     row
-        Function of the state space that returns G, the row by which the sensor reads it, (1, n).
+        Function of the state space that returns the row G, (1, n), of the input of the sensor.
     time_constant
-        In the unit of time of the model; None: the unknown `time_constant[NAME]`.
+        Time constant in the unit of time of the model; None: the unknown `time_constant[NAME]`.
     """
 
     row: Callable[[Any], sp.csr_array]
@@ -47,16 +47,16 @@ class SensorPair(NamedTuple):
 
 
 class SensorBlock(Block):
-    """The one coefficient of a slow sensor.
+    """The coefficient of a slow sensor.
 
-    `number` is its place among all coefficients, `row` reads the others, (1, number).
+    `number` is its index among all coefficients, and `row` the row of its input, (1, number).
     """
 
     size = 1
 
     def __init__(self, number: int, row: sp.csr_array) -> None:
         self.row = sp.csr_array(row)
-        # Local coefficients are counted from the first one of their block.
+        # Local coefficients are relative to the first coefficient of the block.
         self._dofs: IntArray = np.append(self.row.indices - number, 0).astype(np.int32)[:, None]
 
     def dofs_on(self, measure: Measure) -> IntArray:
@@ -74,7 +74,7 @@ class SensorBlock(Block):
         return SensorPair(*values)
 
     def prior(self) -> Array:
-        return np.zeros(1)  # completed by what it sees
+        return np.zeros(1)  # `FunctionSpace.completed` sets it to the input
 
     def labels(self, name: str) -> tuple[str, ...]:
         return ()
@@ -82,7 +82,7 @@ class SensorBlock(Block):
 
 @dataclass(frozen=True, eq=False)
 class SensorMeasure(Measure):
-    """A slow sensor as a measure: one point with the weight one."""
+    """A slow sensor as a measure of one point with weight one."""
 
     sensor: str = ""
     members: IntArray | None = field(default_factory=lambda: np.zeros(1, dtype=np.int64))

@@ -1,4 +1,4 @@
-"""Terms of sensors that respond slowly, in the forms of a model."""
+"""Terms of slow sensors in the forms of a model."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from livepde.fem.sensor_states import SensorMeasure, SensorState
 class SensorTerms:
     """Terms of slow sensors in the forms of a model, M u' + B(u) + A(u) q = F.
 
-    `form_M`: the mass of its fields.
+    `form_M`: mass form of the fields.
     """
 
     def __init__(self, sensors: Mapping[str, SensorState], form_M: Form) -> None:
         self.mass: list[On] = []
-        self.response: list[On] = []  # with a known time constant
+        self.response: list[On] = []  # for known time constants
         self.unknown_response: list[On] = []
         if not sensors:
             return
-        # The state of a sensor is as heavy as a coefficient of the fields.
+        # The mass of a sensor state is the mean mass of a coefficient of the fields.
         weight = float(form_M.matrix("v", "u").diagonal().sum()) / form_M.spaces["u"].dim
         mesh, order = form_M.terms[0].measure.mesh, form_M.terms[0].measure.order
         for name, one in sensors.items():

@@ -1,4 +1,4 @@
-"""Inner products of Sobolev spaces H^s by sparse matrices, and smooth random fields."""
+"""Inner products of Sobolev spaces H^s from sparse matrices, and smooth random fields."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from livepde.errors import SpaceError, require_positive
 from livepde.linalg import Array, Pattern, analyse
 
 SMOOTH = (ElementLineHermite, ElementQuadBFS, ElementTriArgyris)  # of class C^1
-# Spacing of the quadrature points in log b. The trapezoidal rule has the error 2 exp(-2 pi^2 /
-# SPACING) = 1e-4, since the integrand is analytic in a strip.
+# Spacing of the quadrature points in log b. The error of the trapezoidal rule is 2 exp(-2 pi^2 /
+# SPACING) = 1e-4, because the integrand is analytic in a strip.
 SPACING = 2.0
 # Factor by which the quadrature points extend beyond the spectrum on each side.
 REACH = 50.0
@@ -33,35 +33,35 @@ class Sobolev:
 
         (q, xi)_s = (L^s q, xi)_{L^2},    L = I - length^2 Laplace,    s >= 0
 
-    with natural boundary values, or zero ones where the field has a Dirichlet condition. In
-    coefficients, with the mass matrix M and K that of L, G = M (M^{-1} K)^s:
+    with natural boundary conditions, or zero values on boundaries with a Dirichlet condition. In
+    coefficients, with the mass matrix M and the matrix K of L, G = M (M^{-1} K)^s:
 
-    - s = 0 and 1 are M and K, sparse.
-    - s = 2 with an element of class C^1 (Hermite on lines, Bogner-Fox-Schmit, Argyris) is the form
-      q xi + 2 length^2 grad q . grad xi + length^4 hess q : hess xi, sparse.
-    - All others are dense, but Schur complements of a sparse matrix, `border`: s = 2 is
-      K M^{-1} K, with one auxiliary field; orders above 2 are reduced by 2 with two more; for
-      fractional orders, lambda^sigma = c_0 + sum of w_i lambda/(lambda + b_i) by Balakrishnan's
-      formula and the trapezoidal rule in log b, with one auxiliary field for each of the 10 to 15
-      poles and a relative error of 1e-3 at most, which keeps the inner product symmetric, positive
-      and equivalent to the exact one.
+    - For s = 0 and 1, it is M or K, sparse.
+    - For s = 2 and an element of class C^1 (Hermite on lines, Bogner-Fox-Schmit, Argyris), it is
+      the form q xi + 2 length^2 grad q . grad xi + length^4 hess q : hess xi, sparse.
+    - Otherwise it is dense, but the Schur complement of a sparse matrix, `border`. s = 2 is
+      K M^{-1} K, with one auxiliary field. Orders above 2 are reduced by 2 with two more fields.
+      For fractional orders, lambda^sigma = c_0 + sum of w_i lambda/(lambda + b_i) follows from
+      Balakrishnan's formula and the trapezoidal rule in log b, with one auxiliary field for each
+      of 10 to 15 poles. Its relative error is at most 1e-3. The inner product remains symmetric,
+      positive and equivalent to the exact one.
 
-    Both laws use the border and never form G. The cost: a step of `GradientLaw` solves for the
-    auxiliary fields too, about 15 times as many unknowns for fractional s. In `SensitivityLaw` they
-    enter only once, when its modes are computed.
+    Both laws use the border and never form G. A step of `GradientLaw` also solves for the auxiliary
+    fields, about 15 times as many unknowns for fractional s. `SensitivityLaw` uses them only once,
+    to compute its modes.
 
-    For s > 3/2 a natural boundary value is part of the space (the normal derivative vanishes), so
-    that parameters with a slope at the boundary are approximated less well there; the form of the
-    C^1 elements does not impose it.
+    For s > 3/2, the natural boundary condition (a vanishing normal derivative) is part of the
+    space, so that parameters with a slope at the boundary are approximated less well there. The
+    form for C^1 elements does not impose it.
 
     Parameters
     ----------
     s
         Order.
     length
-        Length over which q is correlated, in the unit of the mesh.
+        Correlation length of q, in the unit of the mesh.
     factor
-        Of the inner product; `pointwise` chooses it.
+        Factor of the inner product, see `pointwise`.
 
     Examples
     --------
@@ -80,16 +80,16 @@ class Sobolev:
         require_positive("Sobolev: length", self.length, SpaceError)
 
     def pointwise(self, dimension: int) -> Sobolev:
-        """Return the inner product with `std` of a field as its pointwise standard deviation.
+        """Return the inner product for which `std` of a field is its pointwise standard deviation.
 
         The prior covariance std^2 G^{-1} is then the Whittle-Matern covariance with variance std^2
-        in the interior; within about a length of a free boundary the standard deviation grows, to
-        sqrt(2) std on it, and to 2 std at a corner.
+        in the interior. Within about a length of a free boundary, the standard deviation increases,
+        to sqrt(2) std at the boundary and to 2 std at a corner.
 
         Raises
         ------
         SpaceError
-            If s <= dimension/2, where point values have infinite variance.
+            s <= dimension/2, for which point values have infinite variance.
 
         Examples
         --------
@@ -107,7 +107,7 @@ class Sobolev:
         return replace(self, factor=float(gamma(self.s - half) / gamma(self.s) / volume))
 
     def form(self, element: Any) -> Any:
-        """Return the inner product as a weak form; None if the element admits none."""
+        """Return the inner product as a weak form; None if there is none for the element."""
         c, l2 = self.factor, self.length**2
         if self.s == 0:
             return lambda u, v, x: c * (u * v)
@@ -126,8 +126,8 @@ class Sobolev:
     def border(self, M: sp.csr_array, K: sp.csr_array, free: Array) -> sp.csr_array:
         """Return the sparse matrix whose Schur complement on the first n unknowns is G.
 
-        M is the mass matrix, K that of `operator`, shape (n, n); `free` is one for each free
-        coefficient, zero for each fixed one, which is decoupled.
+        M is the mass matrix and K the matrix of `operator`, shape (n, n). `free` is one for free
+        and zero for fixed coefficients, which are decoupled.
         """
         mask, fixed = sp.diags_array(free), sp.diags_array(1.0 - free)
         M, K = (sp.csr_array(mask @ matrix @ mask + fixed) for matrix in (M, K))
@@ -149,7 +149,7 @@ def _border(s: float, M: Any, K: Any) -> Any:
 
 
 def _fractional_border(s: float, M: Any, K: Any) -> Any:
-    # With one auxiliary field for each pole the Schur complement E - sum F H^{-1} F is
+    # With one auxiliary field for each pole, the Schur complement E - sum F H^{-1} F is
     # lambda^s = lambda^{s - sigma} (c + sum w lambda/(lambda + b)).
     largest = _largest(M, K)
     c, weights, poles = _balakrishnan(s % 1, largest)
@@ -157,7 +157,7 @@ def _fractional_border(s: float, M: Any, K: Any) -> Any:
     if s > 1:
         E, F, H = c * K, [K] * len(poles), [-matrix for matrix in shifted]
     else:  # lambda/(lambda + b) = 1 - b/(lambda + b) = lambda/b - lambda^2/b/(lambda + b)
-        near = poles <= np.sqrt(largest)  # each where it cancels less
+        near = poles <= np.sqrt(largest)  # choose the form with less cancellation
         E = (c + weights[near].sum()) * M + (weights / poles)[~near].sum() * K
         F = [M if close else K for close in near]
         H = [m / b if n else m * b for m, b, n in zip(shifted, poles, near, strict=True)]
@@ -173,8 +173,8 @@ def _largest(M: sp.csr_array, K: sp.csr_array) -> float:
     factor = analyse(Pattern.of(M), symmetric=True).factorise(sp.csr_array(M).sorted_indices().data)
     inverse = LinearOperator(M.shape, matvec=factor.solve, dtype=float)
     value = eigsh(K, k=1, M=M, Minv=inverse, v0=start, tol=0.05, return_eigenvectors=False)
-    # The eigenvalue is computed to 5 % only; the margin of 20 % makes it an upper bound. The poles
-    # depend on it logarithmically, so accuracy would not pay.
+    # The tolerance is 5 %, and the margin of 20 % makes the result an upper bound. The poles depend
+    # on it only logarithmically.
     return 1.2 * float(value[0])
 
 
@@ -182,7 +182,7 @@ def _balakrishnan(sigma: float, largest: float) -> tuple[float, Array, Array]:
     """Return c_0, w, b with lambda^sigma = c_0 + sum of w lambda/(lambda + b) on [1, largest].
 
     lambda^sigma = sin(pi sigma)/pi times the integral over y of b^sigma lambda/(lambda + b) with b
-    = e^y. The terms beyond the outermost poles are geometric series, summed in c_0 and one far
+    = e^y. The terms beyond the outermost poles are geometric series, whose sums are c_0 and one far
     pole.
     """
     low, high = -np.log(REACH), np.log(REACH * largest)
@@ -194,22 +194,22 @@ def _balakrishnan(sigma: float, largest: float) -> tuple[float, Array, Array]:
     return float(c), np.append(w, w[-1] * REACH * above / (1 - above)), np.append(b, far)
 
 
-MOST = 8  # functions of a field at most
-KEPT = 0.98  # share of the mean variance that they represent, if so many are enough
-LEAST = 0.5  # share of it below which a stated deviation is not represented
-CANDIDATES = 2000  # vertices that are looked at
-LENGTH = 0.5  # correlation length, as a share of the largest side of the domain
-NUGGET = 1e-10  # of the variance: places that are close to each other stay independent
-ROUNDING = 100.0 * NUGGET  # of the variance: no more is left where a value is known
+MOST = 8  # most functions of a field
+KEPT = 0.98  # share of the mean variance that the functions represent, unless `MOST` limits them
+LEAST = 0.5  # share of the mean variance below which a given deviation is an error
+CANDIDATES = 2000  # most vertices that are candidates for pivots
+LENGTH = 0.5  # default correlation length over the largest side of the domain
+NUGGET = 1e-10  # added variance, which regularises covariances of close positions
+ROUNDING = 100.0 * NUGGET  # remaining variance below which a value counts as known
 
 Known: TypeAlias = Mapping[Any, float]
 
 
 @dataclass(frozen=True, eq=False)
 class _Kernel:
-    """Matern covariance of smoothness 3/2 on places (places, d), of a correlation length.
+    """Matern covariance of smoothness 3/2 with a correlation length, at positions (places, d).
 
-    The field is zero at the first `known` of the places.
+    The field is zero at the first `known` positions.
     """
 
     places: Array
@@ -217,7 +217,7 @@ class _Kernel:
     known: int
 
     def covariance(self, one: Array, other: Array) -> Array:
-        """Return the covariance of the field at places (a, d) and (b, d), shape (a, b)."""
+        """Return the covariance of the field between positions (a, d) and (b, d), shape (a, b)."""
         d = np.linalg.norm(one[:, None] - other[None], axis=2) * (np.sqrt(3.0) / self.length)
         return np.asarray((1.0 + d) * np.exp(-d))
 
@@ -229,7 +229,7 @@ class _Kernel:
         return found[self.known :]
 
     def mixed(self, mix: Array, x: Any) -> Array:
-        """Return a mix of the functions at x, shape (d, ...)."""
+        """Return a linear combination of the functions at x of shape (d, ...)."""
         x = np.asarray(x, dtype=float)
         found: Array = mix @ self.features(x.reshape(len(x), -1).T)
         return found.reshape(x.shape[1:])
@@ -245,30 +245,30 @@ def random_field(
 ) -> tuple[Callable[[Any], Array], ...]:
     """Return independent functions of x, each one standard deviation of a smooth random field.
 
-    The field has a Matern covariance of smoothness 3/2. It is zero where values are known, and
-    grows between these places and beyond them (kriging): it is the error of an initial state that
-    was interpolated from readings. The leading functions of its covariance are kept; on an interval
-    they are straight lines between the vertices, so that elements of first order have them exactly.
+    The field has a Matern covariance of smoothness 3/2. It is zero at positions with known values,
+    and its variance grows between and beyond them (kriging). It models the error of an initial
+    state that is interpolated from readings. The leading functions of its covariance are returned.
+    On an interval they are linear between vertices, so elements of first order are exact.
 
     Parameters
     ----------
     mesh
         The mesh of the state.
     std
-        Largest standard deviation of the field on the mesh. Default: from the spread of the known
-        values, the estimate of ordinary kriging; a single value has none.
+        Largest standard deviation of the field on the mesh. The default is an estimate from the
+        spread of at least two known values by ordinary kriging.
     known
-        Position (a number, or coordinates) -> value that is known there.
+        Position (a number, or coordinates) -> known value.
     length
         Correlation length; default half of the largest side of the domain.
     most
-        Number of functions at most.
+        Maximum number of functions.
 
     Raises
     ------
     SpaceError
-        A length or deviation that is not positive, or a stated deviation of which the functions
-        represent less than half of the variance, because the length is short.
+        A length or deviation is not positive; or `std` is given, and the functions represent less
+        than half of the variance because the length is short.
 
     Examples
     --------
@@ -294,7 +294,7 @@ def random_field(
         return ()
     kernel = _with_pivots(kernel, points, left, 3 * most)
     features = kernel.features(points)
-    # Directions of the features by their share of the mean variance.
+    # Order the directions of the features by their share of the mean variance.
     square, vectors = np.linalg.eigh(features @ features.T)
     share = np.cumsum(square[::-1]) / left.sum()
     count = min(int(np.searchsorted(share, KEPT)) + 1, most, len(share))
@@ -315,7 +315,7 @@ def random_field(
 def _functions(
     kernel: _Kernel, scale: float, mixes: Array, vertices: Array
 ) -> tuple[Callable[..., Array], ...]:
-    """Return mixes of the functions of a kernel; on an interval straight between the vertices."""
+    """Return combinations of functions of a kernel; on an interval, linear between vertices."""
     if scale == 0.0:
         return ()
     functions = [partial(kernel.mixed, mix) for mix in scale * mixes]
@@ -330,7 +330,7 @@ def _straight(nodes: Array, values: Array, x: Any) -> Array:
 
 
 def _with_pivots(kernel: _Kernel, points: Array, left: Array, most: int) -> _Kernel:
-    """Return the kernel with places added, each where the most variance is left."""
+    """Return the kernel with added positions, each at the largest remaining variance."""
     first = float(left.max())
     while len(kernel.places) - kernel.known < most and left.max() > 1e-3 * first:
         places = np.vstack([kernel.places, points[int(left.argmax())]])
@@ -340,7 +340,7 @@ def _with_pivots(kernel: _Kernel, points: Array, left: Array, most: int) -> _Ker
 
 
 def _explained(kernel: _Kernel, points: Array) -> Array:
-    """Return the share of the variance at points that all places of a kernel explain."""
+    """Return the share of the variance at points that the positions of a kernel explain."""
     if not len(kernel.places):
         return np.zeros(len(points))
     whole = _Kernel(kernel.places, kernel.length, 0)
@@ -348,7 +348,7 @@ def _explained(kernel: _Kernel, points: Array) -> Array:
 
 
 def _spread(kernel: _Kernel, values: Array) -> float:
-    """Return the standard deviation of a field of unknown mean with these values."""
+    """Return the estimated standard deviation of a field with unknown mean and given values."""
     places = kernel.places[: kernel.known]
     weights = np.linalg.inv(kernel.covariance(places, places) + NUGGET * np.eye(len(values)))
     off = values - (weights @ values).sum() / weights.sum()

@@ -32,17 +32,17 @@ from livepde.linalg import Array, IntArray, Mask, compact
 
 
 class Named(SimpleNamespace):
-    """Namespace of several unknowns or components in forms and sensors: q.D, u.c."""
+    """Namespace for several unknowns or components in forms and sensors: q.D, u.c."""
 
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(f"there is no '{name}'; there are {sorted(vars(self))}")
 
 
 class LocalSpace:
-    """Function space on one measure: point values, and integrals against shape functions.
+    """Function space on one measure: point values, and integrals times shape functions.
 
-    On a cached measure all operations are products with precomputed sparse or dense matrices. On a
-    piece of a larger measure nothing is precomputed, and derivatives that a form does not use are
+    On a cached measure, all operations are products with precomputed sparse or dense matrices. On a
+    piece of a larger measure, nothing is precomputed, and derivatives that a form does not use are
     never evaluated.
     """
 
@@ -58,7 +58,7 @@ class LocalSpace:
 
     @cached_property
     def _owners(self) -> list[tuple[Local, slice, str, int]]:
-        """Owner of each component: block, slice of local functions, derivative, index in it."""
+        """Block, slice of local functions, derivative, and index in it for each component."""
         owners, left = [], 0
         for local in self.locals:
             columns = slice(left, left + len(local.dofs))
@@ -69,7 +69,7 @@ class LocalSpace:
 
     @property
     def owners(self) -> list[tuple[int, str]]:
-        """Number of the block of each component, and of which derivative it is a part."""
+        """Index of the block, and name of the derivative, for each component."""
         return [(self.locals.index(local), name) for local, _, name, _ in self._owners]
 
     @cached_property
@@ -78,7 +78,7 @@ class LocalSpace:
         return np.array([name != "value" for _, _, name, _ in self._owners])
 
     def component(self, k: int) -> tuple[slice, Array]:
-        """Return the slice of local functions of a component, and its values (local, E, P)."""
+        """Return the slice of local functions of a component, and their values (local, E, P)."""
         local, columns, name, at = self._owners[k]
         return columns, local.part(name)[at]
 
@@ -93,7 +93,7 @@ class LocalSpace:
 
     @cached_property
     def evaluation(self) -> sp.csr_array:
-        """Matrix from coefficients to all components at all points (fact 10 of the design)."""
+        """Matrix from coefficients to all components at all points, (components * E * P, dim)."""
         components, _, elements, points = self.phi.shape
         c, i, e, p = np.nonzero(self.phi)
         rows = (c * elements + e) * points + p
@@ -116,7 +116,7 @@ class LocalSpace:
         return values
 
     def tested(self, density: Array, weights: Array) -> Array:
-        """Return the integrals of a density, shape (components, E, P), against all functions."""
+        """Return the integrals of a density, shape (components, E, P), times each function."""
         if self.kept:
             weighted = np.empty((self.components, *self.shape))
             np.multiply(density, weights, out=weighted)
@@ -130,7 +130,7 @@ class LocalSpace:
         return result
 
     def paired(self, density: Array, weights: Array, other: LocalSpace) -> Array:
-        """Return the integrals of a density against all pairs of functions, shape (i, j, E).
+        """Return the integrals of a density times each pair of functions, shape (i, j, E).
 
         The density has the shape (components, components of `other`, E, P).
         """
@@ -149,7 +149,7 @@ class LocalSpace:
     def tripled(
         self, density: Array, weights: Array, second: LocalSpace, third: LocalSpace
     ) -> Array:
-        """Return the integrals of a density against all triples of functions, (i, j, n, E)."""
+        """Return the integrals of a density times each triple of functions, (i, j, n, E)."""
         shape = (self.components, second.components, third.components)
         if self.kept:
             weighted = np.broadcast_to(density * weights, (*shape, *self.shape))
@@ -170,13 +170,13 @@ class LocalSpace:
         return np.zeros((self.components, *self.shape))
 
     def units(self, axis: int, axes: int) -> Array:
-        """Return all unit jets as one batch, along batch axis `axis` of `axes`."""
+        """Return all unit jets as one batch along the batch axis `axis` of `axes`."""
         batch = [1] * axes
         batch[axis] = self.components
         return np.eye(self.components).reshape(self.components, *batch, 1, 1)
 
     def unit_jets(self, axis: int, axes: int) -> Any:
-        """Return the jets of `units(axis, axes)`, cached because they never change."""
+        """Return the jets of `units(axis, axes)`, which are cached."""
         if (axis, axes) not in self._units:
             self._units[axis, axes] = self.jets(self.units(axis, axes))
         return self._units[axis, axes]
@@ -190,7 +190,7 @@ class LocalSpace:
             start = stop
         if self.space.single or any(name in self.space.sensors for name in self.blocks):
             return jets[0]
-        # Regions with priors of their own, as k[soil], add up to q.k: each is zero elsewhere.
+        # Regions with separate priors, such as k[soil], sum to q.k: each is zero elsewhere.
         found: dict[str, Any] = {}
         for name, jet in zip(map(base_name, self.blocks), jets, strict=True):
             found[name] = found[name] + jet if name in found else jet
@@ -198,23 +198,23 @@ class LocalSpace:
 
 
 def _parts(density: Array, axes: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], Array]]:
-    """Yield index and values of the non-zero components of a density."""
+    """Yield index and values of each non-zero component of a density."""
     density = np.asarray(density)
     density = density.reshape((1,) * (len(axes) + 2 - density.ndim) + density.shape)
     density = np.broadcast_to(density, axes + density.shape[len(axes) :])
     for index in np.ndindex(axes):
-        # Most components of a density are exactly zero, since a form uses few derivatives.
+        # Most components of a density are exactly zero, because a form uses few derivatives.
         if density[index].any():
             yield index, density[index]
 
 
 @dataclass(frozen=True, kw_only=True)
 class NamedUnknowns:
-    """Names of unknowns, their places among the coefficients, and their priors.
+    """Names of unknowns, their indices among the coefficients, and their priors.
 
-    An estimate that is pickled holds this instead of a `FunctionSpace`, whose functions (of
-    regions, of boundary values) cannot be pickled. Each of `unknowns` is a number with the same
-    prior, evolution and unit; `fields` has the names of fields as keys.
+    Estimates contain this instead of a `FunctionSpace`, because functions of regions and boundary
+    values cannot be pickled. Each of `unknowns` is a `Scalar` with the prior, evolution and unit of
+    an unknown; `fields` has the names of fields as keys.
     """
 
     labels: Mapping[str, int]
@@ -224,7 +224,7 @@ class NamedUnknowns:
 
     @property
     def described(self) -> NamedUnknowns:
-        """Itself."""
+        """The object itself, see `FunctionSpace.described`."""
         return self
 
     def part(self, name: str) -> slice:
@@ -238,9 +238,9 @@ class NamedUnknowns:
 class FunctionSpace:
     """A product of unknowns, each a field, a scalar, or values per region.
 
-    With `single`, forms get the unknown itself, not a namespace. Regions with priors of their own
-    are unknowns, "k[soil]", of which forms see the sum, q.k. A state may also have `sensors` that
-    respond slowly, with the row (1, n) that each sees of the fields.
+    With `single`, the argument of forms is the unknown itself instead of a namespace. Regions with
+    separate priors are unknowns, such as "k[soil]", whose sum is q.k in forms. A state may also
+    have slow `sensors`: name -> row of the input on the fields, (1, n).
     """
 
     unknowns: Mapping[str, Declaration]
@@ -249,7 +249,7 @@ class FunctionSpace:
 
     @classmethod
     def of(cls, unknown: Unknown | Mapping[str, Unknown], name: str) -> FunctionSpace:
-        """Return the space of one unknown, called `name`, or of a mapping of several."""
+        """Return the space of one unknown with the given name, or of a mapping of unknowns."""
         if isinstance(unknown, Mapping):
             if not unknown:
                 raise SpaceError("parameter={}: name at least one unknown.")
@@ -270,23 +270,23 @@ class FunctionSpace:
 
     @cached_property
     def blocks(self) -> dict[str, Any]:
-        """Block of each unknown, by name."""
+        """Name -> block, for all unknowns and slow sensors."""
         found: dict[str, Any] = {name: block_of(item) for name, item in self.unknowns.items()}
         size = sum(block.size for block in found.values())
         rows = enumerate(self.sensors.items(), size)
         return found | {name: SensorBlock(number, row) for number, (name, row) in rows}
 
     def blocks_on(self, measure: Measure) -> dict[str, Any]:
-        """Return the blocks that forms see on a measure."""
+        """Return name -> block, for the arguments of forms on a measure."""
         if not isinstance(measure, SensorMeasure):
             return {name: one for name, one in self.blocks.items() if name not in self.sensors}
         if self.sensors:
             return {measure.sensor: self.blocks[measure.sensor]}
-        # Of the unknowns those with a number for each sensor.
+        # In a space of unknowns, only blocks with named numbers are available.
         return {name: one for name, one in self.blocks.items() if isinstance(one, NamesBlock)}
 
     def with_sensors(self, sensors: Mapping[str, SensorState]) -> FunctionSpace:
-        """Return a space of states with sensors that respond slowly."""
+        """Return the space with additional states of slow sensors."""
         if not sensors:
             return self
         if taken := sorted(set(sensors) & set(self.parts)):
@@ -295,16 +295,16 @@ class FunctionSpace:
 
     @property
     def seen(self) -> int:
-        """Number of coefficients of fields, which sensors see; those of slow sensors follow."""
+        """Number of coefficients of fields; the states of slow sensors follow."""
         return self.dim - len(self.sensors)
 
     @cached_property
     def of_fields(self) -> Array:
-        """Ones for coefficients of fields, zeros for the states of sensors, shape (dim,)."""
+        """Ones for coefficients of fields, and zeros for states of sensors, shape (dim,)."""
         return np.repeat([1.0, 0.0], [self.seen, len(self.sensors)])
 
     def completed(self, u: Array) -> Array:
-        """Return states, (dim,) or (dim, k), in which each slow sensor shows its input."""
+        """Return states, (dim,) or (dim, k), with outputs of slow sensors equal to their inputs."""
         if not self.sensors:
             return u
         found = u.copy()
@@ -314,7 +314,7 @@ class FunctionSpace:
 
     @cached_property
     def mesh(self) -> Mesh:
-        """The mesh of a state, which all components share."""
+        """Common mesh of the components of a state."""
         if len(self.fields) < len(self.unknowns):
             numbers = sorted(set(self.unknowns) - set(self.fields))
             raise ModelError(f"state: {numbers} must be a Field, on the mesh of the others.")
@@ -330,7 +330,7 @@ class FunctionSpace:
     def weight(self) -> Callable[[Array], Any]:
         """Volume element of the coordinates of a state.
 
-        Raises `ModelError`: the components state different ones, or it is negative at a vertex.
+        Raises `ModelError`: it differs between components, or is negative at a vertex.
         """
         points = self.mesh.p
         given = [block.field.weight for block in self.fields.values()]
@@ -347,7 +347,7 @@ class FunctionSpace:
         return given[0]
 
     def product(self, u: Any, v: Any, x: Any) -> Any:
-        """Return the L2 inner product of a state as an integrand: the sum over components."""
+        """Return the integrand of the L2 inner product of a state: a sum over components."""
         products = {name: _product(block) for name, block in self.fields.items()}
         if self.single:
             (single,) = products.values()
@@ -367,7 +367,7 @@ class FunctionSpace:
 
     @cached_property
     def parts(self) -> dict[str, slice]:
-        """Slice of each block among the coefficients, and of each name that forms see."""
+        """Slice of coefficients for each block, and for each name in forms."""
         found: dict[str, slice] = {}
         for (name, block), start in zip(self.blocks.items(), self.starts, strict=True):
             found[name] = slice(start, start + block.size)
@@ -376,16 +376,16 @@ class FunctionSpace:
         return found
 
     def part(self, name: str) -> slice:
-        """Return the slice of one block, or of all regions of an unknown, in the coefficients."""
+        """Return the slice of coefficients of a block, or of all regions of an unknown."""
         return self.parts[name]
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names that forms see."""
+        """Names of unknowns in forms."""
         return tuple(dict.fromkeys(map(base_name, self.blocks)))
 
     def unknown_of(self, label: str) -> Declaration:
-        """Return the unknown of a scalar label."""
+        """Return the unknown with a scalar label."""
         return self.unknowns[label if label in self.unknowns else base_name(label)]
 
     @cached_property
@@ -401,7 +401,7 @@ class FunctionSpace:
 
     @cached_property
     def labels(self) -> dict[str, int]:
-        """Coefficient number of each scalar unknown, by label."""
+        """Label of a scalar unknown -> index of its coefficient."""
         found: dict[str, int] = {}
         for (name, block), start in zip(self.blocks.items(), self.starts, strict=True):
             found |= {label: start + k for k, label in enumerate(block.labels(name))}
@@ -409,7 +409,7 @@ class FunctionSpace:
 
     @cached_property
     def described(self) -> NamedUnknowns:
-        """The space without functions and meshes, for readers of estimates."""
+        """Names and priors of the space, without functions and meshes, for estimates."""
         return NamedUnknowns(
             labels=self.labels,
             parts=self.parts,
@@ -422,7 +422,7 @@ class FunctionSpace:
 
     @cached_property
     def fields(self) -> dict[str, FieldBlock]:
-        """Block of each unknown that is a field, by name."""
+        """Name -> block, for unknowns that are fields."""
         return {n: block for n, block in self.blocks.items() if isinstance(block, FieldBlock)}
 
     def component(self, of: str = "") -> tuple[FieldBlock, slice]:
@@ -431,7 +431,7 @@ class FunctionSpace:
         Raises
         ------
         SpaceError
-            There is no such component, or several and none is named.
+            There is no such component, or there are several and `of` is empty.
         """
         if not of and len(self.fields) == 1:
             of = next(iter(self.fields))
@@ -455,7 +455,7 @@ class FunctionSpace:
         return self.widen(self.component(of)[0].probe(points, what), of)
 
     def prolongation(self, finer: FunctionSpace) -> sp.csr_array:
-        """Return the matrix from coefficients to those of the same functions on a finer mesh."""
+        """Return the matrix that maps coefficients to coefficients on a finer mesh."""
         pairs = zip(self.blocks.values(), finer.blocks.values(), strict=True)
         parts = [block.prolongation(other) for block, other in pairs]
         return sp.csr_array(sp.block_diag(parts, format="csr"))
@@ -480,7 +480,7 @@ class FunctionSpace:
         return each[0] if len(each) == 1 else np.concatenate(each)
 
     def local(self, measure: Measure) -> LocalSpace:
-        """Return the local space on a measure; cached ones are shared by all forms."""
+        """Return the local space on a measure; all forms share cached ones."""
         if measure.members is not None or measure.thin or not measure.kept:
             return LocalSpace(self, measure)
         key = (id(measure.mesh), measure.order, measure.name)
@@ -493,12 +493,12 @@ class FunctionSpace:
         return {}
 
     def interpolate(self, value: Any) -> Array:
-        """Return coefficients of a number, a function of x, coefficients, or a mapping by name.
+        """Return coefficients from a number, a function of x, coefficients, or a mapping by name.
 
-        With several fields, a number is the value of all of them. Sensors that respond slowly show
-        what they see, unless the coefficients have them.
+        With several fields, a number is the value of all of them. The outputs of slow sensors equal
+        their inputs, unless the given coefficients include them.
         """
-        if isinstance(value, Mapping):  # all others have the coefficients of the prior
+        if isinstance(value, Mapping):  # other unknowns have the coefficients of the prior
             if unknown := set(value) - set(self.parts):
                 raise SpaceError(f"no unknown is called {sorted(unknown)}; {list(self.parts)} are.")
             result = self.prior.copy()
@@ -511,7 +511,7 @@ class FunctionSpace:
         return self.completed(np.append(self._all(value, size), np.zeros(self.dim - size)))
 
     def _all(self, value: Any, size: int) -> Array:
-        """Return coefficients of all that are not of sensors."""
+        """Return the coefficients of all unknowns, without states of sensors."""
         if self.single:
             return self._interpolate(next(iter(self.blocks)), value)
         if callable(value):
@@ -539,7 +539,7 @@ def _coefficients(value: Any, size: int, name: str = "") -> Array:
 
 
 def _product(block: FieldBlock) -> Callable[[Any, Any], Any]:
-    """Return the product of two functions at a point: u v, of vectors u . v."""
+    """Return the pointwise product of two functions: u v, or u . v for vectors."""
     return dot if block.vector else lambda u, v: u * v
 
 
@@ -571,14 +571,14 @@ def _density(source: Source, state: FunctionSpace) -> Integrand:
 def _single_density(source: Any, block: FieldBlock) -> Integrand:
     product = _product(block)
     if callable(source):
-        timed = not ignores(source, 1)  # what it reads of x is seen where the form is evaluated
+        timed = not ignores(source, 1)  # otherwise the form would count as time-dependent
         return lambda v, x: product(source(x, x.t if timed else 0.0), v)
     level = float(source)
     return lambda v, x: level * v
 
 
 def volume_element(spaces: Iterable[FunctionSpace]) -> Callable[[Array], Any]:
-    """Return the volume element of the coordinates, which the state among some spaces states."""
+    """Return the volume element of the coordinates from the first weighted field in the spaces."""
     blocks = [block for space in spaces for block in space.fields.values()]
     stated = [block.field.weight for block in blocks if block.field.weight is not unweighted]
     return stated[0] if stated else unweighted
