@@ -72,7 +72,7 @@ class Scatter:
         self._places: dict[int, IntArray] = {}
 
     def add(self, data: Array, term: int, at: slice, local: Array, keep: bool = True) -> None:
-        """Add the entries of some elements of a term, shape (i, j, elements), to data.
+        """Add the entries of a slice of elements of a term, shape (i, j, elements), to data.
 
         `keep` caches the positions of this term's entries, for repeated assembly.
         """

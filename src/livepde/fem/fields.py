@@ -578,9 +578,9 @@ def upwind(b: Any, kappa: Any, h: Any) -> Any:
     """Return the optimal artificial diffusion, |b| h/2 (coth Pe - 1/Pe) with Pe = |b| h/(2 kappa).
 
     If it is added to kappa, elements of first order on a uniform interval are exact at the vertices
-    for the steady -kappa u'' + b u' = 0 with any cell Peclet number Pe (Brooks and Hughes 1982,
-    section 2). It vanishes like h^2 on fine meshes. In more dimensions it acts only along
-    streamlines. It is smooth also at b = 0, so that complex steps are valid.
+    for the steady -kappa u'' + b u' = 0. This holds for any cell Peclet number Pe (Brooks and
+    Hughes 1982, section 2). It vanishes like h^2 on fine meshes. In more dimensions it acts only
+    along streamlines. It is smooth also at b = 0, so that complex steps are valid.
 
     Parameters
     ----------

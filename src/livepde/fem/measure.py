@@ -66,10 +66,10 @@ START = Moment()
 class Place:
     """The argument `x` of a weak form.
 
-    `x[0], x[1], ...` are coordinates of the quadrature points, `x.t` is the time, `x.inputs["Q"]`
-    the value of an input channel, `x.normal` the outward normal (on boundaries), and `x.h` the
-    diameter of the cell or, on a boundary, of the adjacent cell, shape (elements, 1). The use of
-    time and inputs is recorded: a form that uses neither is assembled once.
+    `x[0], x[1], ...` are coordinates of the quadrature points, `x.t` is the time, and
+    `x.inputs["Q"]` the value of an input channel. `x.normal` is the outward normal (on boundaries),
+    and `x.h` the diameter of the cell (on boundaries, the adjacent cell), shape (elements, 1). The
+    use of time and inputs is recorded: a form that uses neither is assembled once.
     """
 
     def __init__(

@@ -29,7 +29,7 @@ REACH = 50.0
 
 @dataclass(frozen=True)
 class Sobolev:
-    """The inner product of H^s: the paper's Q = H^s(Omega), which needs s > d/2.
+    """Inner product of H^s, for Q = H^s(Omega) as in the paper, which requires s > d/2.
 
         (q, xi)_s = (L^s q, xi)_{L^2},    L = I - length^2 Laplace,    s >= 0
 

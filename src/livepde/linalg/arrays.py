@@ -254,8 +254,8 @@ def sandwich(
 ) -> tuple[IntArray, IntArray, sp.csr_array]:
     """Return the linear dependence of `left @ inner @ right` on the data of `inner`.
 
-    Returns rows and columns of the entries of the product, repeated if several terms contribute,
-    and the sparse matrix, (entries, inner.nnz), that maps the data of `inner` to their values.
+    Returns rows and columns of the entries, which repeat if several terms contribute, and the
+    sparse matrix, (entries, inner.nnz), that maps the data of `inner` to their values.
     """
     a, b = sp.csc_array(left), sp.csr_array(right)
     i, j = inner.rows, inner.indices

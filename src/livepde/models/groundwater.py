@@ -36,8 +36,8 @@ def pumping_test(
     """Return Ss r s_t - (k r s_r)_r + r leakance s/b = 0 for the drawdown around a well.
 
     At the wall of the well, -2 pi r b k s_r = Q; at the far end, s = 0. For a small radius and a
-    constant rate, this is the problem of Theis (1935), s = Q/(4 pi k b) E1(r^2 Ss/(4 k t)), and
-    with a leaky layer above, the problem of Hantush and Jacob (1955). The rate Q is the input
+    constant rate, this is the problem of Theis (1935), s = Q/(4 pi k b) E1(r^2 Ss/(4 k t)). With a
+    leaky layer above, it is the problem of Hantush and Jacob (1955). The rate Q is the input
     channel "Q" in m^3/s, positive for extraction. It may vary (step tests, recovery). The unknowns
     are positive: use `LogNormal`.
 

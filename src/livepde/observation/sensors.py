@@ -495,7 +495,7 @@ def _integral_inside(block: FieldBlock, measure: Measure, region: Predicate) -> 
     """Return the size of a region and integrals over it; cells at its border are divided."""
     mesh, cut = block.field.mesh, crossed(measure, region)
     size, row = _integral(block, measure, lambda x, cells: region(x) * ~np.isin(cells, cut))
-    # A region that contains no quadrature point is searched for on finer parts of all cells.
+    # Without quadrature points in the region and crossed cells, search finer parts of all cells.
     members = cut if size > 0 or len(cut) else np.arange(mesh.nelements)
     if len(members):
         fine = FineMeasure(mesh, measure.order, members=members, weight=measure.weight)

@@ -47,9 +47,9 @@ LINEAR = 1e-12
 class ForwardStage:
     """Implicit stage M (u - c)/h + B(u) + A(u) q = F(t) for u, with Dirichlet values imposed.
 
-    If B and A are affine in u with derivatives that depend on neither time nor inputs, the matrix
-    is factorised once for each (h, q), and a stage is one back-substitution with identical results.
-    `advance` also solves for tangents, and reuses a factor for nearby q and h.
+    If B and A are affine in u, and their derivatives depend on neither time nor inputs, the matrix
+    is factorised once for each (h, q). A stage is then one back-substitution with identical
+    results. `advance` also solves for tangents, and reuses a factor for nearby q and h.
     """
 
     def __init__(self, model: Model, newton: Newton | None = None) -> None:
@@ -327,9 +327,9 @@ class ForwardStage:
         """Return state and tangents at the end of a stage, and its warm-start data.
 
         If the matrix depends only on q and h, the factor of an earlier q is used for iterative
-        refinement until the error of the state is below 1e-8 of its norm and 1 % of its change. The
-        matrix is factorised again if the excess solves since the last factorisation would cost more
-        than a new one (`Solver.price`).
+        refinement. It ends if the error of the state is below 1e-8 of its norm and 1 % of its
+        change. The matrix is factorised again if the excess solves since the last factorisation
+        would cost more than a new one (`Solver.price`).
 
         Parameters
         ----------

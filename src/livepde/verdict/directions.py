@@ -1,9 +1,9 @@
 """Dictionary of causes of misfit: sensor errors, and terms that are missing in the model.
 
-A term such as a source, a loss or a boundary value changes the state by the free response p, which
-satisfies M p' + (B + A q)' p = load. It is computed by implicit Euler steps that span several
-samples, and its effect on the sensors is interpolated in between. To distinguish causes, 10 %
-accuracy suffices, so that a response costs a fraction of a step.
+A term such as a source, a loss or a boundary value changes the state by the free response p, with
+M p' + (B + A q)' p = load. It is computed by implicit Euler steps that span several samples, and
+its effect on the sensors is interpolated in between. To distinguish causes, 10 % accuracy suffices,
+so that a response costs a fraction of a step.
 """
 
 from __future__ import annotations

@@ -224,7 +224,7 @@ def flat(label: str, left: float) -> Finding:
 
 
 def _after_misfit(findings: Iterable[Finding]) -> list[Finding]:
-    """Return findings; if there is a misfit, it is named as the reason for wide intervals."""
+    """Return findings; a severe misfit becomes the reason for intervals of flat unknowns."""
     given = list(findings)
     if not any((one.what, one.severity) == ("misfit", "do not trust") for one in given):
         return given

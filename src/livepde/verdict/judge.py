@@ -118,7 +118,7 @@ class Judge:
         return Ledger.start(self.sensors, *counts, self.batch, self.numbers)
 
     def add(self, ledger: Ledger, sample: ScoredSample) -> tuple[Array, Ledger]:
-        """Return the ledger with a sample, and M before the update of this sample: the identity."""
+        """Return M before the update of this sample, the identity, and the ledger with it."""
         M = sample.M
         members, r, _ = M.shape
         # A full batch is summed when the next sample arrives, so that a verdict in between sums a

@@ -2,8 +2,8 @@
 
 The leading axis of every array is over members. A *direction* is a possible cause of misfit of unit
 amplitude, such as an offset of a sensor, a wrong boundary value, or a jump of an unknown. If its
-amplitude is theta, the whitened innovation r_k of a linear filter is white noise plus theta g_k,
-and the sums of g r and g g are sufficient statistics for theta (Rao 1948).
+amplitude is theta, the whitened innovation r_k of a linear filter is white noise plus theta g_k.
+The sums of g r and g g are then sufficient statistics for theta (Rao 1948).
 """
 
 from __future__ import annotations
