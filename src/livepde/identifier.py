@@ -1,4 +1,4 @@
-"""The only object with state: one call for every sample."""
+"""Identifier: sequential estimation of unknowns and state, one call for each sample."""
 
 from __future__ import annotations
 
@@ -55,63 +55,61 @@ from livepde.stream_runs import StreamRuns
 from livepde.taken import TakenSamples
 from livepde.verdict import Verdict
 
-FORMAT = 13  # of the checkpoint
+FORMAT = 13  # version of the checkpoint format
 
 
 class Identifier(StreamRuns):
-    """Identifies parameter and state of a model, sample by sample.
+    """Estimate the unknowns and the state of a model, sample by sample.
 
     Parameters
     ----------
     model
         The process.
     observation
-        Observation by the assimilated sensors.
+        Observation operator of the assimilated sensors.
     law
         Update law of the estimates; default `SensitivityLaw()`, which uses the noise of the
         sensors and the priors of the unknowns.
     q0, u0
-        Initial values: numbers, functions of x, coefficients, or for several unknowns a mapping.
-        A number as u0 is the value of all components of the state; a mapping names each of them.
-        q0 defaults to the prior mean, u0 to the initial state of the model (`initial`), else zero.
-        Without a sample at t0, boundary channels begin with the values that u0 has on their
-        boundaries. A u0 that is left out, or varies along such a boundary, states none.
+        Initial values: numbers, functions of x, coefficients, or mappings from names to those. A
+        number as u0 applies to all components of the state; a mapping requires each of them. q0
+        defaults to the prior mean, u0 to the initial state of the model (`initial`) or zero. If
+        there is no sample at t0, the value of u0 on a boundary is the initial value of its channel,
+        unless u0 is left out or varies along that boundary.
     t0
-        Initial time. A first sample at exactly t0 describes the start and takes no step; a law
-        may update the unknowns of the initial state by it. Without one, channels of the model
-        whose value at t0 is not known hold their first one over the first interval: the estimate
-        (`Estimate.held`) and the verdict name them.
+        Initial time. A first sample at exactly t0 takes no step; a law may update the unknowns of
+        the initial state with it. If there is none, channels of the model without a known value
+        at t0 hold their first value over the first interval. The verdict and `Estimate.held` list
+        them.
     validation
-        Sensors that are never assimilated, only predicted: a run that misses them is doubted.
+        Sensors that are predicted but never assimilated. Large errors count against the verdict.
     ignored
-        Names of those of `validation` that are only shown, such as a faulty sensor: how the run
-        predicts them never counts against it.
+        Names of validation sensors, such as a faulty one, that never affect the verdict.
     scheme, dt_max
-        Time scheme, default that of the law (`Law.scheme`); a longer interval between samples is
-        divided into substeps.
+        Time scheme, default `Law.scheme`, and longest substep: a longer interval between samples
+        is divided.
     halvings
-        A substep that is not solved is halved at most this often, before the step is a failed
-        status. 0: that at once, as where steps are to be those of the samples and no others; nor
-        are the first ones graded then, as for laws with a covariance (`Advance.start`).
+        Maximum number of successive halvings of a failed substep, before the status of the step is
+        a failure. 0: no substep is halved, and the first substeps are not graded as they otherwise
+        are for laws with a covariance (`Advance.start`).
     assimilate_from
-        Samples before this time drive inputs and are scored, but not assimilated.
+        Samples before this time drive inputs and are compared with the model, not assimilated.
     between
-        Input channel -> how it behaves between two readings. "line", the default: it changes
-        linearly. "hold": a reading holds until the next one, such as the state of a switch. "next":
-        a reading is the mean since the last one, such as the mean power of an interval, or the
-        setting of an actuator that is reported with the sample after it.
+        Input channel -> its behaviour between two readings. "line", the default: linear. "hold": a
+        reading holds until the next reading, such as the state of a switch. "next": a reading is
+        the mean since the previous reading, such as the mean power of an interval, or the setting
+        of an actuator that is reported with the next sample.
     input_noise
-        Channel of the model -> standard deviation of its noise, independent from sample to sample:
-        it makes the state less certain, for laws that have a covariance.
+        Channel of the model -> standard deviation of its noise, independent from sample to sample.
+        Laws with a covariance include it in the uncertainty of the state.
     u0_from
-        Channel -> derivative of u0 in its reading at t0, in a form as that of u0 (a function of x,
-        say): for a u0 that was made of readings. Their noise becomes the uncertainty of u0, and
-        they are not assimilated once more. A pair (derivative, standard deviation) states the noise
-        of this reading.
+        For a u0 computed from readings: channel -> derivative of u0 with respect to its reading at
+        t0, such as a function of x. The noise of these readings becomes the uncertainty of u0, and
+        they are not assimilated again. A pair (derivative, standard deviation) specifies the noise
+        of the reading.
     u0_errors
-        Independent errors of u0 itself, each one standard deviation, in forms as that of u0: the
-        functions of `random_field`, say. They are learned with the unknowns, for laws that have a
-        covariance.
+        Independent errors of u0, each of one standard deviation, specified like u0, for example by
+        the functions of `random_field`. Laws with a covariance estimate them with the unknowns.
 
     Raises
     ------
@@ -160,7 +158,7 @@ class Identifier(StreamRuns):
             raise ConfigurationError(f"dt_max must be positive; got {dt_max}.")
         u0_errors = tuple(u0_errors)
         check_start(model, t0, u0, {"u0_from": u0_from, "u0_errors": u0_errors})
-        # Unknowns of the sensors, as an offset, join those of the model: laws treat both alike.
+        # Unknowns of sensors, such as an offset, are added to the model: laws treat both equally.
         self.model = model = with_sensors(model, observation, validation)
         self.law = law
         spaces = (model.state_space, model.X, model.parameter_space)
@@ -170,10 +168,10 @@ class Identifier(StreamRuns):
         self._channels = Channels(model.channels, self.observed, self.validation)
         hidden = self._channels.hidden
         check_ignored(self.ignored, hidden)
-        # Positions of moving sensors are no inputs of the process: they move on lines.
+        # Positions of moving sensors are not inputs of the process: they are always linear.
         optional = self._channels.optional
         held = Held.of(between or {}, [c for c in self.inputs if c not in optional])
-        # The first steps after the start are short where intervals have to hold their error.
+        # Graded first steps keep the error of the time step small against the reported intervals.
         start = float(t0) if law.graded_start else math.nan
         control = Advance(scheme or law.scheme, dt_max, halvings, held, start=start)
         parts = model, self.observed, control, u0
@@ -192,10 +190,9 @@ class Identifier(StreamRuns):
         self._forget()
 
     def _forget(self) -> None:
-        """Go back to the start, as far as the law is concerned."""
+        """Reset the state of the law to the start."""
         self._state: Any = None
-        # Boundary values may come with the first sample; the initial state has to wait for them
-        # then.
+        # With inputs, the initial state depends on boundary values of the first sample.
         if not self.inputs:
             self._begin(self._so_far.inputs)
 
@@ -220,10 +217,10 @@ class Identifier(StreamRuns):
     def _started(
         self, q0: Array, u0: Array, problem: Problem, work: Any, *, assumed: bool
     ) -> Identifier:
-        """Return an identifier of the same parts with another start; for `Fleet.identifier`.
+        """Return a copy of the identifier with another start.
 
-        Latent parameter and state have the shapes (m,) and (n,). `problem` and the law's parts
-        `work` say how that state was given; `assumed`: nobody did.
+        `q0`, `u0`: latent parameters and state, shapes (m,) and (n,). `problem`, `work`: the
+        problem with this start, and its prepared data. `assumed`: u0 is the default, zero.
         """
         other = copy.copy(self)
         other._q0, other._u0 = q0, u0
@@ -232,9 +229,10 @@ class Identifier(StreamRuns):
         return other
 
     def _placed(self, state: Any, ends: Mapping[str, Array], samples: int) -> Identifier:
-        """Return an identifier of the same parts in another state; for `Fleet.identifier`.
+        """Return a copy of the identifier in the state of a member, for `Fleet.identifier`.
 
-        `state` is None before the first sample; `ends` is that of one member in `Fleet.ends`.
+        `state`: state of the law, None before the first sample. `ends`: values of the member in
+        `Fleet.ends`. `samples`: number of its samples.
         """
         other = copy.copy(self)
         other._state = state
@@ -243,7 +241,7 @@ class Identifier(StreamRuns):
         return other
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Identifier:
-        """Return an identifier that continues independently; model, law and matrices are shared."""
+        """Return an independent copy that shares model, law and matrices."""
         other = copy.copy(self)
         other._state, other._so_far = copy.deepcopy((self._state, self._so_far), memo)
         return other
@@ -272,12 +270,12 @@ class Identifier(StreamRuns):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Every channel a sample may name."""
+        """Names of all channels that a sample may contain."""
         return self._channels.names
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Channels that the model and the sensors read."""
+        """Names of the input channels of the model and the sensors."""
         return self._channels.inputs
 
     def step(
@@ -286,40 +284,40 @@ class Identifier(StreamRuns):
         z: Readings,
         inputs: Mapping[str, float] | None = None,
     ) -> Estimate:
-        """Take one sample and return the estimate at its time.
+        """Process one sample and return the estimate at its time.
 
         Parameters
         ----------
         t
             Time in the unit of the model, or a date; the first date is at t0.
         z, inputs
-            As of a `Sample`: an array in the order of the sensors, or a mapping by names. In a row
-            of a pandas table that has all channels, other columns are ignored.
+            As in `Sample`: an array in the order of the sensors, or a mapping from channels. If a
+            row of a pandas table has all channels, its other columns are ignored.
 
         Returns
         -------
         estimate
-            A step that fails numerically changes nothing and says so in its `status`; the next
-            sample tries again from the last good state. One with the status "departed" takes the
-            sample and holds the unknowns. Bad input raises and changes nothing.
+            If a step fails numerically, its `status` is the reason, and the next sample continues
+            from the last successful state. With the status "departed", the state is advanced and
+            the unknowns are held. Invalid input raises an error and changes nothing.
 
         Raises
         ------
         SampleError
-            Wrong shape, text, infinity, or an unknown channel; a noise that is not positive, or one
-            for a law that does not weigh readings.
+            Wrong shape, text, infinity, or an unknown channel; a noise that is not positive, or a
+            noise for a law that does not weigh readings.
         TimeOrderError
-            t is not later than the sample before.
+            t is not later than the previous sample.
         MissingInputError
-            An input has no value yet; a later gap holds the last value and is noted. The position
-            of a moving sensor may be missing, and is not held.
+            An input has no value yet. In later gaps the last value is held and counted. The
+            position of a moving sensor may be missing and is never held.
         """
         return self._taken(t, z, inputs)[0]
 
     def _taken(
         self, t: Any, z: Readings, inputs: Mapping[str, float] | None
     ) -> tuple[Estimate, Interval]:
-        """Take one sample; return the estimate, and the interval that the law was given."""
+        """Process one sample; return the estimate and the interval passed to the law."""
         t, origin = self._so_far.counted(t, self.model.time_unit)
         t = self._so_far.time_of_next(t)
         measured, noise, validation, named = self._channels.parse(z, inputs)
@@ -332,7 +330,7 @@ class Identifier(StreamRuns):
         missing = np.array(list(map(held.__contains__, names)), dtype=float)
         gaps = before.gaps.gaps(names, missing)
         now = End(t=t, inputs=values, z=used, noise=noise, gaps=gaps)
-        # A first sample at the initial time has an empty interval: both ends are the sample.
+        # The interval of a first sample at the initial time is empty: both its ends are the sample.
         interval = Interval.between(before.last if t > before.t else now, now)
         parts = self.law, self._work, self.problem
         self._state, report = stepped(*parts, self._state, interval)
@@ -342,22 +340,22 @@ class Identifier(StreamRuns):
         return estimate, replace(interval, parts=report.parts)
 
     def _filled(self, named: Mapping[str, float]) -> tuple[Inputs, tuple[str, ...]]:
-        """Return all inputs, and those whose missing value is replaced by the last one."""
+        """Return all inputs, and the names of missing inputs that hold their last value."""
         values, missing = self._channels.filled(named, self._so_far.known)
         # A value that holds until the next reading is not missing.
         known = self.problem.control.held.last
         return values, tuple(name for name in missing if name not in known) if known else missing
 
     def _opening(self, inputs: Inputs, t: float) -> Inputs:
-        """Return the inputs at the initial time, from those at t of the first sample."""
+        """Return the inputs at the initial time, given `inputs` of the first sample, at time t."""
         if t == self.t or not self._stated:
             return inputs
         return Inputs({**inputs, **self._stated})
 
     def _begun_by(self, values: Inputs, t: float) -> tuple[str, ...]:
-        """Begin with a first sample, unless no finite state comes of its inputs.
+        """Initialise the state by the inputs of a first sample; raise `SampleError` if not finite.
 
-        Return the channels of the model that have no value at the initial time.
+        Return the channels of the model without a known value at the initial time.
         """
         inputs = self._opening(values, t)
         try:
@@ -374,7 +372,7 @@ class Identifier(StreamRuns):
                 f"inputs {list(self.inputs)}; the run begins with the next one."
             )
         self._state = state
-        # The mean over the first interval comes with its end.
+        # A "next" input requires no initial value: its first reading is the mean since then.
         known = {*self._stated, *self.problem.control.held.next}
         missing = [name for name in self.model.channels if name not in known]
         unstated = tuple(missing) if t > self.t else ()
@@ -383,15 +381,15 @@ class Identifier(StreamRuns):
 
     @property
     def _place(self) -> tuple[Any, TakenSamples]:
-        """Snapshot for `return_to`, of values that a step replaces but never changes in place."""
+        """Snapshot for `_return_to`; steps replace these values and never modify them."""
         return self._state, self._so_far
 
     def _return_to(self, place: tuple[Any, TakenSamples]) -> None:
-        """Go back to a snapshot by `place`, as if no sample had been taken since then."""
+        """Restore a snapshot from `_place`, which undoes all later samples."""
         self._state, self._so_far = place
 
     def _check_weighs(self, noise: Array | None) -> None:
-        """Refuse the noise of readings where the law does not weigh them; None: there is none."""
+        """Raise `SampleError` if readings have their own noise and the law does not weigh them."""
         if noise is not None and not self.law.weighs_readings():
             raise SampleError(
                 f"{type(self.law).__name__} does not weigh readings by their noise: leave it out "
@@ -399,9 +397,9 @@ class Identifier(StreamRuns):
             )
 
     def _latent_belief(self) -> Belief:
-        """Return the belief of the law: q and its factor in latent coefficients.
+        """Return the belief of the law, with q and its factor in latent coefficients.
 
-        Those are the coefficients of `Model.Q`: of logarithms, say, or of harmonics.
+        Latent coefficients are elements of `Model.Q`, for example logarithms or amplitudes.
         """
         belief: Belief = self.law.belief(self._work, self._state)
         return belief
@@ -420,8 +418,8 @@ class Identifier(StreamRuns):
         *,
         scored: bool = False,
     ) -> Estimate:
-        # Estimates that are kept hold the small state of the law; mean and factors are computed
-        # when read.
+        # A stored estimate keeps only the small state of the law; mean and factors are computed on
+        # first access.
         latent, judge = self.law.deferred(self._work, self._state)
         problem, error = self.problem, validation
         read = latent if self.model.latent.plain else then(latent, problem.physical)
@@ -431,7 +429,7 @@ class Identifier(StreamRuns):
             predicted = self.validation.predict(belief.u, belief.q, Moment(t, inputs))
             error = validation - predicted
             if scored and t >= self.assimilate_from:
-                # Of the predicted values, without the noise of the sensors.
+                # Variance of the predicted values, without the noise of the sensors.
                 rows = seen_rows(self.validation, belief, Moment(t, inputs))
                 variance = np.zeros(len(error)) if rows is None else (rows * rows).sum(axis=1)
                 scores = self._so_far.validation.add(validation, predicted, variance)
@@ -454,7 +452,7 @@ class Identifier(StreamRuns):
     def _judge(
         self, judge: Callable[[], Verdict], diagnose: Callable[[], Diagnostics[float]]
     ) -> Callable[[], Verdict]:
-        """Return the verdict of the law with the findings on steps, validation sensors and gaps."""
+        """Return a function for the law's verdict with findings on steps, validation and gaps."""
         taken = self._so_far
         validation, gaps, steps = taken.validation, taken.gaps, taken.steps
         known, ignored = self.validation, self.ignored
@@ -479,7 +477,7 @@ class Identifier(StreamRuns):
         Raises
         ------
         MissingInputError
-            Model or sensors need channels and no sample has come yet.
+            Model or sensors require inputs, and no sample has been processed yet.
         """
         if self._state is None:
             raise MissingInputError(
@@ -495,15 +493,15 @@ class Identifier(StreamRuns):
         return self._estimate(taken.t, nothing, hidden, taken.inputs, report, ())
 
     def _settled(self, estimate: Estimate, *, columns: bool = True) -> Estimate:
-        """Return the last estimate after a fit of all stored samples, for the end of a run.
+        """Return the last estimate after a refit of all stored samples, for the end of a run.
 
-        The identifier does not change: the next sample finds it as it was. See `refit`.
+        The identifier itself does not change. See `refit`.
 
         Parameters
         ----------
         columns
-            Whether its verdict looks for errors of single columns, such as one in another unit,
-            where something speaks against the estimates.
+            If findings count against the estimates, test single columns for errors, such as values
+            in another unit.
         """
         if self._state is None:
             return estimate
@@ -514,7 +512,7 @@ class Identifier(StreamRuns):
             return replace(estimate, judge=self._judge(judge, known))
 
         def diagnose() -> Diagnostics[float]:
-            # What the last sample brought stays; the shifts belong to the new estimate.
+            # Diagnostics of the last sample are kept; the replaced ones depend on the new estimate.
             now = self.law.diagnosed(self._work, state)
             before = estimate.diagnostics
             return replace(
@@ -530,38 +528,38 @@ class Identifier(StreamRuns):
         )
 
     def refit(self) -> Estimate:
-        """Fit all stored samples again, continue from there, and return the estimate.
+        """Refit all stored samples, continue from the result, and return the estimate.
 
-        The most probable unknowns given these samples: see `livepde.laws.Refit`. For a law that
-        stores no samples the estimate is as it was.
+        The result is the most probable unknowns given these samples: see `livepde.laws.Refit`. If
+        the law stores no samples, the estimate does not change.
 
         Raises
         ------
         MissingInputError
-            As for `estimate`.
+            Model or sensors require inputs, and no sample has been processed yet.
         """
         if self._state is not None:
             self._state = self.law.settled(self._work, self._state)
         return self.estimate()
 
     def forecast(self, times: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None) -> Forecast:
-        """Return predicted readings if nothing more is measured; nothing is learned.
+        """Return predicted readings without further measurements; the identifier does not change.
 
-        Unknowns that evolve follow their prior, and standard deviations grow with them.
+        Moving unknowns evolve as in their prior, and standard deviations increase accordingly.
 
         Parameters
         ----------
         times
-            Later than the last sample and increasing, numbers or dates; the first may be the time
-            of this sample, for the readings at present.
+            Increasing numbers or dates after the last sample. The first may be the time of the last
+            sample, for its readings.
         inputs
-            Channel -> its value, or one for each time. A missing value (left out, NaN) is the last
-            one held; the position of a moving sensor only at the time of the last sample.
+            Channel -> one value, or one for each time. The last value is held where one is missing
+            (left out, NaN); the position of a moving sensor only at the time of the last sample.
 
         Raises
         ------
         SampleError
-            Another shape, text, infinity, an unknown input, or too many substeps between two times.
+            Wrong shape, text, infinity, an unknown input, or too many substeps between two times.
         TimeOrderError
             Times that do not increase.
         MissingInputError
@@ -595,7 +593,7 @@ class Identifier(StreamRuns):
 
     @property
     def fingerprint(self) -> Fingerprint:
-        """Numbers by which a checkpoint of this problem is known; computed when first asked for."""
+        """Fingerprint of the problem, stored in its checkpoints; computed on first access."""
         return self._fingerprint()
 
     def _header(self) -> dict[str, Any]:
@@ -613,7 +611,7 @@ class Identifier(StreamRuns):
         checkpoint.write(path, self.dump())
 
     def dump(self) -> bytes:
-        """Return the state as `save` writes it."""
+        """Return the state as bytes, in the format of `save`."""
         header = {**self._header(), "begun": self._state is not None}
         leaves = self._so_far.leaves | self.fingerprint.leaves
         if self._state is not None:
@@ -621,20 +619,20 @@ class Identifier(StreamRuns):
         return checkpoint.packed(header, leaves)
 
     def load(self, path: str | os.PathLike[str]) -> None:
-        """Continue from a saved state; the identifier must be built as the one that was saved.
+        """Continue from a saved state; the identifier must be built with the same arguments.
 
         Raises
         ------
         RunError
-            The file is damaged, or of another problem: another model, prior, sensor place or
-            boundary value, say, or another option of the law.
+            The file is damaged, or was saved for another problem: for example another model, prior,
+            sensor position, boundary value or option of the law.
         """
         self.restore(checkpoint.read(path), str(path))
 
     def restore(self, content: bytes, where: str = "the checkpoint") -> None:
-        """Continue from the bytes of `dump`, named `where` in messages. Raises as `load`."""
+        """Continue from the bytes of `dump`; `where` names them in the errors listed at `load`."""
         header, leaves = checkpoint.unpacked(content, where)
-        # Nothing of this identifier changes before all parts of the checkpoint have been read.
+        # The identifier does not change until all parts of the checkpoint have been read.
         mine = self._header()
         for key, value in mine.items():
             if header.get(key) != value:

@@ -1,4 +1,4 @@
-"""The stated start of a run, the noise of its inputs, and the problem that these make, checked."""
+"""Validation of the initial state and options of an identifier; construction of its problem."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from livepde.stepping import Advance, Scheme
 
 
 def check_parts(*parts: object) -> None:
-    """Refuse anything but a model, an observation and a law, in this order."""
+    """Raise `ConfigurationError` unless the parts are a model, an observation and a law."""
     for part, kind in zip(parts, (Model, Observation, Law), strict=True):
         if not isinstance(part, kind):
             remedy = ": call it" if isinstance(part, type) and issubclass(part, kind) else ""
@@ -31,7 +31,7 @@ def check_parts(*parts: object) -> None:
 
 
 def time_option(name: str, value: Any) -> float:
-    """Return a time or duration of the options; raises `ConfigurationError`."""
+    """Return the value of a time option as a float; raise `ConfigurationError` for other types."""
     if np.ndim(value) or np.asarray(value).dtype.kind not in "iuf" or math.isnan(value):
         raise ConfigurationError(
             f"{name} must be a number, in the unit of time of the model; got {value!r}."
@@ -40,7 +40,7 @@ def time_option(name: str, value: Any) -> float:
 
 
 def check_kinds(validation: Any, scheme: Any) -> None:
-    """Refuse a validation that is no observation, and a scheme that is none."""
+    """Raise `ConfigurationError` if `validation` or `scheme` has a wrong type."""
     for what, part, kind, expected in (
         ("validation", validation, Observation, "an observation, such as Points"),
         ("scheme", scheme, Scheme, "a time scheme, such as Alexander2()"),
@@ -50,7 +50,7 @@ def check_kinds(validation: Any, scheme: Any) -> None:
 
 
 def check_start(model: Model, t0: float, u0: Any, uncertain: Mapping[str, Any]) -> None:
-    """Refuse an initial time that is not finite, and an initial state given twice or not at all."""
+    """Raise `ConfigurationError` for a non-finite t0, or a missing or repeated initial state."""
     if not np.isfinite(t0):
         raise ConfigurationError(f"t0 must be a finite number; got {t0}.")
     for name, given in uncertain.items():
@@ -61,12 +61,12 @@ def check_start(model: Model, t0: float, u0: Any, uncertain: Mapping[str, Any]) 
 
 
 def assumes_zero(model: Model, u0: Any) -> bool:
-    """Return whether nobody states an initial state, so that it is zero."""
+    """Return whether no initial state is specified, so that zero is assumed."""
     return u0 is None and model.form_initial is None
 
 
 def check_ignored(names: Iterable[str], validation: tuple[str, ...]) -> None:
-    """Refuse names of ignored sensors that are not among those for validation."""
+    """Raise `ConfigurationError` if an ignored sensor is not a validation sensor."""
     for name in names:
         if name not in validation:
             raise ConfigurationError(
@@ -77,7 +77,7 @@ def check_ignored(names: Iterable[str], validation: tuple[str, ...]) -> None:
 def with_sensors(
     model: Model, observation: Observation, validation: Observation | None = None
 ) -> Model:
-    """Return a model with the unknowns of its sensors besides, and with the states of slow ones."""
+    """Return the model with the unknowns of its sensors and the states of slow sensors."""
     known = model.parameter_space.unknowns
     own = {name: item for name, item in observation.unknowns.items() if name not in known}
     model = model.with_unknowns(own) if own else model
@@ -87,7 +87,7 @@ def with_sensors(
 
 
 def _shown_states(validation: Observation | None) -> Mapping[str, SensorState]:
-    """Return the states of slow sensors that are only predicted, whose constants are known."""
+    """Return the states of slow validation sensors, whose time constants must be known."""
     shown = {} if validation is None else validation.states
     for name, state in shown.items():
         if state.unknown:
@@ -108,7 +108,7 @@ def stated_problem(
     u0_from: Mapping[str, Any] | None,
     u0_errors: Iterable[Any],
 ) -> Problem:
-    """Return the problem of an identifier from its options."""
+    """Return the problem defined by the options of an identifier."""
     noise = _input_noise(model, input_noise or {})
     readings = initial_readings(model, observed, u0_from or {})
     return Problem(model, observed, control, noise, readings, initial_errors(model, u0_errors), u0)
@@ -132,7 +132,7 @@ def _input_noise(model: Model, given: Mapping[str, float]) -> dict[str, float]:
 def initial_readings(
     model: Model, observed: Observed, u0_from: Mapping[str, Any]
 ) -> dict[str, InitialReading]:
-    """Return the readings that u0 was made of, each with the derivative of u0 in it."""
+    """Return the readings from which u0 was computed, each with the derivative of u0."""
     known = {*observed.names, *model.channels}
     for name in u0_from:
         if name not in known:
@@ -149,7 +149,7 @@ def initial_readings(
 
 
 def initial_errors(model: Model, u0_errors: Iterable[Any]) -> Array:
-    """Return coefficients of the errors of u0, shape (errors, n)."""
+    """Return coefficients of the independent errors of u0, shape (errors, n)."""
     found = np.array([model.state_space.interpolate(error) for error in u0_errors])
     found = found.reshape(-1, model.X.dim)
     if not np.isfinite(found).all():

@@ -1,4 +1,4 @@
-"""Whole runs of an identifier: estimates of all samples of a stream, smoothed ones, readings."""
+"""Runs of an identifier over whole streams: estimates, smoothed estimates and expected readings."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class StreamRuns(Shown):
-    """What `Identifier` makes of whole streams, by taking their samples one by one."""
+    """Methods of `Identifier` for whole streams, which process their samples one by one."""
 
     model: Model
     observed: Observed
@@ -52,7 +52,7 @@ class StreamRuns(Shown):
 
     @abstractmethod
     def step(self, t: Any, z: Readings, inputs: Mapping[str, float] | None = None) -> Estimate:
-        """Take one sample and return the estimate at its time."""
+        """Process one sample and return the estimate at its time."""
 
     @abstractmethod
     def _taken(
@@ -81,7 +81,7 @@ class StreamRuns(Shown):
 
     @property
     def origin(self) -> datetime | None:
-        """The date of t = 0 in UTC, once a sample with a date was taken; the first is at t0."""
+        """Date of t = 0 in UTC; None before a sample with a date. The first date is at t0."""
         origin = self._so_far.origin
         return None if np.isnan(origin) else origin_at(origin)
 
@@ -99,7 +99,7 @@ class StreamRuns(Shown):
         units: Mapping[str, str] | None = None,
         strict: bool | None = None,
     ) -> Result:
-        """Take every sample of a table, a file or a stream, and collect the estimates.
+        """Process all samples of a table, a file or a stream, and return the estimates.
 
         Parameters
         ----------
@@ -108,35 +108,35 @@ class StreamRuns(Shown):
             (`.csv`, `.jsonl`, `.parquet`); or an iterable of (t, z), (t, z, inputs) or `Sample`.
             Times are numbers or dates; the first date is at t0. Dates without a zone are in UTC.
         on_estimate
-            Called with each estimate before the next sample is asked for: a controller, say. Its
-            return value is ignored; an exception ends the run.
+            Function such as a controller, called with each estimate before the next sample is read.
+            Its return value is ignored; an exception ends the run.
         progress
-            Show a bar with rate and time left.
+            Show a progress bar with rate and remaining time.
         total
-            Number of samples, for the time left; default len(stream) if it has one.
+            Number of samples, for the remaining time; default len(stream) if it is defined.
         fields_every
-            Keep the fields of every so many samples (scalars and innovations of all).
+            Store fields of every `fields_every`-th sample; numbers and innovations of all samples.
         time
-            Column of the times; this and the options below are of tables and files. Default: the
-            index of a table, the coordinate of a dataset, or the one column that is called time,
-            date or the like.
+            Column of the times; this and the following options require a table or a file. Default:
+            the index of a table, the coordinate of a dataset, or the only column with a name such
+            as time or date.
         time_unit
-            Unit of times that are numbers; default that of the model. Required if the name of
-            their column has another one, such as time_min.
+            Unit of times that are numbers; default the unit of the model. Required if the name of
+            the column contains another unit, such as time_min.
         columns
-            Channel -> name of its column, where they differ: {"T_10": "TS_3_2_1"}.
+            Channel -> name of its column, if they differ: {"T_10": "TS_3_2_1"}.
         units
-            Sensor or boundary channel -> unit of its column, where that is not the unit of the
+            Sensor or boundary channel -> unit of its column, if it differs from the unit of the
             sensor or of the state.
         strict
-            Refuse columns that are no channel; by default they are ignored.
+            Raise an error for columns that are not channels; by default they are ignored.
 
         Raises
         ------
         DataError
-            A channel without a column; text or infinity in one; times that do not increase.
+            A channel without a column; text or infinity in a column; times that do not increase.
         ConfigurationError
-            Options that do not fit; dates for a model without `time_unit`.
+            Incompatible options; dates for a model without `time_unit`.
 
         Examples
         --------
@@ -153,7 +153,7 @@ class StreamRuns(Shown):
         options |= {"units": units, "strict": strict}
         given = {name: value for name, value in options.items() if value is not None}
         stream, result = self._samples_of(stream, given), self._result(fields_every)
-        begun, taken = copy.copy(self), list[Sample]()  # states of laws are values
+        begun, taken = copy.copy(self), list[Sample]()  # shallow, since states are immutable
         result.smoother = partial(begun.smoothed, taken, fields_every=fields_every)
         result.readings = partial(self._channels.readings, taken)
         if progress:
@@ -177,7 +177,7 @@ class StreamRuns(Shown):
         return result
 
     def _samples_of(self, data: Any, reading: Mapping[str, Any]) -> Iterable[Any]:
-        """Return a stream as it is, and the samples of a table with times of the model."""
+        """Return the samples of a table with times of the model; a stream is returned unchanged."""
         if not is_tabular(data):
             if reading:
                 raise ConfigurationError(
@@ -212,21 +212,21 @@ class StreamRuns(Shown):
         return Result(*parts, ignored=self.ignored)
 
     def _dated(self, layout: Layout) -> Layout:
-        """Return the layout of a run with the date of t = 0, if times are dates."""
+        """Return a layout with the date of t = 0 added, if times are dates."""
         if self.origin is None:
             return layout
         return replace(layout, attrs={**layout.attrs, "origin": self.origin.isoformat(sep=" ")})
 
     @property
     def _unsmoothed(self) -> str:
-        """Why the law smooths nothing; empty if it does."""
+        """Reason why the law cannot smooth; empty if it can."""
         return self.law.unsmoothed(self._work)
 
     def smoothed(self, stream: Any, *, fields_every: int = 1) -> xr.Dataset:
-        """Return the smoothed unknowns and state at each sample of a run, given all of them.
+        """Return smoothed unknowns and states at the samples of a run, given all samples.
 
-        A fixed-interval smoother: see `livepde.laws.smoother`. All samples are taken by a copy of
-        this identifier, as in a run, and then at least once more; this one stays as it is.
+        This is a fixed-interval smoother: see `livepde.laws.smoother`. A copy of the identifier
+        processes all samples at least twice; the identifier itself does not change.
 
         Parameters
         ----------
@@ -236,15 +236,15 @@ class StreamRuns(Shown):
         Returns
         -------
         smoothed
-            As `Result.to_xarray` of the run, without innovations. A constant unknown
-            has one value at all times: the last one.
+            Dataset as `Result.to_xarray` returns it, without innovations. A constant unknown has
+            its last value at all times.
 
         Raises
         ------
         ConfigurationError
-            An identifier that has taken a sample.
+            The identifier has already processed a sample.
         LawError
-            A law without a covariance that a smoother could follow.
+            A law without a covariance, or with the option `memory`.
         """
         if self._so_far.samples:
             raise ConfigurationError(
@@ -258,7 +258,7 @@ class StreamRuns(Shown):
         for item in stream:
             sample = sample_of(item)
             estimate, interval = who._taken(sample.t, sample.z, sample.inputs)
-            if before is None:  # the law begins with the first sample
+            if before is None:  # the initial state depends on inputs of the first sample
                 before = self._start(Inputs(interval.inputs0))
             run.add(estimate, interval, who._latent_belief().q)
         result = self._result(fields_every)
@@ -270,11 +270,11 @@ class StreamRuns(Shown):
     def _expected(
         self, samples: Iterable[Sample], noise: Array, q: Array, draws: Array
     ) -> tuple[Array, Array]:
-        """Return readings that draws of the unknowns lead to, and their standard deviation.
+        """Return readings for draws of the unknowns, (n, samples, sensors), and their deviations.
 
-        Linear about q, shape (m,), for draws of shape (n, m): the samples are taken again from
-        there, without their readings. Shapes (n, samples, sensors) and (samples, sensors); NaN
-        where a step fails.
+        Linear about q, shape (m,), for draws of shape (n, m): the samples are processed again with
+        these unknowns, without readings. Standard deviations, (samples, sensors), are NaN where a
+        step fails.
         """
         latent = self.model.latent
         centre = latent.inverse(q)

@@ -1,4 +1,4 @@
-"""Samples that an identifier has taken: the last one, and counts for the verdict."""
+"""Last sample of an identifier, and counts of all its samples for the verdict."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ INPUTS = ("inputs", "known")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TakenSamples:
-    """Time and values of the last accepted sample, and the counts behind the verdict."""
+    """Time and values of the last accepted sample, and counts of all samples for the verdict."""
 
     t: float
     z: Array
     inputs: Inputs
-    known: Inputs  # the same, or what holds since the sample of a failed step
-    samples: int  # number of samples, also of failed steps
-    origin: float  # seconds from 1970 to t = 0, where times are dates; NaN: they are numbers
+    known: Inputs  # last known inputs, which include held inputs of later failed steps
+    samples: int  # number of samples, including failed steps
+    origin: float  # seconds from 1970 to t = 0 if times are dates; NaN if they are numbers
     validation: ValidationLedger
     gaps: InputLedger
     steps: StepLedger
@@ -58,7 +58,7 @@ class TakenSamples:
     def placed(
         self, ends: Mapping[str, Array], names: tuple[str, ...], samples: int
     ) -> TakenSamples:
-        """Return the value of one member of a fleet, from its `ends`; `names` are of its inputs."""
+        """Return the value for a member of a fleet from its `Fleet.ends`; `names`: its inputs."""
         counts = ends["held_counts"].astype(np.int64)
         return changed(
             self,
@@ -72,17 +72,17 @@ class TakenSamples:
 
     @property
     def last(self) -> End:
-        """The last accepted sample, where the next interval begins."""
+        """The last accepted sample, at which the next interval begins."""
         return End(t=self.t, inputs=self.inputs, z=self.z)
 
     def counted(self, t: Any, unit: str) -> tuple[Any, float]:
-        """Return a time in the unit of the model, and the origin from which a date counts."""
+        """Return a number or date as a time in the unit of the model, and the origin of dates."""
         if type(t) is float or (stamp := stamp_of(t)) is None:
             return t, self.origin
         return self.since(stamp, unit)
 
     def since(self, stamp: float, unit: str) -> tuple[float, float]:
-        """Return the time of a date in seconds since 1970, and the origin from which it counts."""
+        """Return the time of a date, given in seconds since 1970, and the origin of dates."""
         if not unit:
             raise ConfigurationError(
                 "the time is a date, and the model has no unit of time: name it, as in "
@@ -98,7 +98,7 @@ class TakenSamples:
         return (stamp - self.origin) * second, self.origin
 
     def time_of_next(self, t: float) -> float:
-        """Return the time of the next sample, checked; only the first may be at the start."""
+        """Return the validated time of the next sample; only the first may be at t0."""
         if type(t) is not float or not math.isfinite(t):
             t = number(t, "time t")
             if math.isnan(t):
@@ -117,7 +117,7 @@ class TakenSamples:
     def begun(
         self, inputs: Inputs, unstated: Collection[str], names: tuple[str, ...]
     ) -> TakenSamples:
-        """Return the value at the start, where some of the inputs may have no value."""
+        """Return the value at the start; `unstated`: names of inputs without an initial value."""
         mask = np.array([name in unstated for name in names], dtype=float)
         gaps = InputLedger(self.gaps.counts, self.gaps.held, mask)
         return changed(self, inputs=inputs, known=inputs, gaps=gaps)
@@ -125,11 +125,11 @@ class TakenSamples:
     def after(
         self, end: End, status: Status, missing: Array, control: Advance, origin: float
     ) -> TakenSamples:
-        """Return the value after a step; `missing`: 1 for each input whose last value was held."""
+        """Return the value after a step; `missing`: 1 for each input that holds its last value."""
         length = end.t - self.t
         steps = self.steps.add(status.code, length, control.stretches(length))
         now = changed(self, samples=self.samples + 1, origin=origin, steps=steps)
-        if not status.taken:  # a value that holds until the next reading may not be read again
+        if not status.taken:  # an input with "hold" may have no further reading
             last = {name: end.inputs[name] for name in control.held.last}
             return changed(now, known=Inputs({**self.known, **last}))
         gaps = self.gaps.add(length, missing) if len(missing) else self.gaps
@@ -137,7 +137,7 @@ class TakenSamples:
 
     @property
     def leaves(self) -> dict[str, Any]:
-        """The leaves of a checkpoint that hold it."""
+        """Leaves for a checkpoint."""
         return {
             "t": self.t,
             "z": self.z,
@@ -154,7 +154,7 @@ class TakenSamples:
         }
 
     def restored(self, leaves: Mapping[str, Array], names: tuple[str, ...]) -> TakenSamples:
-        """Return the value that `leaves` hold; raises `KeyError` or `ValueError`."""
+        """Return the value stored in leaves of a checkpoint; raise `KeyError` or `ValueError`."""
         names = names if len(leaves["inputs"]) else ()
         counts = leaves["held_counts"].astype(np.int64)
         return TakenSamples(
