@@ -1,4 +1,4 @@
-"""The process: M u' + B(u) + A(u) q = F, from weak forms."""
+"""Model of the process, M u' + B(u) + A(u) q = F, defined by weak forms."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ from livepde.spaces import BorderedSpace, DualOperator, HilbertSpace, product
 
 
 def mass_form(u: Any, v: Any, x: Any) -> Any:
-    """The L2 inner product, u v; of several components their sum."""
+    """The L2 inner product u v, summed over the components."""
     return _summed(lambda u, v: u * v, u, v)
 
 
 def h1_form(u: Any, v: Any, x: Any) -> Any:
-    """The H1 inner product, u v + grad u . grad v; of several components their sum."""
+    """The H1 inner product u v + grad u . grad v, summed over the components."""
     return _summed(lambda u, v: u * v + dot(grad(u), grad(v)), u, v)
 
 
@@ -72,63 +72,62 @@ class Model(Shown):
     """A time-dependent PDE with unknown parameters, M u' + B(t, u) + A(t, u) q = F(t) in X*.
 
     The paper's abstract equation (main) with C(q, u) = A(u) q + B(u) (Assumption ass:equation),
-    tested with the basis of X. A may be nonlinear in q, too: then the laws take its derivative at
-    the estimate in the place of A(u) (Kaltenbacher and Nguyen 2021). Frozen: it is built once and
-    never changes.
+    tested with the basis of X. A may also be nonlinear in q. The laws then replace A(u) by the
+    derivative of A in q at the estimate (Kaltenbacher and Nguyen 2021). A model is immutable.
 
     Parameters
     ----------
     state
-        The field u, or a mapping of names to fields on one mesh, which forms see as u.c, v.c and so
-        on; Dirichlet values may be numbers, functions g(x, t) or channels.
+        The field u, or a mapping from names to fields on one mesh, available in forms as u.c, v.c
+        and so on. Dirichlet values are numbers, functions g(x, t) or channels.
     parameter
         The unknown: a prior (`Normal`, `LogNormal`, `LogitNormal`: one number), a `Scalar`,
-        `Piecewise`, `Scalars` or `Field`, or a mapping of names to those.
+        `Piecewise`, `Scalars` or `Field`, or a mapping from names to those.
     A
-        Integrand (q, u, v, x), linear in v; for a mapping of unknowns `q.name`. Whether it is
-        linear in q is found out; all of the residual may stand here.
+        Integrand (q, u, v, x), linear in v; `q.name` if unknowns have names. It may contain the
+        whole residual. Linearity in q is detected.
     B
         Integrand (u, v, x), linear in v.
     f
-        Source density: a number or f(x, t); for several components a mapping of names to those.
-        It is evaluated once for each set of inputs if its second argument is called `_` and it
-        does not read x.t.
+        Source density: a number or f(x, t), or a mapping from components to those. If its second
+        argument is called `_` and it does not read x.t, it is evaluated once for each set of
+        inputs.
     M
-        Integrand (u, v, x) of the mass term, symmetric positive; default u v, or the sum of these
-        products over the components. A component that it leaves out is algebraic: its equation
-        holds at every moment, and has to determine it (index 1). `GradientLaw` needs all of them.
+        Integrand (u, v, x) of the mass term, symmetric positive; default u v, summed over the
+        components. A component without a mass term is algebraic: its equation holds at all times
+        and must determine it (index 1). `GradientLaw` requires a mass term of each component.
     dA, dB
-        Optional integrands of the derivatives in u, (q, u, du, v, x) and (u, du, v, x). Without
-        them a complex step is taken (exact for analytic integrands).
+        Optional integrands of the derivatives in u, (q, u, du, v, x) and (u, du, v, x). The default
+        is a complex step, exact for analytic integrands.
     inputs
-        Names of the channels that forms read as x.inputs["name"]; a mapping has their units, by
-        which the values of data that state another unit are converted.
+        Names of the channels that forms read as x.inputs["name"], or a mapping from names to units.
+        Data in other units are converted to these.
     time_unit, length_unit, formula
         Units of times and coordinates, and the equation as text; default the weak form in code.
     initial
-        Integrand (q, v, x), linear in v: the initial state as a functional, `q.u0 * v` say; its L2
-        projection is where u begins. Unknowns in it belong to the initial state.
+        Integrand (q, v, x), linear in v, such as `q.u0 * v`: a functional whose L2 projection is
+        the initial state. Its unknowns are unknowns of the initial state.
     coefficients
-        Function q -> {name: value} of further coefficients that A reads as q.name, as in
+        Function q -> {name: value} of further coefficients that A reads as q.name, such as
         lambda q: {"diffusivity": q.k / q.C}. If all of them are numbers and A is linear in unknowns
-        and coefficients, a step is as fast as with an A that is linear in the unknowns. If an
-        unknown in them varies in space, A is evaluated at each step.
+        and coefficients, a step is as fast as with an A that is linear in the unknowns. If they
+        depend on an unknown that varies in space, A is evaluated at each step.
     sensors
-        Sensors that respond slowly, by name: their states are coefficients behind those of the
-        fields. Identifiers add those of their observations (`lp.observation.Slow`).
+        Sensors with a slow response, by name. Their states are coefficients after the coefficients
+        of the fields. Identifiers add the slow sensors of observations (`lp.observation.Slow`).
 
     Notes
     -----
     `A`, `B`, `f` and `M` may each be a list of terms; `On("left", form)` restricts a term to a
-    named boundary or subdomain of the mesh. In a form, `x[0]` is a coordinate, `x.t` the time.
-    Call `u` in a term that ignores it `_`, as in (q, _, v, x): then time and inputs that the term
-    reads do not change the derivative in u, and factors are kept.
+    named boundary or subdomain of the mesh. In a form, `x[0]` is a coordinate, `x.t` the time. If a
+    term does not depend on `u`, name that argument `_`, as in (q, _, v, x). Then the derivative in
+    u does not depend on time and inputs of the term, and factorisations are reused.
 
     Raises
     ------
     ModelError
         A form cannot be evaluated, has the wrong number of components, or is not linear in v; the
-        mass depends on time; or a name stands for something else in a run's dataset.
+        mass depends on time; or a name has another meaning in the dataset of a run.
 
     Warns
     -----
@@ -183,7 +182,7 @@ class Model(Shown):
         self.parameter_space = FunctionSpace.of(parameter, "q")
         self.inputs = tuple(inputs)
         self._check_parameter()
-        # Refuse boundary values that do not fit their field, and weights that make no sense.
+        # Computed here to raise errors in boundary values and weights early.
         _ = self.state_space.fixed, self.state_space.weight
         x, q = self.state_space, self.parameter_space
         pair = {"u": x, "v": x}
@@ -240,13 +239,13 @@ class Model(Shown):
         return f"{of}{unknown.prior.text} {unknown.unit}".rstrip() + named
 
     def __copy__(self) -> Model:
-        return self  # it never changes
+        return self  # a model is immutable
 
     def __deepcopy__(self, memo: object) -> Model:
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return how pickle builds it again: from its own arguments."""
+        """Return the arguments from which pickle rebuilds the model."""
         parts = self.state, self.parameter, self._parts
         try:
             pickle.dumps(parts)
@@ -270,7 +269,7 @@ class Model(Shown):
         more: Sequence[On] = (),
     ) -> Form:
         mesh, order, inputs = self.mesh, self.order, self.inputs
-        if more:  # terms of slow sensors, whose derivatives nobody has to give
+        if more:  # terms of slow sensors; their derivatives use the complex step
             integrands = integrands if isinstance(integrands, Sequence) else [integrands]
             given = isinstance(derivative, Sequence)
             derivative = derivative if given else [derivative] * len(integrands)
@@ -283,16 +282,16 @@ class Model(Shown):
         dA: Integrand | Sequence[Integrand] | None,
         coefficients: Callable[[Any], Mapping[str, Any]] | None,
     ) -> None:
-        """Set A in the parameter as forms see it; `form_A` is the same in latent coefficients."""
+        """Set `physical_A`, `linear_A` in unknowns and coefficients, and `form_A` in latent q."""
         x = self.state_space
         spaces = {"q": self.parameter_space, "u": x, "v": x}
         computed = self._coefficients(coefficients, dA)
         terms = computed.expanded(A) if computed else A
         own = self._at_sensors.unknown_response
         self.physical_A = self.linear_A = self._form("A", terms, spaces, "u", dA, "q", own)
-        # Numbers computed from the unknowns, and A in both; None if there are none.
+        # Coefficients that are numbers, with A as a form in unknowns and coefficients; else None.
         self.coefficients = computed if computed and computed.numeric else None
-        self.computed = tuple(computed.names) if computed else ()  # what A reads besides q
+        self.computed = tuple(computed.names) if computed else ()  # names of all coefficients
         if self.coefficients is not None:
             more = spaces | {"q": self.coefficients.space}
             self.linear_A = self._form("A", A, more, "u", None, "q", own)
@@ -313,7 +312,7 @@ class Model(Shown):
         return found
 
     def with_unknowns(self, more: Mapping[str, Unknown]) -> Model:
-        """Return the same process with more unknowns, such as those of sensors, not in its forms.
+        """Return a copy of the model with more unknowns, such as sensor offsets, not in its forms.
 
         Raises `ModelError`: this model has one unknown without a name, or a name is taken.
         """
@@ -326,7 +325,7 @@ class Model(Shown):
         return Model(self.state, unknowns, **self._parts, **self._about)
 
     def with_sensors(self, sensors: Mapping[str, SensorState]) -> Model:
-        """Return the same process with more sensors that respond slowly."""
+        """Return a copy of the model with additional slow sensors."""
         parts = self._parts | {"sensors": {**self.sensors, **sensors}}
         return Model(self.state, self.parameter, **parts, **self._about)
 
@@ -336,11 +335,11 @@ class Model(Shown):
         B: Sequence[Integrand | On] = (),
         inputs: Sequence[str] = (),
     ) -> Model:
-        """Return a process with more terms in A, (q, u, v, x), and B, (u, v, x): fluxes, sources.
+        """Return a copy with additional terms in A, (q, u, v, x), and B, (u, v, x).
 
-        `inputs` are the names of the channels that these read.
+        `inputs`: names of the channels that these terms read.
 
-        Raises `ModelError`: the derivative of A or B was given and would lack that of the terms.
+        Raises `ModelError`: the model has dA or dB, which would lack the derivative of the terms.
         """
         parts = dict(self._parts)
         for name, more in (("A", A), ("B", B)):
@@ -355,7 +354,7 @@ class Model(Shown):
         return Model(self.state, self.parameter, **parts, **about)
 
     def with_constant_inputs(self, values: Mapping[str, float]) -> Model:
-        """Return the same process with constants instead of some of its inputs."""
+        """Return a copy of the model with constant values of some inputs."""
         if other := sorted(set(values) - set(self.inputs)):
             raise ModelError(
                 f"with_constant_inputs: the model has no input '{other[0]}'; it has "
@@ -372,15 +371,15 @@ class Model(Shown):
             return with_constants(part, values) if callable(part) else part
 
         left = {name: unit for name, unit in self._input_units.items() if name not in values}
-        # What reads no channels.
+        # These parts never read channels.
         kept = {name: self._parts[name] for name in ("coefficients", "sensors")} | {"inputs": left}
         parts = {name: bound(part) for name, part in self._parts.items() if name not in kept}
         return Model(self.state, self.parameter, **parts, **kept, **self._about)
 
     def refined(self) -> Model:
-        """Return the same process on a mesh whose elements are halved in every direction.
+        """Return a copy of the model on a mesh whose elements are halved in every direction.
 
-        Raises `ModelError` or `SpaceError`: a part of the model is defined on this mesh alone.
+        Raises `ModelError` or `SpaceError`: a part of the model is only defined on this mesh.
         """
         mesh = halved(self.mesh)
 
@@ -406,7 +405,7 @@ class Model(Shown):
                 )
 
     def _check_diffusion(self) -> None:
-        """Warn of a diffusion that is negative everywhere at the prior mean: u_t = -k u_xx."""
+        """Warn if the diffusion is negative at the prior mean, as in u_t = -k u_xx."""
         components, A, B = list(self.state_space.blocks), self.physical_A, self.form_B
         for name in self.state_space.fields:
             number = components.index(name)
@@ -420,7 +419,7 @@ class Model(Shown):
                 )
 
     def _check_names(self) -> None:
-        """Refuse names that a run's dataset could not distinguish."""
+        """Raise `NameClashError` if two names coincide in the dataset of a run."""
         state, parameter = self.state_space, self.parameter_space
         axes = "xyz"[: self.mesh.dim()]
         clashes = name_clashes(
@@ -434,22 +433,22 @@ class Model(Shown):
 
     @cached_property
     def order(self) -> int:
-        """Quadrature order: the state's, or exact for A(u) q with polynomial factors."""
+        """Quadrature order: that of the fields, or exact for A(u) q with polynomial factors."""
         states = [block.field for block in self.state_space.fields.values()]
         if given := [field.quadrature for field in states if field.quadrature is not None]:
             return max(given)
         degrees = [block.field.element.maxdeg for block in self.parameter_space.fields.values()]
-        # u, its test function, and q: the degrees of the factors add up.
+        # The degrees of the factors add up: u, its test function, and q.
         return max(field.order for field in states) + max([int(d) for d in degrees], default=0)
 
     @cached_property
     def state_block(self) -> FieldBlock:
-        """The finite-element functions of a state of one component."""
+        """Finite-element functions of a state with one component."""
         return self.state_space.component()[0]
 
     @cached_property
     def channels(self) -> tuple[str, ...]:
-        """Names of all channels the model needs: inputs of forms and Dirichlet channels."""
+        """Names of all channels of the model: inputs of forms and Dirichlet channels."""
         boundary = [value.name for value in self.boundary_values if isinstance(value, Channel)]
         return tuple(dict.fromkeys([*self.inputs, *boundary]))
 
@@ -466,7 +465,7 @@ class Model(Shown):
 
     @cached_property
     def algebraic(self) -> IntArray:
-        """Free coefficients without a mass term: the algebraic components of the state."""
+        """Indices of free coefficients without a mass term: algebraic components of the state."""
         mass = np.asarray(abs(self.mass).sum(axis=1)).ravel()
         free = np.ones(self.state_space.dim, dtype=bool)
         free[self.state_space.fixed] = False
@@ -503,7 +502,7 @@ class Model(Shown):
         if form is not None:
             gram = self._on_parameter(field, form) / variance
             return HilbertSpace(sp.csr_array(gram), "Q", block.fixed)
-        # The inner product is not a bilinear form: it is a Schur complement of a sparse matrix.
+        # This inner product is not a bilinear form, but a Schur complement of a sparse matrix.
         free = np.ones(block.size)
         free[block.fixed] = 0.0
         mass, K = (self._on_parameter(field, form) for form in (mass_form, inner.operator))
@@ -512,7 +511,7 @@ class Model(Shown):
 
     @cached_property
     def parameter_mass(self) -> sp.csr_array:
-        """L2 Gram matrix of the parameter, in which its modes are ordered; identity for numbers."""
+        """L2 Gram matrix of the parameter, which orders its modes; the identity for numbers."""
         blocks = [
             self._on_parameter(block.field, mass_form)
             if isinstance(block, FieldBlock)
@@ -532,7 +531,7 @@ class Model(Shown):
     ) -> sp.csr_array:
         """Assemble a constant bilinear form (u, v, x) on the state space, shape (n, n).
 
-        With `cells`, integrated over these elements only.
+        With `cells`, the form is integrated over these elements only.
         """
         form = self._form("operator", integrand, {"u": self.state_space, "v": self.state_space})
         if not form.constant:
@@ -557,7 +556,7 @@ class Model(Shown):
     def A(self, u: Array, moment: Moment = START, q: Array | None = None) -> DualOperator:
         """Return A(u): Q -> X*, for coefficients u of shape (n,).
 
-        For an A that is not linear in the latent parameter its derivative at q, by default the
+        If A is not linear in the latent parameter, this is its derivative at q, by default the
         prior mean.
         """
         q = self.latent.prior if q is None else q
@@ -569,8 +568,8 @@ class Model(Shown):
 
     def F(self, moment: Moment = START) -> Array:
         """Return the source in X*, shape (n,)."""
-        # The last source that reads no time, and the inputs it belongs to; None: to all. Threads
-        # share it: the pair is read once and replaced as a whole, so that its parts fit together.
+        # The last source that does not depend on time, with its inputs, or None if it depends on no
+        # inputs. Threads share this pair: it is read once and replaced as a whole.
         known = self._source
         if known is not None and (known[0] is None or known[0] is moment.inputs):
             return known[1]
@@ -578,7 +577,7 @@ class Model(Shown):
         source.setflags(write=False)
         if not read:
             self._source = (None, source)
-        elif "t" not in read and isinstance(moment.inputs, Inputs):  # which never change
+        elif "t" not in read and isinstance(moment.inputs, Inputs):  # `Inputs` are immutable
             self._source = (moment.inputs, source)
         return source
 
@@ -588,12 +587,12 @@ class Model(Shown):
         return all(isinstance(one, int | float) and one == 0.0 for one in self.boundary_values)
 
     def impose(self, u: Array, moment: Moment) -> Array:
-        """Return u with the Dirichlet values of a moment."""
+        """Return u with the Dirichlet values at a moment imposed."""
         return self.state_space.impose(u, moment)
 
     @property
     def formula(self) -> str:
-        """The equation as text; empty if none was given."""
+        """The equation as text; empty if not specified."""
         return str(self._about["formula"])
 
     @property
@@ -613,10 +612,10 @@ class Model(Shown):
         }
 
     def boundary_readings(self, u0: Any) -> dict[str, float]:
-        """Return the values of boundary channels that an initial state implies.
+        """Return the values of boundary channels at t0 implied by u0: channel -> mean value.
 
-        Left out are channels on whose boundaries u0 varies by more than a thousandth of its range,
-        and those of components that u0 does not name.
+        Omitted are channels on whose boundaries u0 varies by more than a thousandth of its range,
+        and channels of components that u0 does not contain.
         """
         if u0 is None:
             return {}
@@ -629,7 +628,7 @@ class Model(Shown):
                 continue
             own = u[self.state_space.part(name)]
             inside = block.at_vertices @ own
-            # Rounding counts where the state is the same everywhere.
+            # The second term allows for rounding in a uniform state.
             spread = 1e-3 * float(np.ptp(inside)) + 1e-9 * float(np.abs(inside).max())
             for channel, there in block.traces(given, own):
                 values[channel] = np.append(values.get(channel, []), there)
@@ -642,14 +641,14 @@ class Model(Shown):
         return self.impose(self.state_space.interpolate(u0), moment)
 
     def initial_values(self, u0: Any) -> Array:
-        """Return coefficients of the u0 of a run, before boundary values, checked.
+        """Return coefficients of u0 without boundary values, after validation.
 
         Raises
         ------
         ModelError
-            A mapping that leaves out a component; values that are not finite.
+            A mapping without one of the components; values that are not finite.
         SpaceError
-            Coefficients of another shape, or an unknown component.
+            Coefficients with a wrong shape, or an unknown component.
         """
         components = self.state_space.fields
         if isinstance(u0, Mapping) and (left := [name for name in components if name not in u0]):
@@ -663,11 +662,11 @@ class Model(Shown):
         return found
 
     def initial_state(self, q: Array, moment: Moment = START) -> Array:
-        """Return coefficients of the initial state of a latent parameter."""
+        """Return coefficients of the initial state for latent parameters q."""
         boundary = self.impose(np.zeros(self.X.dim), moment)
         if self.form_initial is None:
             return boundary
-        # Projection onto functions with the Dirichlet values: what these contribute is known.
+        # Projection onto functions with the Dirichlet values, whose contribution is subtracted.
         functional = self.form_initial.vector("v", moment, q=q) - self._projection.dual(boundary)
         return self.state_space.completed(boundary + self._projection.riesz(functional))
 
@@ -677,14 +676,14 @@ class Model(Shown):
         return HilbertSpace(self.state_mass, "L2", self.state_space.fixed)
 
     def initial_directions(self, q: Array, directions: Array, moment: Moment = START) -> Array:
-        """Return du_0/dq applied to columns of shape (m, k): shape (n, k); zero without initial."""
+        """Return du_0/dq applied to columns, (m, k) -> (n, k); zero if `initial` is not set."""
         if self.form_initial is None:
             return np.zeros((self.X.dim, directions.shape[1]))
         changed = self.form_initial.product("v", "q", directions, moment, q=q)
         return self.state_space.completed(self._projection.riesz(changed))
 
     def initial_parameter(self, q0: Any = None) -> Array:
-        """Return latent coefficients of q0; None is the prior mean. Fixed coefficients are zero."""
+        """Return latent coefficients of q0, by default the prior mean; fixed ones are zero."""
         if q0 is None:
             q = self.latent.prior.copy()
         else:

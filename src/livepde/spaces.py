@@ -195,7 +195,7 @@ class HilbertSpace:
         return self.factor.solve(functional * free)
 
     def restricted(self, part: slice, fixed: IntArray) -> HilbertSpace:
-        """Return the subspace of some coefficients, with its own fixed ones."""
+        """Return the subspace of the coefficients in `part`; `fixed`: those it fixes."""
         return HilbertSpace(sp.csr_array(self.gram[part, part]), self.name, fixed)
 
     def _form(self, free: IntArray) -> Any:
@@ -216,9 +216,9 @@ class HilbertSpace:
     def beyond(self, modes: Array) -> Array:
         """Return the prior variance of each coefficient outside given modes, shape (n,).
 
-        As `variance`, but beyond 20 000 coefficients the remainder is interpolated instead of the
-        whole variance. Values at rounding level are zero. `modes` are G-orthonormal columns, (n,
-        k).
+        Computed like `variance`, except that beyond 20 000 coefficients only the remainder outside
+        the modes is interpolated. Values at rounding level are set to zero. `modes`: G-orthonormal
+        columns, (n, k).
         """
         held = (modes**2).sum(axis=1)
         if self.dim <= LARGE:
@@ -252,7 +252,7 @@ class HilbertSpace:
         return solved, variance
 
     def _between(self, solved: IntArray, values: Array) -> Array:
-        """Return values at all free coefficients by harmonic interpolation of known ones."""
+        """Return values at all free coefficients by harmonic interpolation from `solved`."""
         found = np.zeros(self.dim)
         found[solved] = values
         rest = np.setdiff1d(np.flatnonzero(self.free), solved)
@@ -299,17 +299,17 @@ class HilbertSpace:
         return total
 
     def modes(self, count: int, mass: sp.csr_array) -> tuple[Array, Array]:
-        """Leading modes of the Gaussian measure with covariance G^{-1}.
+        """Return the leading modes of the Gaussian measure with covariance G^{-1}.
 
         Solves mass phi = lambda G phi for the `count` largest lambda; the columns of phi, (n,
         count), are G-orthonormal, so q = Phi a with a ~ N(0, I) has covariance Phi Phi^T, the best
         approximation of G^{-1} of that rank in the norm of `mass`. The lambda, descending, are the
         variances.
 
-        By Lanczos' method beyond 400 coefficients, with one Riesz solve per iteration and a fixed
-        start vector, so that every run finds the same modes. Each lambda is exact to rounding,
-        beyond 20 000 coefficients to a relative error of 1e-8. The variance outside of the modes is
-        that of the measure minus the sum of theirs (`spread`).
+        Beyond 400 coefficients Lanczos' method is used, with one Riesz solve per iteration and a
+        fixed start vector, so that results are reproducible. Each lambda is exact to rounding;
+        beyond 20 000 coefficients its relative error is 1e-8. The variance outside the modes is the
+        total variance (`spread`) minus their sum.
         """
         from scipy.linalg import eigh
         from scipy.sparse.linalg import LinearOperator, eigsh
@@ -398,7 +398,7 @@ class BorderedSpace(HilbertSpace):
     def _inner_factor(self) -> tuple[sp.csr_array, sp.csr_array, Factor]:
         E, F, H = self._parts
         if self.dim > LARGEST_EXPLICIT and np.all(H.diagonal() < 0.0):
-            try:  # of powers of an operator -H is a mass matrix
+            try:  # for powers of an operator, -H is a mass matrix
                 negative = self._factorised(sp.csr_array(-H), symmetric=True)
                 return E, F, Inverse(lambda b: -negative.solve(b))
             except SpaceError:
@@ -422,9 +422,9 @@ class BorderedSpace(HilbertSpace):
         return Leading(factor, self.dim, self.border.shape[0])
 
     def _root(self) -> Factor | None:
-        """Return the inverse of G = -F H^{-1} F with symmetric F, as for H^2; else None.
+        """Return G^{-1} for a large G = -F H^{-1} F with symmetric F, as for H^2; else None.
 
-        For large spaces: F admits Cholesky or multigrid, the indefinite K does not.
+        F admits Cholesky or multigrid; the indefinite K does not.
         """
         n, (E, F, H) = self.dim, self._parts
         if n <= LARGEST_EXPLICIT or E.count_nonzero() or F.shape != (n, n):
@@ -470,7 +470,7 @@ class BorderedSpace(HilbertSpace):
 
 
 def product(spaces: Sequence[HilbertSpace], name: str, fixed: IntArray) -> HilbertSpace:
-    """Return the product of spaces, with its own name and fixed coefficients."""
+    """Return the product space, with a given name and fixed coefficients."""
     whole = sp.csr_array(sp.block_diag([s.augmented for s in spaces], format="csr"))
     sizes = [s.augmented.shape[0] for s in spaces]
     starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
