@@ -25,7 +25,7 @@ Kept = TypeVar("Kept")
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Estimate(Shown):
-    """The estimate of parameter and state after one sample.
+    """Estimate of the unknowns and the state after one sample.
 
     Attributes
     ----------
@@ -34,28 +34,28 @@ class Estimate(Shown):
     belief
         Coefficients of parameter and state, with their uncertainty.
     innovation
-        Measured minus expected before the sample was used, shape (sensors,); NaN where missing.
-        For `GradientLaw`, which pulls the state to the sample within the step, the output error
-        after the step.
+        Measured minus predicted readings before the update, shape (sensors,); NaN where missing.
+        For `GradientLaw`, which corrects the state within the step, the output error after the
+        step.
     validation_error
-        Measured minus estimated of each validation channel.
+        Measured minus estimated value of each validation sensor, shape (validation,).
     status
-        Status of the step; unless ok, q and u are those of the last successful step.
+        Status of the step; unless ok, q and u are from the last successful step.
     steps
-        Substeps taken.
+        Number of substeps.
     diagnose
         Function that returns the diagnostics of the law; see `diagnostics`.
     held
         Input channels whose last value was held because the sample had none; at the first sample
-        also those without a value at the initial time, whose first one was held.
+        also channels without a value at the initial time, whose first value was held.
     space
-        The unknowns.
+        Function space of the unknowns.
     state_space
-        The components of the state; None for an estimate that was pickled.
+        Function space of the state; None for an estimate that was pickled.
     judge
         Function that returns the verdict of the law on the run so far; see `verdict`.
     fit
-        The last fit of all stored samples; None before it, and for laws without.
+        Last refit of all stored samples; None before the first, and for laws that never refit.
 
     Examples
     --------
@@ -83,9 +83,9 @@ class Estimate(Shown):
 
     @classmethod
     def deferred(cls, read: Callable[[], Belief], **attributes: Any) -> Estimate:
-        """Return an estimate whose belief is computed by `read` when it is first read, and kept.
+        """Return an estimate whose belief is computed by `read` on first access, and cached.
 
-        All other attributes are given; `read` must give the same numbers at any time.
+        `attributes` are all other attributes. `read` must return the same numbers at any time.
         """
         estimate = object.__new__(cls)
         estimate.__dict__.update(attributes, _read=read)
@@ -94,7 +94,7 @@ class Estimate(Shown):
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            # Python calls this only for a name that is not in __dict__: it reads the belief once.
+            # Python calls this only for names that are not in __dict__: the belief is read once.
             held = self.__dict__
             read = held.get("_read") if name == "belief" else None
             if read is not None:
@@ -105,8 +105,8 @@ class Estimate(Shown):
             return held[name]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the values themselves, for pickle and copies."""
-        # Functions of a law cannot be pickled, and hold its arrays: what they return is stored.
+        """Return the attributes for pickle and copies, with values instead of functions."""
+        # Functions of a law cannot be pickled and refer to its arrays: their results are stored.
         own = {
             "belief": self.belief,
             "verdict": self.verdict,
@@ -135,12 +135,12 @@ class Estimate(Shown):
 
     @cached_property
     def diagnostics(self) -> Diagnostics[float]:
-        """Innovation statistics, safeguards, and other numbers of the law."""
+        """Diagnostics of the law, such as innovation statistics and safeguards."""
         return self.diagnose()
 
     @cached_property
     def verdict(self) -> Verdict:
-        """Verdict on the trustworthiness of the estimates, by all samples so far.
+        """Verdict on the trustworthiness of the estimates, based on all samples so far.
 
         It is computed on first access, which takes about a millisecond.
         """
@@ -162,20 +162,20 @@ class Estimate(Shown):
 
     @property
     def q_std(self) -> Array | None:
-        """Standard deviation of each coefficient of q, or None if the law has none."""
+        """Standard deviation of each coefficient of q; None for a law without covariance."""
         return self.belief.q_std
 
     @property
     def u_std(self) -> Array | None:
-        """Standard deviation of each coefficient of u, or None if the law has none."""
+        """Standard deviation of each coefficient of u; None for a law without covariance."""
         return self.belief.u_std
 
     @property
     def parameters(self) -> dict[str, tuple[float, float]]:
-        """Label of each scalar unknown -> (value, standard deviation; NaN if there is none).
+        """Label of each scalar unknown -> (value, standard deviation; NaN without covariance).
 
-        For a `Normal` mean and standard deviation. Under a transform the median, and the standard
-        deviation to first order; `estimate[label]` has mean and standard deviation of these, too.
+        Mean and standard deviation for a `Normal`. Under a transform, the median and the standard
+        deviation to first order; `estimate[label]` also has the exact mean and standard deviation.
         """
         std = self.q_std
         return {
@@ -184,10 +184,10 @@ class Estimate(Shown):
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """Return time, status, unknown numbers and innovations as JSON can hold them.
+        """Return time, status, unknown numbers, innovations and verdict as JSON-compatible values.
 
-        {"t", "status", "unknowns": {label: {"value", "std"}}, "innovation": [...], "verdict"}; None
-        stands where there is no number.
+        {"t", "status", "unknowns": {label: {"value", "std"}}, "innovation": [...], "verdict"}, with
+        None instead of values that are not finite.
         """
         unknowns = {
             label: {"value": _number(value), "std": _number(std)}
@@ -202,18 +202,18 @@ class Estimate(Shown):
         }
 
     def __getitem__(self, name: str) -> Marginal:
-        """Return the marginal of one unknown: median, mean, standard deviation and intervals.
+        """Return the marginal of an unknown: median, mean, standard deviation and intervals.
 
         Parameters
         ----------
         name
-            Label of an unknown number, or name of a field or of a component of the state, which
-            have values at coordinates: `estimate["u"].at([0.1, 0.5])`.
+            Label of an unknown number, or name of a field or a component of the state. Fields and
+            components have values at points: `estimate["u"].at([0.1, 0.5])`.
 
         Raises
         ------
         ConfigurationError
-            There is no such unknown.
+            Unknown name.
         """
         space = self.space
         std = self.q_std if self.q_std is not None else np.full_like(self.q, np.nan)
@@ -256,10 +256,10 @@ class Estimate(Shown):
 
 
 def read_together(estimates: Sequence[Estimate]) -> None:
-    """Compute what estimates leave until it is read, at once: beliefs and diagnostics."""
+    """Compute the deferred beliefs and diagnostics of several estimates together."""
     parts = [vars(estimate) for estimate in estimates]
     for name, function in (("belief", "_read"), ("diagnostics", "diagnose")):
-        # Another thread may read some of them meanwhile.
+        # Another thread may read some of them at the same time.
         each = ((own, own.get(function)) for own in parts if name not in own)
         unread = [(own, read) for own, read in each if read is not None]
         for (own, _), value in zip(unread, together([read for _, read in unread]), strict=True):
@@ -272,5 +272,5 @@ def _number(value: float) -> float | None:
 
 
 def kept(value: Kept) -> Kept:
-    """Return a value: with it, a function that returns it can be pickled."""
+    """Return the value; `partial(kept, value)` is a constant function that can be pickled."""
     return value

@@ -1,4 +1,4 @@
-"""Samples of a stream, and their parsing: names and values checked, missing inputs held."""
+"""Samples of a stream, and their parsing: validation of names and values, held inputs."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ Readings: TypeAlias = ArrayLike | Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Sample:
-    """One moment of a stream.
+    """Readings and inputs at one time of a stream.
 
     Attributes
     ----------
     t
         Time, in the unit of the model.
     z
-        Measurements: an array of shape (sensors,), or channel name -> value for everything that
-        was measured at t (sensors, inputs, validation channels). NaN or absent: missing. A sensor
-        may have a pair (value, standard deviation of its noise), an array the shape (sensors, 2),
-        and a mapping the noise by itself: "noise of T_1". NaN: the noise that the sensor states.
+        Measurements: an array of shape (sensors,), or channel name -> value for all values measured
+        at t (sensors, inputs, validation channels). NaN or absent: missing. To specify the noise of
+        a reading, use a pair (value, standard deviation), an array of shape (sensors, 2), or a key
+        such as "noise of T_1" in the mapping; the default, also for NaN, is the sensor's noise.
     inputs
-        Input and boundary channels, if they are not in z.
+        Input and boundary channels that z does not contain.
 
     Examples
     --------
@@ -52,7 +52,7 @@ class Sample:
 
 
 def sample_of(item: Any) -> Sample:
-    """Return an item of a stream as a sample: it is one, (t, z), or (t, z, inputs)."""
+    """Convert an item of a stream, a `Sample`, (t, z) or (t, z, inputs), to a sample."""
     if isinstance(item, Sample):
         return item
     if isinstance(item, tuple | list) and len(item) in (2, 3):
@@ -66,7 +66,7 @@ def sample_of(item: Any) -> Sample:
 
 
 def in_order(stream: Iterable[Any], who: str) -> Iterator[Sample]:
-    """Iterate over a stream as samples, each later than the one before; `who` asks for it."""
+    """Iterate over samples with increasing times; `who` names the caller in messages."""
     before = -math.inf
     for item in stream:
         sample = sample_of(item)
@@ -90,7 +90,7 @@ def is_dataset(data: Any) -> bool:
 
 
 def is_tabular(data: Any) -> bool:
-    """Return whether data are a table, a dataset or the name of a file, and no stream of samples.
+    """Return whether data are a table, a dataset or a file name, rather than a stream of samples.
 
     >>> is_tabular("rod.csv"), is_tabular([(0.0, 20.0)])
     (True, False)
@@ -99,7 +99,7 @@ def is_tabular(data: Any) -> bool:
 
 
 def noise_channel(name: str) -> str:
-    """Return by which name a sample has the noise of a reading.
+    """Return the name under which a sample contains the noise of a reading.
 
     >>> noise_channel("T_1")
     'noise of T_1'
@@ -108,7 +108,7 @@ def noise_channel(name: str) -> str:
 
 
 def check_noise(name: str, value: Any) -> float:
-    """Return the standard deviation of a reading, NaN if it is that of the sensor."""
+    """Return the validated noise of a reading; NaN selects the noise of its sensor."""
     found = number(value, noise_channel(name))
     if found <= 0.0:
         raise SampleError(
@@ -121,7 +121,7 @@ def check_noise(name: str, value: Any) -> float:
 def by_name(z: Any, names: Sequence[str]) -> dict[str, Any]:
     """Return readings as channel -> number, with noise under a separate name.
 
-    `names` are the sensors whose values an array contains.
+    `names`: sensors in the order of an array.
     """
     if not isinstance(z, Mapping):
         z = dict(zip(names, np.atleast_1d(z).tolist(), strict=True))
@@ -135,16 +135,16 @@ def by_name(z: Any, names: Sequence[str]) -> dict[str, Any]:
 
 
 def _series(values: Any) -> Any:
-    """Return a data array with one labelled axis as a series, and anything else as it is."""
+    """Convert a data array with one labelled axis to a series; return other values unchanged."""
     if getattr(values, "ndim", 0) == 1 and hasattr(values, "to_series") and len(values.coords):
         return values.to_series()
     return values
 
 
 def labelled(z: Any) -> Any:
-    """Return a row of a pandas table as a mapping: its names count, not its order.
+    """Convert a row of a pandas table to a mapping, since its names count and not its order.
 
-    So do those of a data array of xarray with one axis. A dataset is a mapping already.
+    A data array of xarray with one labelled axis is converted too; a dataset is already a mapping.
     """
     z = _series(z)
     if isinstance(z, Mapping) or not (hasattr(z, "to_dict") and hasattr(z, "keys")):
@@ -158,9 +158,9 @@ def labelled(z: Any) -> Any:
 
 
 def in_order_of(members: Sequence[str], values: Any, what: str) -> Any:
-    """Return values with labels in the order of the members of a fleet, and others as they are.
+    """Return the labelled values of a mapping, series or data array in the order of the members.
 
-    Those of a mapping, a series or a data array have labels. `what` names them in messages.
+    Values without labels are returned unchanged. `what` names them in messages.
     """
     values = _series(values)
     if isinstance(values, np.ndarray) or not (hasattr(values, "items") and hasattr(values, "keys")):
@@ -173,11 +173,11 @@ def in_order_of(members: Sequence[str], values: Any, what: str) -> Any:
         raise SampleError(
             f"{what} has values for {labels}; expected one for each of the members {list(members)}."
         )
-    return values  # a series that is only numbered
+    return values  # a series with the default index
 
 
 def mapped(given: Any, what: str) -> Mapping[str, Any]:
-    """Return values by name; a row or a table of pandas counts by its names, None has none."""
+    """Convert a mapping, a row or table of pandas, or None (empty) to a mapping from names."""
     if given is None:
         return {}
     found = dict(given.items()) if is_frame(given) else labelled(given)
@@ -187,7 +187,7 @@ def mapped(given: Any, what: str) -> Mapping[str, Any]:
 
 
 def number(value: Any, what: str) -> float:
-    """Return a float; None, NA or masked is missing (NaN). `what` names it in messages."""
+    """Return a float; None, NA and masked values become NaN. `what` names it in messages."""
     if type(value) is float and math.isfinite(value):
         return value
     if value is None or value is np.ma.masked or type(value).__name__ == "NAType":
@@ -204,7 +204,7 @@ def number(value: Any, what: str) -> float:
 
 
 def numbers(values: Any, what: str) -> Array:
-    """Return an array of floats, NaN where it is masked. `what` names it in messages."""
+    """Return an array of floats, NaN where masked. `what` names it in messages."""
     try:
         if np.iscomplexobj(values):
             raise TypeError
@@ -217,7 +217,7 @@ def numbers(values: Any, what: str) -> Array:
 
 
 def plan(name: str, values: Any, count: int) -> Array:
-    """Return the values of an input at each of some times."""
+    """Return the values of an input at `count` times, shape (count,)."""
     found = numbers(values, f"input '{name}'")
     if found.shape not in ((), (count,)):
         raise SampleError(
@@ -228,7 +228,7 @@ def plan(name: str, values: Any, count: int) -> Array:
 
 
 def _array(z: Any) -> Array:
-    """Return an array of floats; refuses text and truth values, which NumPy would convert."""
+    """Return an array of floats; raise `SampleError` for text or bool, which NumPy converts."""
     if isinstance(z, list | tuple):
         text = any(isinstance(value, str | bytes | bool) for value in z)
     else:
@@ -239,18 +239,18 @@ def _array(z: Any) -> Array:
 
 
 def _are_pairs(z: Any, count: int) -> bool:
-    """Return whether readings come with the noise of each."""
+    """Return whether readings are `count` pairs of value and noise."""
     with suppress(ValueError):  # rows of several lengths
         return bool(np.shape(z) == (count, 2))
     return False
 
 
 def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
-    """Return the measurements of all sensors, shape (sensors,), as a new array.
+    """Return the measurements of all sensors as a new array, and their noise, (sensors,) each.
 
-    And the noise of each, None if none has one of its own.
+    The noise is None if no reading specifies its own.
     """
-    # Most samples are arrays as they should be: they pass without the slower checks below.
+    # Most samples are valid arrays, which skip the slower checks below.
     usual = type(z) is np.ndarray and z.dtype == float and z.shape == (observed.size,)
     if usual and np.count_nonzero(np.isfinite(z)) == z.size:
         return np.array(z), None
@@ -264,7 +264,7 @@ def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
 
 
 def _values(array: Array, observed: Observed) -> Array:
-    """Return measurements of all sensors as a new array, if they have its shape and no infinity."""
+    """Return a copy of measurements after validating their shape and that none is infinite."""
     if array.ndim == 0 and observed.size == 1:
         array = array.reshape(1)
     if array.shape != (observed.size,):
@@ -306,7 +306,7 @@ class Channels:
 
     @cached_property
     def sensors(self) -> list[Observed]:
-        """Observation operators: the assimilated, and that for validation if present."""
+        """Observation operators of the assimilated sensors and, if present, for validation."""
         return [item for item in (self.observed, self.validation) if item is not None]
 
     @cached_property
@@ -325,7 +325,7 @@ class Channels:
 
     @cached_property
     def inputs(self) -> tuple[str, ...]:
-        """Channels that the model and the sensors read."""
+        """Names of the input channels of the model and the sensors."""
         read = [name for item in self.sensors for name in item.observation.inputs]
         return tuple(dict.fromkeys([*self.forced, *read]))
 
@@ -340,10 +340,10 @@ class Channels:
     def parse(
         self, z: Readings, inputs: Mapping[str, float] | None
     ) -> tuple[Array, Array | None, Array, dict[str, float]]:
-        """Return assimilated values and their noise, validation values, and inputs, all checked.
+        """Return validated measurements, their noise, validation values, and named values.
 
-        The noise is None if no value has one of its own, NaN where one has none. Among the inputs
-        may be other channels.
+        The noise is None if no value specifies its own, and NaN for values that do not. The named
+        values include all inputs and may include other channels.
         """
         if not isinstance(inputs, dict):
             inputs = mapped(inputs, "inputs")
@@ -360,14 +360,14 @@ class Channels:
         return measured, noise, validation, named
 
     def labelled(self, z: Any) -> Any:
-        """Return a row of a table as a mapping of its channels, and other readings as they are."""
+        """Convert a row of a table to a mapping from channels; return other readings unchanged."""
         if isinstance(z, (np.ndarray, dict)):
             return z
         row = labelled(z)
         return row if row is z else self._columns(row)
 
     def _check_once(self, named: Mapping[str, float], given: Mapping[str, float]) -> None:
-        """Refuse an input with one value among the readings and another one among the inputs."""
+        """Raise `SampleError` for an input with different values in readings and inputs."""
         sensors = {*self.observed.names, *self.hidden}
         for name, value in given.items():
             other = named.get(name, value)  # a sensor may have the name of an input
@@ -378,9 +378,9 @@ class Channels:
                 )
 
     def _columns(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return a row of a table without the columns that are no channel, as `run` reads a table.
+        """Drop the columns of a row that are not channels, as `run` does for a table.
 
-        A row that lacks a channel keeps them: one may be this channel with a misspelt name.
+        If a channel is missing, all are kept: one may be that channel with a misspelt name.
         """
         if not (set(self.names) - self.optional).issubset(row):
             return row
@@ -395,15 +395,15 @@ class Channels:
     def _by_name(
         self, z: Mapping[str, Any], inputs: Mapping[str, float]
     ) -> tuple[Array, Array | None, Array, dict[str, float]]:
-        """Return the values of `parse` for a mapping; it may contain inputs, too."""
+        """Parse a mapping, which may also contain inputs; return the same values as `parse`."""
         if not self._known.issuperset(chain(z, inputs)):
             unknown = next(name for name in (*z, *inputs) if name not in self._known)
             raise SampleError(
                 f"unknown channel '{unknown}'; this identifier has {list(self.names)}."
             )
         values: dict[str, float] = {}
-        stds: dict[str, float] = {}  # of the sensors that state one
-        for name, value in z.items():  # words for a message cost more than the usual value
+        stds: dict[str, float] = {}  # sensor -> noise of its reading
+        for name, value in z.items():  # composing a message takes longer than the usual check
             if name in self.noise:
                 stds[self.noise[name]] = check_noise(self.noise[name], value)
                 continue
@@ -415,7 +415,7 @@ class Channels:
         return _row(self.observed.names, values), noise, _row(self.hidden, values), values
 
     def _pair(self, name: str, given: Sequence[Any]) -> tuple[Any, float]:
-        """Return value and noise of a reading given as a pair."""
+        """Return value and noise of a reading that is a pair."""
         if len(given) != 2 or noise_channel(name) not in self.noise:
             raise SampleError(
                 f"channel '{name}': got {given!r}; expected a number, or of a sensor a pair "
@@ -425,7 +425,7 @@ class Channels:
         return value, check_noise(name, std)
 
     def _named(self, inputs: Mapping[str, float]) -> dict[str, float]:
-        """Return validated inputs."""
+        """Return inputs with validated names and values."""
         named = {}
         for name, value in inputs.items():
             if name not in self.inputs:
@@ -463,15 +463,15 @@ class Channels:
     ) -> list[Inputs]:
         """Return all inputs at each of several future times.
 
-        `inputs` has one value for each channel or for each time, `t` and `known` are time and
-        inputs of the last sample.
+        `inputs`: channel -> one value, or one for each time. `t`, `known`: time and inputs of the
+        last sample.
         """
         times, planned, last = list(times), [], known
         given = mapped(inputs, "forecast: inputs")
         plans = {name: plan(name, values, len(times)) for name, values in given.items()}
         for k, when in enumerate(times):
             named = self._named({name: float(values[k]) for name, values in plans.items()})
-            if when == t:  # the last sample itself: where sensors are that move is known
+            if when == t:  # positions of moving sensors are known at the last sample
                 named = {**last, **{name: v for name, v in named.items() if not np.isnan(v)}}
             last, _ = self.filled(named, last)
             planned.append(last)
@@ -479,5 +479,5 @@ class Channels:
 
 
 def _row(names: Sequence[str], values: Mapping[str, float]) -> Array:
-    """Return the values of some names as an array, NaN where there is none."""
+    """Return the values of `names` as an array, NaN for missing names."""
     return np.array(list(map(values.get, names, repeat(math.nan))))
