@@ -1,14 +1,14 @@
 """Checkpoints: header and arrays in one buffer, without pickle, with a checksum.
 
-The buffer is MAGIC, the length of a text, a digest of all that follows, the text, and the bytes of
-the arrays one after the other, each begun at a multiple of ALIGNED. The text is JSON: the header,
-and for each array its name, its type as NumPy writes it ("<f8"), and its shape.
+The buffer consists of MAGIC, the length of a text, a digest of all that follows, the text, and the
+bytes of the arrays, each at a multiple of ALIGNED. The text is JSON: the header, and the name, type
+in NumPy's notation ("<f8") and shape of each array.
 
-The header has the fingerprint of the problem, by which its checkpoints are recognised. Digests of
-matrices would differ between machines, whose sums round differently. So numbers are kept as they
-are, a few for each part: model, priors, sensors and options are evaluated at fixed states,
-parameters and times, and the results summed with fixed weights. Two builds of one problem agree in
-them to rounding, two problems do not.
+A checkpoint contains the fingerprint of its problem. Digests of matrices would differ between
+machines, whose sums round differently. Therefore the fingerprint consists of a few numbers for each
+part: model, priors and sensors are evaluated at fixed states, parameters and times, and the results
+are summed with fixed weights. Two builds of one problem agree to rounding, different problems
+differ.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ DIGEST = 16  # bytes
 START = struct.Struct(f"<8sQ{DIGEST}s")
 ALIGNED = 16  # bytes
 MOST = 1 << 40  # values in one array
-FEW = 4  # descriptions that are kept: each has some 200 KiB, and those of growing states differ
-PLAIN = "biufcU"  # kinds of arrays that are plain numbers or text
+FEW = 4  # cached descriptions, of about 200 KiB each; those of growing states differ
+PLAIN = "biufcU"  # kinds of NumPy types that are numbers or text
 
 
 def flatten(value: Any, prefix: str = "state") -> dict[str, Any]:
@@ -61,7 +61,7 @@ def flatten(value: Any, prefix: str = "state") -> dict[str, Any]:
 
 @lru_cache(maxsize=256)
 def _parts(kind: type) -> tuple[tuple[str, int, bool], ...] | None:
-    """Return name, axis that grows, and whether it restarts, of each field of a dataclass."""
+    """Return the name, growing axis and `begins_anew` of each field of a dataclass, or None."""
     if not is_dataclass(kind):
         return None
     return tuple(
@@ -73,12 +73,12 @@ def _parts(kind: type) -> tuple[tuple[str, int, bool], ...] | None:
 def rebuild(
     template: Any, leaves: Mapping[str, Array], prefix: str = "state", grows: int = 0
 ) -> Any:
-    """Return a value of the structure of `template`, with the given leaves.
+    """Return a value with the structure of `template` and the given leaves.
 
-    The first axis of an array may have another length (stored samples, active members), and so may
-    the axis declared in the metadata of its field, as in field(metadata={"grows": 1}). A field with
-    the metadata "begins_anew" is as in the template, with the length that may differ, if it was
-    stored by something else: a verdict by a run that has kept none.
+    The length of the first axis of an array may differ (stored samples, active members), and so may
+    the axis declared in the metadata of its field, as in field(metadata={"grows": 1}). If a field
+    with the metadata "begins_anew" does not fit, as a ledger stored by a run without a verdict, the
+    value of the template is used, or zeros of the stored length.
     """
     if isinstance(template, tuple):
         return tuple(
@@ -114,27 +114,27 @@ def _anew(template: Any, leaves: Mapping[str, Array], prefix: str, grows: int) -
 
 
 def _others(array: Array, axis: int) -> list[int]:
-    """Return the lengths of all axes but the first and one more."""
+    """Return the lengths of all axes except the first and `axis`."""
     return [length for k, length in enumerate(array.shape) if k not in (0, axis)]
 
 
 def packed(header: Mapping[str, Any], leaves: Mapping[str, Any]) -> bytes:
-    """Return header and leaves as one buffer."""
+    """Return a buffer that contains header and leaves."""
     arrays = [np.asarray(leaf, order="C") for leaf in leaves.values()]
     described = zip(leaves, (a.dtype.str for a in arrays), (a.shape for a in arrays), strict=True)
     text = _text(json.dumps(dict(header)), tuple(described))
-    # -n % ALIGNED bytes fill n up to the next multiple.
+    # -n % ALIGNED bytes pad n bytes to the next multiple.
     parts: list[Any] = [text, bytes(-len(text) % ALIGNED)]
     for array in arrays:
         parts += [array, bytes(-array.nbytes % ALIGNED)]
-    # Joined once: the states of a shard are large, and each copy would count in its memory.
+    # A single join avoids copies of the states of a shard, which are large.
     return b"".join([START.pack(MAGIC, len(text), _digest(*parts)), *parts])
 
 
 def unpacked(content: bytes, where: str) -> tuple[dict[str, Any], dict[str, Array]]:
     """Return header and leaves of a buffer; `where` names it in messages.
 
-    Raises `RunError`: it is no checkpoint, or damaged.
+    Raises `RunError`: the buffer is not a checkpoint, or it is damaged.
     """
     try:
         magic, length, digest = START.unpack_from(content)
@@ -143,7 +143,7 @@ def unpacked(content: bytes, where: str) -> tuple[dict[str, Any], dict[str, Arra
             raise ValueError("it begins or adds up otherwise")
         text = bytes(body[:length])
         header, described = _read(text)
-        # One copy, since `content` cannot be written to: all arrays are views of it.
+        # All arrays are views of one copy, since `content` is read-only.
         numbers = bytearray(body[length + -length % ALIGNED :])
         leaves, at = {}, 0
         for name, kind, shape in described:
@@ -166,7 +166,7 @@ def _digest(*parts: Any) -> bytes:
 
 @lru_cache(maxsize=FEW)
 def _text(header: str, described: tuple[tuple[str, str, tuple[int, ...]], ...]) -> bytes:
-    """Return header and descriptions as text, cached: those of successive states repeat."""
+    """Return header and array descriptions as text, cached since successive states repeat them."""
     for name, kind, _ in described:
         if np.dtype(kind).kind not in PLAIN:
             raise TypeError(f"{name}: a checkpoint holds arrays of numbers and texts, not {kind}.")
@@ -175,7 +175,7 @@ def _text(header: str, described: tuple[tuple[str, str, tuple[int, ...]], ...]) 
 
 @lru_cache(maxsize=FEW)
 def _read(text: bytes) -> tuple[dict[str, Any], list[tuple[str, np.dtype[Any], tuple[int, ...]]]]:
-    """Return what `_text` has written, its types checked."""
+    """Return header and array descriptions from a text of `_text`, after validating types."""
     header, described = json.loads(text)
     found = []
     for name, kind, shape in described:
@@ -209,10 +209,10 @@ def read(path: str | os.PathLike[str]) -> bytes:
 
 
 Place: TypeAlias = tuple[Array, Array, Moment]  # latent parameter, state and time
-ROUNDING = 1e-8  # relative: far above what the order of sums changes, far below any other change
+ROUNDING = 1e-8  # relative tolerance: far above effects of summation order, far below real changes
 TIMES = (0.37, 1.91)
-SUMS = 2  # for each vector
-PREFIX = "built."  # of the leaves of a checkpoint
+SUMS = 2  # number of weighted sums of each vector
+PREFIX = "built."  # prefix of the leaves of the fingerprint
 
 NAMES = {
     "law": "option of the law",
@@ -222,17 +222,17 @@ NAMES = {
     "model": "model: its equation, mesh, source or boundary values",
     "sensors": "sensor: its place, function or noise",
 }
-# Model and sensors are evaluated at the start and near it: only from the same one can it be known
-# whether they differ.
+# Model and sensors are evaluated at the start and near it: they are only comparable if the start is
+# the same.
 EVALUATED = ("model", "sensors")
 
 
 @dataclass(frozen=True, eq=False)
 class Fingerprint:
-    """Texts and numbers of each part of a problem.
+    """Texts and numbers that identify each part of a problem.
 
-    `texts` has the options of a part, with a sign instead of each number; `numbers` the numbers,
-    and the sizes of their terms, shape (numbers, 2).
+    `texts`: options of each part, with a placeholder for each number. `numbers`: the numbers of
+    each part and the magnitudes of their terms, shape (numbers, 2).
     """
 
     texts: Mapping[str, str]
@@ -240,12 +240,12 @@ class Fingerprint:
 
     @property
     def leaves(self) -> dict[str, Any]:
-        """The leaves of a checkpoint that hold it."""
+        """Leaves for a checkpoint."""
         texts = {f"{PREFIX}{part}.text": np.array(text) for part, text in self.texts.items()}
         return texts | {f"{PREFIX}{part}": each for part, each in self.numbers.items()}
 
     def differing(self, leaves: Mapping[str, Array]) -> str:
-        """Return in words what differs from the problem of a checkpoint; empty if nothing does."""
+        """Return a description of the differences from a checkpoint; empty if there are none."""
         differ = [part for part in NAMES if not self._same(part, leaves)]
         if {"unknowns", "start"} & set(differ):
             differ = [part for part in differ if part not in EVALUATED]
@@ -254,9 +254,9 @@ class Fingerprint:
     def of_members(
         self, q0: Sequence[Array], u0: Sequence[Array], errors: Sequence[Array]
     ) -> Fingerprint:
-        """Return the fingerprint of members that begin at these parameters and states.
+        """Return the fingerprint of a fleet, from initial parameters and states of its members.
 
-        `errors` are those of each state, each of shape (errors, n).
+        `errors`: errors of each initial state, shape (errors, n) each.
         """
         whole = [np.concatenate([np.ravel(one) for one in each]) for each in (q0, u0, errors)]
         start = np.concatenate(_start(*whole))
@@ -270,7 +270,7 @@ class Fingerprint:
 
 
 def _alike(one: Array, other: Array) -> bool:
-    """Return whether sums are the same to rounding of their terms; not finite is as such."""
+    """Return whether sums agree to rounding of their terms, and the same sums are not finite."""
     if one.shape != other.shape:
         return False
     finite = np.isfinite(one).all(axis=1)
@@ -281,13 +281,13 @@ def _alike(one: Array, other: Array) -> bool:
     return bool((np.abs(a - b) <= ROUNDING * size[:, None]).all())
 
 
-@nonfinite_allowed()  # at states that the process never has
+@nonfinite_allowed()  # the test states may be unphysical
 def fingerprint(
     law: AnyLaw, problem: Problem, validation: Observed | None, q0: Array, u0: Array
 ) -> Fingerprint:
     """Return the fingerprint of an identifier.
 
-    q0 and u0 are latent parameter and state at the start, without boundary values.
+    `q0`, `u0`: latent parameters and state at the start, without boundary values.
     """
     model, places = problem.model, _places(problem, q0, u0)
     valued = [(model.latent.value(q), u, at) for q, u, at in places]
@@ -320,12 +320,12 @@ def fingerprint(
 
 
 def _start(q0: Array, u0: Array, errors: Array) -> list[Array]:
-    """Return sums of the start of a run; none of errors of u0 where there are none."""
+    """Return sums of q0, of u0 and, if there are any, of the errors of u0."""
     return [_sums(q0), _sums(u0), *([_sums(errors.ravel())] if errors.size else [])]
 
 
 def _sums(values: Any) -> Array:
-    """Return weighted sums of each column of an array, and their sizes, shape (sums, 2)."""
+    """Return weighted sums of each column of an array and their magnitudes, shape (sums, 2)."""
     rows = np.asarray(values, dtype=float)
     rows = rows.reshape(len(rows), -1).T if rows.ndim > 1 else rows[None]
     weights = _weights(rows.shape[1])
@@ -333,12 +333,12 @@ def _sums(values: Any) -> Array:
 
 
 def _weights(size: int) -> Array:
-    """Return fixed weights, no two of them alike, shape (size, SUMS)."""
+    """Return fixed, pairwise different weights, shape (size, SUMS)."""
     return np.cos(np.outer(1.0 + np.arange(size), np.sqrt([2.0, 3.0])[:SUMS]))
 
 
 def _places(problem: Problem, q0: Array, u0: Array) -> list[Place]:
-    """Return the start, and a parameter and a state near it."""
+    """Return two points of evaluation: the start, and parameters and state near it."""
     inputs = Inputs({name: 1.0 + 0.3 * k for k, name in enumerate(problem.channels)})
     first, second = (Moment(t, inputs) for t in TIMES)
     u = u0 + 0.1 * max(1.0, float(np.abs(u0).max(initial=0.0))) * _weights(len(u0))[:, 0]
@@ -365,7 +365,7 @@ OF_SENSORS: tuple[Callable[..., Any], ...] = (
 def _evaluated(
     functions: Iterable[Callable[..., Any]], of: Model | Observed, places: Iterable[Place]
 ) -> list[Array]:
-    """Return sums of the terms of the process, or of readings, at each place."""
+    """Return sums of the functions of a model or of sensors at each place."""
     return [_tried(function, of, *place) for place in places for function in functions]
 
 
@@ -380,17 +380,17 @@ def _of_priors(model: Model) -> Iterator[Array]:
 
 
 def _tried(function: Callable[..., Any], *arguments: Any) -> Array:
-    """Return the sums of the values of a function; NaN if it has none there."""
+    """Return the sums of the values of a function; NaN if it raises an error."""
     try:
         return _sums(function(*arguments))
-    except Exception:  # noqa: BLE001  a form may refuse a state in any way; so it does next time
+    except Exception:  # noqa: BLE001  a form may raise any error; it is the same in each build
         return np.full((1, 2), np.nan)
 
 
 def _described(value: Any, numbers: list[float]) -> str:
-    """Return options as text, with a sign for each number, which is appended to `numbers`.
+    """Return options as text with a placeholder for each number, and append it to `numbers`.
 
-    Functions have no text: their values are in the numbers of their part.
+    Functions are not part of the text: the numbers of their part contain their values.
     """
     if isinstance(value, bool | str | None):
         return repr(value)
@@ -410,7 +410,7 @@ def _described(value: Any, numbers: list[float]) -> str:
 
 
 def _options(value: Any) -> list[tuple[str, Any]]:
-    """Return names and values of the parts of an object, without those that may restart."""
+    """Return names and values of the options of a dataclass, without `begins_anew` fields."""
     if is_dataclass(value):
         given = [item for item in fields(value) if not item.metadata.get("begins_anew")]
         return [(item.name, getattr(value, item.name)) for item in given if item.init]

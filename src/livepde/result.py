@@ -1,4 +1,4 @@
-"""Estimates, one at a time and as a table with axes."""
+"""Result of a run: its estimates, tables and datasets."""
 
 from __future__ import annotations
 
@@ -44,25 +44,25 @@ if TYPE_CHECKING:
 
     from livepde.plots import RunPlots
 
-OF_MODEL = ("model", "observed", "validation", "_readout", "_settled")  # lost by pickling
+OF_MODEL = ("model", "observed", "validation", "_readout", "_settled")  # dropped by pickle
 
 
 class Result(Shown):
-    """Estimates of a run, as they are added.
+    """Estimates of a run, which are added one by one.
 
-    Scalars, innovations and status are kept for every sample; fields, evaluated at the vertices of
-    the mesh, for every `fields_every`-th and the last.
+    Scalars, innovations and status are stored for every sample. Fields, evaluated at the vertices
+    of the mesh, are stored for every `fields_every`-th sample and the last.
 
     Parameters
     ----------
     records
         Store of the estimates; default arrays in memory.
     layout
-        Names, units and coordinates of the numbers of records; default those of model and sensors.
+        Names, units and coordinates of the records; default from model and sensors.
     count
-        Number of earlier estimates, not all of which need be kept; default that of the records.
+        Number of earlier estimates, if not all are stored; default the number of records.
     ignored
-        Names of validation sensors that never count, for the default layout.
+        Names of validation sensors that never affect the verdict, for the default layout.
 
     Examples
     --------
@@ -94,14 +94,14 @@ class Result(Shown):
         self.fields_every = int(fields_every)
         self.last: Estimate | None = None
         self._settled: Belief | None = None
-        self._ended = False  # a last fit was asked for
+        self._ended = False  # the last estimate follows a final refit
         self.smoother: Callable[[], xr.Dataset] | None = None
-        self.readings: Callable[[], Array] | None = None  # of all samples, (samples, sensors)
-        # From q and draws of it to the readings that they lead to, and their deviations.
+        self.readings: Callable[[], Array] | None = None  # all readings, (samples, sensors)
+        # (q, draws of q) -> expected readings for each draw, and their standard deviations.
         self.expected: Callable[[Array, Array], tuple[Array, Array]] | None = None
         self.records: Records = RecordArrays() if records is None else records
         self.layout = layout or layout_of(model, observed, validation, ignored)
-        # Of a result that was pickled: its records are complete, and the model is not there.
+        # A result that was pickled has complete records and no model.
         self._complete, self._last_fields = False, cast("Snapshot | None", None)
         self._count = len(self.records) if count is None else count
         self._readout = ScalarReadout(model.parameter_space)
@@ -119,27 +119,27 @@ class Result(Shown):
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict on the run so far: that of the last estimate."""
+        """Verdict on the run so far, from the last estimate."""
         return Verdict.unjudged() if self.last is None else self.last.verdict
 
     @property
     def log_evidence(self) -> float:
-        """Logarithm of the marginal likelihood of all readings; NaN for a law without covariance.
+        """Log marginal likelihood of all readings; NaN for a law without covariance.
 
-        The density of the readings of the assimilated sensors, in their unit, with the unknowns
-        integrated out: after a fit of the stored samples linear about that fit, else the sum of the
-        log densities of the innovations. Readings that were refused count as if at the limit of
-        the gate. Two runs can be compared if they assimilate the same readings.
+        It is the log density of the readings of the assimilated sensors, in their unit, with the
+        unknowns integrated out. After a refit it is linear about that fit, otherwise it is the sum
+        of the log densities of the innovations. A refused reading counts as a reading at the limit
+        of the gate. Runs can be compared if they assimilate the same readings.
         """
         return math.nan if self.last is None else float(self.last.diagnostics.log_evidence)
 
     def add(self, estimate: Estimate) -> None:
-        """Add one estimate."""
+        """Add an estimate."""
         self.records.append(*self._records([(estimate, self._keeps)]))
         self._follow(estimate)
 
     def _announce(self, estimate: Estimate) -> bool:
-        """Count an estimate whose record is stored later; return whether it keeps its fields."""
+        """Count an estimate whose record is stored later; return whether to store its fields."""
         keeps = self._keeps
         self._follow(estimate)
         return keeps
@@ -155,13 +155,13 @@ class Result(Shown):
         self.last = estimate
 
     def _settle(self, estimate: Estimate) -> None:
-        """Take the last parameter and state from the end of a run, in tables and datasets."""
+        """Replace the last estimate, also in tables and datasets, by the final one of a run."""
         self._ended = True
         if estimate is not self.last:
             self.last, self._settled = estimate, estimate.belief
 
     def _records(self, estimates: Sequence[tuple[Estimate, bool]]) -> Iterator[Record]:
-        """Iterate over the records of estimates, each with whether its fields are kept."""
+        """Iterate over the records of pairs (estimate, whether to store its fields)."""
         read_together([estimate for estimate, _ in estimates])
         numbers = self._readout([estimate.belief for estimate, _ in estimates])
         for (estimate, keeps), row in zip(estimates, numbers, strict=True):
@@ -180,21 +180,21 @@ class Result(Shown):
         return snapshot_of(self.model, estimate.belief)
 
     def to_xarray(self) -> xr.Dataset:
-        """Return a dataset of the run over time: numbers, fields, errors of the sensors.
+        """Return a dataset of the run over time: numbers, fields and errors of the sensors.
 
-        It is that of `dataset`, and has besides: `date` over `time`, if times are dates; the ends
-        `_low` and `_high` of the 95 % interval of each unknown, whatever its prior; and
-        `estimates` over (`time`, `parameter`, `statistic`), with the value, std, low and high of
-        each number: `data.estimates.sel(parameter="alpha", statistic="high")`.
+        In addition to the variables of `dataset`, it contains `date` over `time`, if times are
+        dates; the ends `_low` and `_high` of the 95 % interval of every unknown; and `estimates`
+        over (`time`, `parameter`, `statistic`), with value, std, low and high of each number, as in
+        `data.estimates.sel(parameter="alpha", statistic="high")`.
         """
         return with_estimates(self.dataset())
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return the numbers over time as a pandas table, one row for each sample.
 
-        The index has dates if the samples have. Columns are, for an unknown `alpha`: `alpha`,
-        `alpha_std`, `alpha_low` and `alpha_high`; for a sensor `T_1` `innovation:T_1`, or
-        `validation_error:T_1` for validation; and `status`.
+        The index contains dates if the samples have dates. The columns of an unknown `alpha` are
+        `alpha`, `alpha_std`, `alpha_low` and `alpha_high`. The column of a sensor `T_1` is
+        `innovation:T_1`, or `validation_error:T_1` for validation. The last column is `status`.
         """
         return frame(self.dataset())
 
@@ -202,17 +202,17 @@ class Result(Shown):
         """Return the last estimates as a pandas table, one row for each unknown number.
 
         Columns: `value` and `std`; `low` and `high`, the 95 % interval if the model is exact;
-        `model_low` and `model_high`, the one that allows for errors of the model, and `effect`,
-        by how much these may move the value, relative to it (NaN where the run cannot judge it);
-        `unit`; and `level`, that of the verdict on the whole run. The attribute `misfit` is the
-        root mean square of the residuals over the noise.
+        `model_low` and `model_high`, the 95 % interval that allows for model errors; `effect`, the
+        possible change of the value by model errors relative to the value (NaN if not judged);
+        `unit`; and `level`, the level of the verdict on the whole run. The attribute `misfit` is
+        the root mean square of the residuals divided by the noise.
         """
         return estimates(self.dataset())
 
     def covariance(self) -> pd.DataFrame:
-        """Return the covariance of the last numbers among the unknowns, by name.
+        """Return the covariance of the last estimates of scalar unknowns, by name.
 
-        Under a transform it is that to first order, as are the standard deviations.
+        Under a transform, it is the covariance to first order, as are the standard deviations.
 
         Raises
         ------
@@ -223,7 +223,7 @@ class Result(Shown):
         return covariance_of(last.belief, last.space)
 
     def correlation(self) -> pd.DataFrame:
-        """Return the correlation of the last numbers among the unknowns, by name."""
+        """Return the correlation of the last scalar estimates; raises as `covariance`."""
         found = self.covariance()
         size = np.sqrt(np.diag(found))
         return found.div(size, axis=0).div(size, axis=1)
@@ -236,21 +236,21 @@ class Result(Shown):
         n
             Number of draws.
         seed
-            Of the random numbers, or their generator.
+            Seed of the random numbers, or a generator.
 
         Returns
         -------
         draws
             Numbers over `draw`, fields and state over (`draw`, `vertex`). They are jointly normal
-            in latent values, and unknowns lie within their bounds; modes that the law leaves out
-            are drawn as well.
+            in latent values, within the bounds of the unknowns. Modes that the law omits are also
+            drawn.
 
         Raises
         ------
         LawError
             A law without a covariance.
         ConfigurationError
-            There is no estimate yet; the result was pickled.
+            There is no estimate yet, or the result was pickled.
         """
         last = self._last("sample")
         _check_count("sample: n", n)
@@ -258,25 +258,24 @@ class Result(Shown):
         return draws_dataset(self.model, *drawn, self.layout.coordinates)
 
     def to_inference_data(self, n: int = 1000, seed: int | None = 0) -> xr.DataTree:
-        """Return what ArviZ (from 1.0 on) plots and compares: an xarray DataTree.
+        """Return an xarray DataTree for plots and model comparison with ArviZ, 1.0 or newer.
 
-        Its groups:
+        Groups:
 
-        - `posterior`: the draws of `sample`. `prior`: draws of the numbers among the unknowns.
-        - `observed_data`: the readings of all sensors, of a result of `Identifier.run`.
+        - `posterior`: the draws of `sample`. `prior`: draws of the scalar unknowns.
+        - `observed_data`: readings of all sensors, for a result of `Identifier.run`.
         - `posterior_predictive`: for each draw of the unknowns, draws of the readings of the
-          assimilated sensors, noise included.
-        - `log_likelihood`: `readings` over `reading`, for each draw of the unknowns the log density
-          of each assimilated reading, so that `arviz.loo` compares models by it. A reading that no
-          unknown reaches, as at a known initial state, is left out.
+          assimilated sensors, including noise.
+        - `log_likelihood`: `readings` over `reading`, the log density of each assimilated reading
+          for each draw of the unknowns; `arviz.loo` compares models by it. Readings that do not
+          depend on the unknowns, as at a known initial state, are omitted.
 
-        For the last two all samples are taken again, which takes as long as a run. What a draw
-        leads to is linear about the last estimate: the model from the initial state on, without
-        corrections by the readings. So these are no predictions one step ahead, which are
-        `predicted` and do not depend on a draw. Noise of inputs, errors of the initial state and of
-        the discretisation widen each density. Readings that the gate has refused count as the
-        others. Runs of unknowns that move, and runs that continue an earlier one, have neither
-        group.
+        For the last two groups all samples are processed again, which takes as long as a run. The
+        readings for a draw are linear about the last estimate: they follow the model from the
+        initial state, without corrections by readings. One-step predictions, which do not depend
+        on a draw, are in `predicted`. Noise of inputs and errors of the initial state and the
+        discretisation widen each density. Refused readings count like all others. Both groups are
+        absent for moving unknowns and for runs that continue an earlier run.
 
         Parameters
         ----------
@@ -296,7 +295,7 @@ class Result(Shown):
             frame = self.measured
             chains["observed_data"] = xr.Dataset({name: frame[name] for name in frame})
         if self.expected is not None:
-            # The same draws as in `sample`, without what the law takes no account of.
+            # The same draws as in `sample`, without the modes that the law omits.
             q, _ = draws(replace(last.belief, rest=None), last.space, n, seed)
             measured = self.measured[list(self.layout.sensors)]
             chains |= predictive(measured, *self.expected(last.q, q), seed)
@@ -304,12 +303,12 @@ class Result(Shown):
 
     @property
     def measured(self) -> pd.DataFrame:
-        """Readings of the assimilated and then of the validation sensors, one row for each sample.
+        """Readings of the assimilated, then of the validation sensors, one row for each sample.
 
         Raises
         ------
         ConfigurationError
-            Estimates that were added one by one.
+            The result is not from `Identifier.run`, and its readings are not known.
         """
         import pandas as pd
 
@@ -322,10 +321,10 @@ class Result(Shown):
 
     @property
     def predicted(self) -> pd.DataFrame:
-        """Readings as the model predicted them, one row for each sample.
+        """Predicted readings, one row for each sample; NaN where there is no reading.
 
-        Of assimilated sensors before a reading was used, of validation sensors after the update;
-        NaN where there is no reading. Raises as `measured`.
+        Predictions for assimilated sensors precede the update, those for validation sensors follow
+        it. Raises as `measured`.
         """
         return self.measured - self.residuals
 
@@ -346,19 +345,17 @@ class Result(Shown):
         return self.last
 
     def dataset(self) -> xr.Dataset:
-        """Return the dataset that a run directory holds.
+        """Return the dataset that a run directory contains.
 
-        Its dimensions are time, snapshot, vertex, sensor and validation.
-        Scalar unknowns are variables over `time`, fields over (`snapshot`, `vertex`), with `_std`
-        variables beside them, and `_low` and `_high`, the ends of the 95 % interval, for unknowns
-        with a transform or bounds; innovations over (`time`, `sensor`). Units are attributes. Of a
-        law with covariance also `_left`, the remaining share of the prior standard deviation of a
-        scalar; `_modes`, the number of modes of a field that the data determine, and `_left_out`,
-        the share of its mean variance in modes that the law leaves out, over `snapshot`; and
-        `correlation` of the last scalars, over (`unknown`, `other`). The attribute `verdict` is the
-        result of `Verdict.to_dict`, as JSON; `log_evidence` that of the result; and
-        `bounded_at_end`, after a last fit that has converged, the number of coefficients that a
-        bound holds there.
+        Its dimensions are time, snapshot, vertex, sensor and validation. Scalar unknowns are over
+        `time`, fields over (`snapshot`, `vertex`), innovations over (`time`, `sensor`). The suffix
+        `_std` is the standard deviation; `_low` and `_high` are the ends of the 95 % interval of an
+        unknown with a transform or bounds. A law with covariance adds `_left`, the remaining share
+        of the prior standard deviation of a scalar; `_modes`, the number of modes of a field that
+        the data determine, and `_left_out`, the share of its mean variance in modes that the law
+        omits, over `snapshot`; and `correlation` of the last scalars, over (`unknown`, `other`).
+        Attributes are the units, `verdict` (`Verdict.to_dict` as JSON), `log_evidence`, and, after
+        a converged last refit, `bounded_at_end`: the number of its coefficients at a bound.
         """
         data = self.layout.dataset(*self._finished())
         if self.last is not None:
@@ -367,17 +364,17 @@ class Result(Shown):
                 data.attrs["log_evidence"] = self.log_evidence
             fit = self.last.fit
             if self._ended and fit is not None and fit.converged:
-                # What the search has met on its way is no matter of where it has ended.
+                # Bounds that were only active during the search do not count.
                 bounded = self.last.diagnostics.bounded
                 data.attrs["bounded_at_end"] = 0.0 if math.isnan(bounded) else bounded
         return data
 
     def _finished(self) -> tuple[RecordArrays, Snapshot | None]:
-        """Return all records, and the last fields if `fields_every` has left them out."""
+        """Return all records, and the last fields if the last record does not contain them."""
         records, fields = RecordArrays.of(self.records), self._last_fields
         if self._complete or self.last is None:
             return records, fields
-        # The last fields are part of the dataset, also where `fields_every` has left them out.
+        # The dataset contains the last fields whatever `fields_every` is.
         missing = records.last_snapshot < len(records) - 1
         last = self._snapshot(self.last) if missing or self._settled is not None else None
         if self._settled is not None:
@@ -386,7 +383,7 @@ class Result(Shown):
         return records, last if missing else fields
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the records, without the model, whose functions may not be pickled."""
+        """Return the attributes without the model, whose functions pickle may not support."""
         records, fields = self._finished()
         own: dict[str, Any] = {
             "records": records,
@@ -400,7 +397,7 @@ class Result(Shown):
         return {k: v for k, v in vars(self).items() if k not in OF_MODEL} | own
 
     def __getattr__(self, name: str) -> Any:
-        # Python calls this only for names that are not there: those that `__getstate__` leaves out.
+        # Python calls this only for missing names, such as those that `__getstate__` drops.
         if name in OF_MODEL:
             raise ConfigurationError(
                 "this result was pickled, without its model: it has its estimates, datasets and "
@@ -409,17 +406,17 @@ class Result(Shown):
         raise AttributeError(f"a Result has no attribute '{name}'.")
 
     def smoothed(self) -> xr.Dataset:
-        """Return a dataset of unknowns and state over time, given all samples of the run.
+        """Return a dataset of smoothed unknowns and states, given all samples of the run.
 
-        Names as in `to_xarray`; intervals are those given all samples. The samples are taken again
-        at least twice: see `Identifier.smoothed`.
+        Names are as in `to_xarray`. All samples are processed again, at least twice: see
+        `Identifier.smoothed`.
 
         Raises
         ------
         ConfigurationError
-            Estimates that were added one by one.
+            The result is not from `Identifier.run`, and its samples are not known.
         LawError
-            A law without a covariance that a smoother could follow.
+            A law without a covariance, or with the option `memory`.
         """
         if self.smoother is None:
             raise ConfigurationError(
@@ -437,9 +434,9 @@ class Result(Shown):
 
     @property
     def plot(self) -> RunPlots:
-        """Figures by name, `plot.estimates("alpha", ax=ax)`; `plot()` draws all of the run.
+        """Figures by name, such as `plot.estimates("alpha", ax=ax)`; `plot()` draws all of them.
 
-        They need the extra `plots`.
+        They require the extra `plots`.
         """
         from livepde.plots import RunPlots
 
@@ -447,6 +444,6 @@ class Result(Shown):
 
 
 def _check_count(name: str, value: Any) -> None:
-    """Refuse anything but a whole number of at least 1."""
+    """Raise `ConfigurationError` unless the value is a positive whole number."""
     if not isinstance(value, Integral) or int(value) < 1:
         raise ConfigurationError(f"{name} must be a whole number, at least 1; got {value!r}.")
