@@ -1,4 +1,4 @@
-"""Results of a run as tables of pandas, as a dataset with axes, and as draws; their names."""
+"""Results of a run as pandas tables, datasets and draws; names and units of its records."""
 
 from __future__ import annotations
 
@@ -39,24 +39,24 @@ if TYPE_CHECKING:
 MEDIAN = "the median"
 FIRST_ORDER = "to first order: that of the latent value, times the slope of the transform"
 STATISTICS = ("value", "std", "low", "high")
-ALLOWED = ("model_low", "model_high", "effect")  # of an estimate that allows for model errors
+ALLOWED = ("model_low", "model_high", "effect")  # columns that allow for model errors
 ERRORS = (("innovation", "sensor"), ("validation_error", "validation"))
 
 
 def model_errors(data: xr.Dataset) -> ModelErrors | None:
-    """Return misfit and effects that the verdict of a run has stated; None without."""
+    """Return misfit and effects in the verdict of a run; None without a verdict."""
     stored = data.attrs.get("verdict")
     return ModelErrors.from_dict(json.loads(stored).get("errors")) if stored else None
 
 
 def relative_error(data: xr.Dataset, label: str) -> float:
-    """Return the relative error of the last estimate to the reference, NaN without one."""
+    """Return the relative error of the last estimate; NaN without a nonzero reference."""
     reference = float(data[label].attrs.get("reference", math.nan))
     return abs(float(data[label][-1]) - reference) / abs(reference) if reference else math.nan
 
 
 def estimates(data: xr.Dataset) -> pd.DataFrame:
-    """Return the last estimates of the numbers of a run, one row for each: see `Result.summary`."""
+    """Return a table of the last estimates of scalar unknowns: see `Result.summary`."""
     import pandas as pd
 
     errors, verdict = model_errors(data), json.loads(data.attrs.get("verdict", "{}"))
@@ -81,7 +81,7 @@ def estimates(data: xr.Dataset) -> pd.DataFrame:
 
 
 def times(data: xr.Dataset) -> pd.Index[Any]:
-    """Return the times of a run for an index: dates where it has them."""
+    """Return an index with the times of a run, as dates if it has dates."""
     import pandas as pd
 
     dates = instants(data, data["time"].values)
@@ -90,7 +90,7 @@ def times(data: xr.Dataset) -> pd.Index[Any]:
 
 
 def frame(data: xr.Dataset) -> pd.DataFrame:
-    """Return numbers over time, one row for each sample: see `Result.to_dataframe`."""
+    """Return a table of numbers over time: see `Result.to_dataframe`."""
     import pandas as pd
 
     columns: dict[str, Array] = {}
@@ -106,7 +106,7 @@ def frame(data: xr.Dataset) -> pd.DataFrame:
 
 
 def over_time(data: xr.Dataset, variable: str, dimension: str) -> dict[str, Array]:
-    """Return the values of each channel of a variable; none if the run has no such variable."""
+    """Return channel -> its values of a variable; empty if the run has no such variable."""
     if variable not in data:
         return {}
     columns = data[variable].transpose(dimension, "time").values
@@ -114,7 +114,7 @@ def over_time(data: xr.Dataset, variable: str, dimension: str) -> dict[str, Arra
 
 
 def with_estimates(data: xr.Dataset) -> xr.Dataset:
-    """Return the dataset of a run with dates, and with its numbers on separate axes."""
+    """Add dates, interval ends and the variable `estimates` to the dataset of a run."""
     found: dict[str, Any] = {}
     labels = scalars(data)
     for name in [*labels, *field_names(data)]:
@@ -128,7 +128,7 @@ def with_estimates(data: xr.Dataset) -> xr.Dataset:
         data = data.assign_coords({DATE: ("time", dates.tz_localize(None))})
     if not labels:
         return data
-    ends = ("", "_std", "_low", "_high")  # as STATISTICS
+    ends = ("", "_std", "_low", "_high")  # in the order of STATISTICS
     columns = [[data[f"{label}{end}"].values for end in ends] for label in labels]
     values = np.array(columns).transpose(2, 0, 1)
     units = [str(data[label].attrs.get("units", "")) for label in labels]
@@ -142,7 +142,7 @@ def with_estimates(data: xr.Dataset) -> xr.Dataset:
 
 
 def covariance_of(belief: Belief, space: FunctionSpace) -> pd.DataFrame:
-    """Return the covariance of the numbers among the unknowns, by label."""
+    """Return the covariance of the scalar unknowns, by label."""
     import pandas as pd
 
     rows = list(space.labels.values())
@@ -157,8 +157,8 @@ def draws(
 ) -> tuple[Array, Array]:
     """Return draws of the coefficients of parameter and state, shapes (n, m) and (n, state).
 
-    Jointly normal in latent values, with the variance that the law omits; the state to first
-    order.
+    They are jointly normal in latent values and include the variance that the law omits. The
+    state is linear to first order.
     """
     factor, rng = _factor(belief), np.random.default_rng(seed)
     xi = rng.standard_normal((n, factor.shape[1]))
@@ -177,7 +177,7 @@ def draws(
 def draws_dataset(
     model: Model, q: Array, u: Array, coordinates: Mapping[str, Sequence[float]]
 ) -> xr.Dataset:
-    """Return draws of the coefficients as numbers, fields and state: see `Result.sample`."""
+    """Return a dataset of draws, given their coefficients: see `Result.sample`."""
     import xarray as xr
 
     space, order = model.parameter_space, vertex_order(model)
@@ -199,7 +199,7 @@ def draws_dataset(
 
 
 def prior_draws(space: FunctionSpace, n: int, seed: int | np.random.Generator | None) -> xr.Dataset:
-    """Return draws of the numbers among the unknowns from their priors."""
+    """Return draws of the scalar unknowns from their priors."""
     import xarray as xr
 
     rng, found = np.random.default_rng(seed), {}
@@ -216,8 +216,8 @@ def predictive(
     """Return draws of readings and log densities: see `Result.to_inference_data`.
 
     `measured`: readings, one column for each sensor.
-    `expected`, `std`: what they are for each draw, shape (n, samples, sensors), and their standard
-    deviations about it, shape (samples, sensors).
+    `expected`, `std`: expected readings for each draw, shape (n, samples, sensors), and standard
+    deviations of the readings about them, shape (samples, sensors).
     """
     import xarray as xr
 
@@ -228,7 +228,7 @@ def predictive(
     scale = std[rows, columns]
     e = (values[rows, columns] - expected[:, rows, columns]) / scale
     density = -0.5 * e**2 - np.log(scale) - 0.5 * math.log(2.0 * math.pi)
-    # ArviZ refuses readings that are the same for all draws, as where the initial state is known.
+    # ArviZ rejects readings with equal density for all draws, as at a known initial state.
     told = np.ptp(density, axis=0) > 1e-12 * np.abs(density).max(axis=0, initial=1.0)
     about = {
         "time": ("reading", measured.index[rows[told]]),
@@ -255,7 +255,7 @@ def layout_of(
 ) -> Layout:
     """Return names, units and coordinates of the records of a run.
 
-    `ignored`: names of validation sensors that never count.
+    `ignored`: names of validation sensors that never affect the verdict.
     """
     components = model.state_space.fields.items()
     places, units = _of_sensors(observed, validation)
@@ -288,7 +288,7 @@ def _numbers(space: FunctionSpace) -> dict[str, dict[str, Any]]:
     for label in space.labels:
         unknown = space.unknown_of(label)
         unit: dict[str, Any] = {"units": unknown.unit}
-        plain = isinstance(unknown.prior, Normal)  # then mean and standard deviation
+        plain = isinstance(unknown.prior, Normal)  # the value is the mean, not only the median
         numbers[label] = {**unit, **_prior(unknown), **({} if plain else {"comment": MEDIAN})}
         numbers[f"{label}_std"] = {**unit, **({} if plain else {"comment": FIRST_ORDER})}
         numbers |= dict.fromkeys(interval_ends(label, unknown, 0.0, 0.0), unit)
@@ -297,7 +297,7 @@ def _numbers(space: FunctionSpace) -> dict[str, dict[str, Any]]:
 
 
 def _of_sensors(*groups: Observed | None) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return sensor -> place, where it has one, and sensor -> unit."""
+    """Return sensor -> position, for sensors at one point, and sensor -> unit."""
     places: dict[str, Any] = {}
     units: dict[str, str] = {}
     for one in filter(None, groups):
@@ -316,7 +316,7 @@ def _comments(model: Model) -> dict[str, str]:
 
 
 def vertex_order(model: Model) -> Any:
-    """In which order vertices are kept: along an interval, else as the mesh has them."""
+    """Return the order of stored vertices: increasing on an interval, else that of the mesh."""
     points = model.mesh.p
     return np.argsort(points[0]) if len(points) == 1 else slice(None)
 
@@ -330,7 +330,7 @@ def _units(model: Model) -> dict[str, str]:
 
 
 def interval_ends(name: str, unknown: Any, values: Any, std: Any) -> dict[str, Any]:
-    """Return variables with the ends of 95 % intervals, if those are not mean +- 1.96 std."""
+    """Return variables with the ends of 95 % intervals, unless these are mean +- 1.96 std."""
     if unknown.prior.symmetric:
         return {}
     low, high = unknown.interval(values, std)
@@ -338,16 +338,16 @@ def interval_ends(name: str, unknown: Any, values: Any, std: Any) -> dict[str, A
 
 
 def _prior(unknown: Any) -> dict[str, float]:
-    """Return prior and finite bounds of a scalar unknown as attributes of its variable."""
+    """Return the prior and finite bounds of a scalar unknown, as attributes of its variable."""
     bounds = zip(("lower_bound", "upper_bound"), unknown.prior.bounds, strict=True)
     found = {name: float(bound) for name, bound in bounds if np.isfinite(bound)}
-    if not unknown.evolution.moves:  # one that moves is never known better for good
+    if not unknown.evolution.moves:  # the variance of a moving unknown may increase again
         found["prior_std"] = float(unknown.prior.std)
     return found
 
 
 def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:
-    """Return the table of a run's dataset: last estimates, and errors of each channel."""
+    """Return a table of the last estimates and of the errors of each channel of a run."""
     rows: dict[str, dict[str, float]] = {}
     for label in scalars(data) if data.sizes["time"] else ():
         rows[label] = {"value": float(data[label][-1]), "std": float(data[f"{label}_std"][-1])}
@@ -367,12 +367,12 @@ def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:
 
 
 def snapshot_of(model: Model, belief: Belief) -> Snapshot:
-    """Return the fields at the vertices."""
+    """Return the fields of a belief at the vertices, with their determined modes."""
     space, told, left_out = model.parameter_space, {}, {}
     for name, field in space.fields.items():
         left = belief.modes_left(space.part(name))
         if len(left):
-            # A mode counts by the share of its prior variance that the data have taken away.
+            # The weight of a mode is the share by which the data have reduced its prior variance.
             told[name] = float(np.maximum(1.0 - left**2, 0.0).sum()), len(left)
             left_out[name] = belief.left_out(field.at_vertices, space.part(name))
     order, rows = vertex_order(model), [*space.labels.values()]
@@ -403,14 +403,14 @@ def _profiles(model: Model, belief: Belief) -> dict[str, Array]:
 
 
 def _split(name: str, block: FieldBlock, values: Array, end: str = "") -> dict[str, Array]:
-    """Return the variables of a component with their values at the vertices."""
+    """Return the values at the vertices as variables, one for each component of a vector."""
     names = block.variables(name)
     rows = values.reshape(len(names), -1)
     return {f"{key}{end}": row for key, row in zip(names, rows, strict=True)}
 
 
 def correlation_of(rows: Array) -> Array:
-    """Return the correlation of numbers by a square root of their covariance, (..., numbers, r)."""
+    """Return correlations from square roots of covariances, shape (..., numbers, r)."""
     size = np.linalg.norm(rows, axis=-1)
     unit = rows / np.where(size > 0.0, size, 1.0)[..., None]
     correlation: Array = unit @ unit.swapaxes(-1, -2)

@@ -1,4 +1,4 @@
-"""Unknowns of an estimate: the marginal of one, and the numbers of all scalars as one row."""
+"""Marginals of unknowns, and the numbers of all scalar unknowns as one row."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ LEVEL = 0.95
 
 
 class ScalarReadout:
-    """Numbers of the scalar unknowns, in the order of `Layout.numbers`.
+    """Function that returns the numbers of scalar unknowns, in the order of `Layout.numbers`.
 
-    The arithmetic equals that of `Belief` and of `Scalar.interval` to the last bit; the ends of
-    intervals are computed for many beliefs at once, since a call costs more than its numbers.
+    Results equal those of `Belief` and `Scalar.interval` to the last bit. Interval ends of many
+    beliefs are computed together, since the cost of a call exceeds the cost of its arithmetic.
     """
 
     def __init__(self, space: FunctionSpace) -> None:
@@ -35,15 +35,15 @@ class ScalarReadout:
         self._prior: tuple[Array | None, list[float]] = (None, [])
 
     def __call__(self, beliefs: Sequence[Belief]) -> Array:
-        """Return value, standard deviation, interval ends and share left of all, for each belief.
+        """Return the numbers of all scalar unknowns for each belief, shape (beliefs, numbers).
 
-        Concatenated, shape (beliefs, numbers).
+        They are value, standard deviation, interval ends and ratio to the prior deviation.
         """
         if not (self._unknowns and beliefs):
             return np.empty((len(beliefs), 0))
         read = [(belief.q[self._rows], *self._deviations(belief)) for belief in beliefs]
         columns: list[Array] = []
-        # A row for each unknown, in one piece: NumPy may round strided numbers otherwise.
+        # Contiguous rows, one for each unknown: NumPy may round strided numbers differently.
         rows = (np.array(part).T.copy() for part in zip(*read, strict=True))
         for unknown, value, std, share in zip(self._unknowns, *rows, strict=True):
             ends = () if unknown.prior.symmetric else unknown.interval(value, std, LEVEL)
@@ -51,11 +51,11 @@ class ScalarReadout:
         return np.stack(columns, axis=1)
 
     def _deviations(self, belief: Belief) -> tuple[list[float], list[float]]:
-        """Return standard deviations, and their ratios to those of the prior."""
+        """Return standard deviations, and their ratios to prior standard deviations."""
         factor, nothing = belief.q_factor, [math.nan] * len(self._unknowns)
         if factor is None:
             return nothing, nothing
-        # Rows of a column-major matrix would be summed in another order, with other rounding.
+        # Rows of a column-major matrix are summed in another order and round differently.
         chosen = factor[self._rows]
         after = np.sqrt(np.add.reduce(chosen * chosen, axis=1))
         std = after
@@ -71,7 +71,7 @@ class ScalarReadout:
         return std.tolist(), [share / before for share, before in pairs]
 
     def _before(self, prior: Array) -> list[float]:
-        """Return prior standard deviations; NaN if there is none."""
+        """Return prior standard deviations, NaN where they are zero."""
         before = np.linalg.norm(prior[self._rows], axis=1)
         found: list[float] = np.where(before > 0.0, before, np.nan).tolist()
         return found
@@ -79,11 +79,11 @@ class ScalarReadout:
 
 @dataclass(frozen=True, eq=False)
 class Marginal:
-    """The marginal distribution of one unknown in an estimate: a Gaussian in its latent value.
+    """Marginal distribution of an unknown in an estimate: Gaussian in its latent value.
 
-    `median`: a number; of a field an array of coefficients.
-    `deviation`: standard deviation to first order: that of the latent value times the slope of the
-    transform at the median. NaN for a law without covariance.
+    `median`: a number, or for a field an array of coefficients.
+    `deviation`: standard deviation to first order: latent standard deviation times the slope of the
+    transform at the median; NaN for a law without covariance.
     `unknown`: the unknown with its prior.
     """
 
@@ -95,17 +95,17 @@ class Marginal:
     def at(self, points: ArrayLike) -> Marginal:
         """Return the marginals of the values of a field at points.
 
-        `points`: coordinates of one or more points: on an interval a number or shape (points,),
-        else shape (d,) or (points, d).
+        `points`: coordinates of one or more points: a number or shape (points,) on an interval,
+        otherwise shape (d,) or (points, d).
 
         Returns
         -------
         marginals
-            Its median, deviation, mean, std and intervals have a number for each point; of a vector
-            field a row of components.
+            Marginal whose median, deviation, mean, std and intervals have a number for each point,
+            or for a vector field a row of components.
 
         Raises `ConfigurationError`: the unknown is a number, or the estimate was pickled.
-        Raises `ObservationError`: a point outside of the mesh.
+        Raises `ObservationError`: a point is outside the mesh.
 
         Examples
         --------
@@ -123,12 +123,12 @@ class Marginal:
 
     @property
     def mean(self) -> Any:
-        """Mean: the median of a `Normal`, larger than it for a `LogNormal`."""
+        """Mean: equal to the median of a `Normal`, larger for a `LogNormal`."""
         return self._moments[0]
 
     @property
     def std(self) -> Any:
-        """Standard deviation: `deviation` of a `Normal`, larger for a `LogNormal`."""
+        """Standard deviation: equal to `deviation` of a `Normal`, larger for a `LogNormal`."""
         return self._moments[1]
 
     @cached_property
@@ -137,18 +137,18 @@ class Marginal:
         return (float(mean), float(std)) if isinstance(self.median, float) else (mean, std)
 
     def interval(self, level: float = 0.95) -> tuple[Any, Any]:
-        """Return the ends of the central interval that holds it with probability `level`.
+        """Return the ends of the central interval with probability `level`.
 
-        Within its bounds, and not symmetric for a `LogNormal` or `LogitNormal`. NaN for a law
-        without covariance.
+        They are within the bounds of the unknown, asymmetric for a `LogNormal` or `LogitNormal`,
+        and NaN for a law without covariance.
         """
         low, high = self.unknown.interval(self.median, self.deviation, level)
         return (float(low), float(high)) if isinstance(self.median, float) else (low, high)
 
     def __str__(self) -> str:
-        """Return mean and standard deviation; under a transform median and 95 % interval.
+        """Return mean and standard deviation, or median and 95 % interval under a transform.
 
-        The value alone for a law without covariance.
+        For a law without covariance, only the value is returned.
         """
         if not isinstance(self.median, float):
             return repr(self)
@@ -161,7 +161,7 @@ class Marginal:
 
 
 def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
-    """Return findings on scalar unknowns that are not identifiable, or end at a bound."""
+    """Yield findings on scalar unknowns that are not identifiable or at a bound."""
     for label, row in space.labels.items():
         unknown, value = space.unknown_of(label), float(belief.q[row])
         lower, upper = map(float, unknown.prior.bounds)
@@ -181,7 +181,7 @@ def marginals_at(
 ) -> Marginal:
     """Return the marginals of the values of a field of a space at points.
 
-    `deviation` returns the standard deviation of rows @ coefficients[part], None if unknown.
+    `deviation`: function (rows, part) -> standard deviation of rows @ coefficients[part], or None.
     """
     block, part, unknown = space.fields[name], space.part(name), space.unknown_of(name)
     at, one = coordinates_of(points, len(block.box[0]), name)
@@ -198,7 +198,7 @@ def marginals_at(
 
 
 def coordinates_of(points: ArrayLike, axes: int, name: str) -> tuple[Array, bool]:
-    """Return coordinates of points, shape (axes, points), and whether one point is meant."""
+    """Return coordinates of points, shape (axes, points), and whether they are a single point."""
     try:
         given = np.asarray(points, dtype=float)
     except (TypeError, ValueError):

@@ -1,7 +1,7 @@
-"""Records of estimates, and the dataset made of them.
+"""Records of estimates, and their conversion to a dataset.
 
-A record holds numbers and arrays only; their names, units and coordinates are stored once, in a
-layout of plain values. So a run can be read without its model, and while it is in progress.
+A record contains only numbers and arrays. A layout of plain values contains their names, units and
+coordinates. A run can therefore be read without its model, and while it is in progress.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 
 NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard deviations
 STATUS_CODES = ("ok", "not_converged", "not_finite", "singular", "departed")
-STATUS_FLAGS = {  # attributes of the variable that holds indices in these
+STATUS_FLAGS = {  # CF attributes of a variable with indices in STATUS_CODES
     "flag_values": list(range(len(STATUS_CODES))),
     "flag_meanings": " ".join(STATUS_CODES),
 }
 
-NOTE = "note_"  # prefix of a note whose own name is taken
+NOTE = "note_"  # prefix of a note whose name is already used
 SMOOTHED = "_smoothed"  # suffix of a variable estimated from all samples of a run
-DATE = "date"  # column of an exported table, beside the variables of the dataset
-# The numbers among the unknowns on axes of their own, in `Result.to_xarray`.
+DATE = "date"  # additional coordinate of times with dates, in exported datasets and tables
+# Variable of scalar unknowns in `Result.to_xarray`, and its two dimensions besides time.
 ESTIMATES, PARAMETER, STATISTIC = "estimates", "parameter", "statistic"
 OWN_NAMES = frozenset(
     {DATE, ESTIMATES, PARAMETER, f"{PARAMETER}_unit", STATISTIC}
@@ -40,8 +40,8 @@ OWN_NAMES = frozenset(
     | {"sensor", "sensor_unit", "innovation", "validation", "validation_unit", "validation_error"}
     | {"status", "steps"}
 )
-"""Names that every dataset of a run has, without those of its mesh."""
-# Variables beside an unknown or a component of the state: suffix of their names -> meaning.
+"""Names that are used in every dataset of a run, except the names of its mesh."""
+# Additional variables of an unknown or a component of the state: suffix of the name -> meaning.
 STATE_ENDS = {"_std": "the standard deviation"}
 INTERVAL_ENDS = {"_low": "the lower end of the interval", "_high": "the upper end of the interval"}
 NUMBER_ENDS = {
@@ -67,23 +67,23 @@ class Snapshot:
     told: Mapping[str, tuple[float, int]]
     # Correlation of the scalar unknowns, shape (unknowns, unknowns); None without covariance
     correlation: Array | None = None
-    # Field -> share of its mean variance in modes that the law leaves out
+    # Field -> share of its mean variance in modes that the law omits
     left_out: Mapping[str, float] = field(default_factory=dict)
 
     def to_bytes(self) -> bytes:
-        """Return names and sizes in JSON, a zero byte, and the numbers."""
+        """Return names and sizes as JSON, a zero byte, and the numbers."""
         head: dict[str, Any] = {"told": self.told, "left_out": self.left_out}
         head["profiles"] = {name: len(values) for name, values in self.profiles.items()}
         body = [values.tobytes() for values in self.profiles.values()]
         if self.correlation is not None:
             head["correlation"] = len(self.correlation)
             body.append(self.correlation.tobytes())
-        # JSON has no zero byte, so that the first one ends it.
+        # JSON never contains a zero byte: the first one marks its end.
         return json.dumps(head).encode() + b"\0" + b"".join(body)
 
     @classmethod
     def from_bytes(cls, content: bytes) -> Snapshot:
-        """Return the snapshot in the bytes of `to_bytes`; others raise one of many errors."""
+        """Return the snapshot stored by `to_bytes`; other bytes raise errors of various types."""
         text, body = content.split(b"\0", 1)
         head = json.loads(text)
         sizes = [*head["profiles"].values()]
@@ -102,7 +102,7 @@ class Snapshot:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Record:
-    """The stored part of an estimate."""
+    """Stored part of an estimate."""
 
     t: float
     numbers: Array  # values of the variables `Layout.numbers`, shape (numbers,)
@@ -111,14 +111,14 @@ class Record:
     status: int  # index in `STATUS_CODES`
     steps: int
     notes: Mapping[str, float]
-    snapshot: Snapshot | None = None  # the fields; None where none are kept
+    snapshot: Snapshot | None = None  # fields; None if they are not stored at this time
 
 
 class Records(Protocol):
-    """A store of records: arrays, or the journal of a run."""
+    """Store of records: arrays, or the journal of a run."""
 
     def append(self, record: Record, /) -> None:
-        """Keep one more."""
+        """Store a record after all others."""
 
     def __iter__(self) -> Iterator[Record]: ...
 
@@ -126,7 +126,7 @@ class Records(Protocol):
 
 
 class RecordArrays:
-    """Records of a run as arrays that grow by a sixteenth: the numbers themselves, and no objects.
+    """Records of a run as arrays of numbers, without objects, which grow by a sixteenth.
 
     A note that is NaN counts as missing.
     """
@@ -136,12 +136,12 @@ class RecordArrays:
         self._numbers, self._innovation, self._error = array("d"), array("d"), array("d")
         self._status, self._steps = array("b"), array("i")
         self._notes: dict[str, array[float]] = {}
-        self._fields: list[bytes] = []  # of the records with these numbers
+        self._fields: list[bytes] = []  # snapshots, of the records in `_with_fields`
         self._with_fields = array("q")
 
     @classmethod
     def of(cls, records: Iterable[Record]) -> RecordArrays:
-        """Return records as arrays: themselves if they are."""
+        """Convert records to arrays; return `RecordArrays` unchanged."""
         if isinstance(records, cls):
             return records
         found = cls()
@@ -154,7 +154,7 @@ class RecordArrays:
 
     def append(self, record: Record, /) -> None:
         count = len(self._t)
-        # All is converted before anything is kept: a value that is no number changes nothing.
+        # All values are converted first, so that an invalid value does not change the store.
         notes = {name: float(value) for name, value in record.notes.items()}
         found = (record.numbers, record.innovation, record.validation_error)
         numbers, innovation, error = (np.asarray(part, dtype=float).tobytes() for part in found)
@@ -162,7 +162,7 @@ class RecordArrays:
             column = self._notes.get(name)
             if column is None:
                 column = self._notes[name] = array("d")
-            # A note that is new, or was absent for a while, is NaN until now.
+            # A note is NaN in earlier records without it.
             if len(column) < count:
                 column.extend([math.nan] * (count - len(column)))
             column.append(value)
@@ -177,7 +177,7 @@ class RecordArrays:
             self._with_fields.append(count)
 
     def with_last(self, numbers: Array, snapshot: Snapshot | None) -> RecordArrays:
-        """Return a copy in which numbers and fields of the last record are others."""
+        """Return a copy with other numbers and fields of the last record."""
         *earlier, last = self
         return RecordArrays.of([*earlier, replace(last, numbers=numbers, snapshot=snapshot)])
 
@@ -229,7 +229,7 @@ class RecordArrays:
 
     @property
     def notes(self) -> dict[str, Array]:
-        """Name of a note -> its values, shape (samples,); NaN where it is missing."""
+        """Name of a note -> its values, shape (samples,), NaN where missing."""
         found = {}
         for name, values in self._notes.items():
             found[name] = np.full(len(self), np.nan)
@@ -241,12 +241,12 @@ class RecordArrays:
         return self._with_fields[-1] if self._with_fields else -1
 
     def snapshots(self) -> Iterator[tuple[int, Snapshot]]:
-        """Iterate over the snapshots and the numbers of their records."""
+        """Iterate over pairs (index of a record, its snapshot)."""
         return zip(self._with_fields, map(Snapshot.from_bytes, self._fields), strict=True)
 
 
 def _array(values: array[float]) -> Array:
-    """Return a copy: a view would lock the size of the growing array."""
+    """Return a copy, since a growing array with a view cannot be resized."""
     return np.array(values, dtype=float)
 
 
@@ -255,13 +255,13 @@ class Layout:
     """Names, units and coordinates of the numbers of records, as plain values."""
 
     time_unit: str
-    sensor_unit: str  # of innovations; empty if the sensors have several
+    sensor_unit: str  # unit of innovations; empty if sensors have different units
     coordinates: Mapping[str, Sequence[float]]  # axis -> coordinates of the vertices
-    # Kind of cell as meshio names it ("triangle", "tetra", ...) -> vertices of each; of an interval
-    # none, its vertices are in order
+    # Kind of cell in meshio's notation ("triangle", "tetra", ...) -> vertices of each cell; empty
+    # for an interval, whose vertices are in order
     cells: Mapping[str, Sequence[Sequence[int]]]
-    sensors: Sequence[str]
-    validation: Sequence[str] | None  # names of these sensors; None if there are none
+    sensors: Sequence[str]  # names of the assimilated sensors
+    validation: Sequence[str] | None  # names of the validation sensors; None if there are none
     # Variable over time -> its attributes, in the order of `Record.numbers`
     numbers: Mapping[str, Mapping[str, Any]]
     units: Mapping[str, str]  # unknown or component of the state -> unit
@@ -269,13 +269,13 @@ class Layout:
     fields: Sequence[str]  # names of unknown fields
     state: Sequence[str]  # names of variables of the state
     length_unit: str = ""  # unit of coordinates
-    # Sensor, of either kind, that is at one point -> its coordinates
+    # Assimilated or validation sensor at one point -> its coordinates
     places: Mapping[str, Sequence[float]] = field(default_factory=dict)
     # Attributes of the dataset: title, origin (the date of t = 0), equation
     attrs: Mapping[str, Any] = field(default_factory=dict)
-    # Variable of a field -> what its numbers are, where that is not a mean or a standard deviation
+    # Variable of a field -> meaning of its numbers, unless mean or standard deviation
     comments: Mapping[str, str] = field(default_factory=dict)
-    # Sensor, of either kind -> its unit; empty if they have one in common
+    # Assimilated or validation sensor -> its unit; empty if all have the same unit
     sensor_units: Mapping[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
@@ -283,13 +283,13 @@ class Layout:
 
     @classmethod
     def from_json(cls, text: str) -> Layout:
-        """Return a layout from JSON; raises `ValueError` where a type is wrong."""
+        """Return a layout from JSON; raise `ValueError` if a type is wrong."""
         return _layouts().validate_json(text)
 
     def dataset(self, records: Iterable[Record], last: Snapshot | None = None) -> xr.Dataset:
-        """Return records as a dataset; see `Result.to_xarray`.
+        """Convert records to a dataset: see `Result.dataset`.
 
-        `last`: the fields at the last time, if its record holds none.
+        `last`: fields at the last time, if its record does not contain them.
         """
         import xarray as xr
 
@@ -312,7 +312,7 @@ class Layout:
         data["status"] = ("time", rows.status, dict(STATUS_FLAGS))
         data["steps"] = ("time", rows.steps, {"long_name": "substeps taken"})
         for name, values in rows.notes.items():
-            taken = name in data or name in coords  # by an unknown, say
+            taken = name in data or name in coords  # for example by an unknown
             data[f"{NOTE}{name}" if taken else name] = ("time", values)
         about = {
             **self.attrs,
@@ -323,7 +323,7 @@ class Layout:
         return xr.Dataset(data, coords, about)
 
     def _of_sensors(self, rows: RecordArrays) -> dict[str, Any]:
-        """Return the variables of sensors, and of those that are not used."""
+        """Return the variables with the errors of assimilated and validation sensors."""
         unit = {"units": self.sensor_unit}
         innovations = np.reshape(rows.innovation, (len(rows), len(self.sensors)))
         data = {"innovation": (("time", "sensor"), innovations, unit)}
@@ -333,7 +333,7 @@ class Layout:
         return data
 
     def _coordinates(self, times: Array, snapshots: Array) -> dict[str, Any]:
-        """Return the coordinates of the dataset: times of samples and of fields, and places."""
+        """Return the coordinates of the dataset: times of samples and fields, names, positions."""
         unit, validation = {"units": self.length_unit}, self.validation or ()
         return {
             "time": ("time", times, {"units": self.time_unit}),
@@ -348,7 +348,7 @@ class Layout:
         }
 
     def _places(self, dimension: str, names: Sequence[str]) -> dict[str, Any]:
-        """Return the coordinates of sensors, NaN for those that are not at one point."""
+        """Return the positions of sensors, NaN for sensors that are not at one point."""
         if not any(name in self.places for name in names):
             return {}
         nowhere = [np.nan] * len(self.coordinates)
@@ -358,16 +358,16 @@ class Layout:
         return {f"{dimension}_{axis}": (dimension, x, unit) for axis, x in axes}
 
     def _sensor_units(self, dimension: str, names: Sequence[str]) -> dict[str, Any]:
-        """Return the coordinate of the units of sensors, if they have several."""
+        """Return the units of sensors as a coordinate; empty if all have the same unit."""
         if not self.sensor_units or not names:
             return {}
         return {f"{dimension}_unit": (dimension, [self.sensor_units[name] for name in names])}
 
     @staticmethod
     def own_names(axes: Iterable[str], cells: Iterable[str]) -> set[str]:
-        """Return the names of dimensions, coordinates and variables that every dataset has.
+        """Return the names of dimensions, coordinates and variables of every dataset.
 
-        `axes`, `cells`: coordinates and kinds of cells of the mesh.
+        `axes`, `cells`: names of the axes and kinds of cells of the mesh.
         """
         places = {f"{of}{axis}" for axis in axes for of in ("", "sensor_", "validation_")}
         return {*OWN_NAMES, *places, *cells}
@@ -402,14 +402,14 @@ def _layouts() -> TypeAdapter[Layout]:
 
 
 def bare(name: str) -> str:
-    """Return the name of the unknown of a variable."""
+    """Return the name of a variable without the suffix of a deviation or interval end."""
     for end in (*STATE_ENDS, *INTERVAL_ENDS):
         name = name.removesuffix(end)
     return name
 
 
 def refusal(name: str) -> str:
-    """Return the name of the note that is 1 where a reading of a sensor was refused.
+    """Return the name of the note that is 1 if the reading of a sensor was refused.
 
     >>> refusal("T_1")
     'refused T_1'
@@ -418,7 +418,7 @@ def refusal(name: str) -> str:
 
 
 def refused_readings(data: xr.Dataset) -> dict[str, Mask]:
-    """Return sensor -> which samples have a reading that the gate refused; none without."""
+    """Return sensor -> mask of samples whose reading the gate refused, if there are any."""
     found = {}
     for name in map(str, data["sensor"].values) if "sensor" in data else ():
         note = refusal(name)
@@ -429,7 +429,7 @@ def refused_readings(data: xr.Dataset) -> dict[str, Mask]:
 
 
 def used_errors(data: xr.Dataset, variable: str, dimension: str) -> Array:
-    """Return errors of channels, (samples, channels), NaN where the gate refused the reading."""
+    """Return errors of channels, (samples, channels), NaN for readings that the gate refused."""
     errors: Array = data[variable].transpose("time", dimension).values
     refused = refused_readings(data) if variable == "innovation" else {}
     if not refused:
@@ -443,9 +443,9 @@ def used_errors(data: xr.Dataset, variable: str, dimension: str) -> Array:
 def name_clashes(
     own: Iterable[str], state: Iterable[str], numbers: Iterable[str], fields: Iterable[str]
 ) -> list[str]:
-    """Return a sentence for each name that would have two meanings in a run's dataset.
+    """Return a message for each name with two meanings in the dataset of a run.
 
-    `own`: names of the dataset itself: `Layout.own_names`.
+    `own`: names of the dataset itself, `Layout.own_names`.
     `state`, `numbers`, `fields`: variables of the state, labels of scalar unknowns, names of
     unknown fields.
     """
@@ -468,7 +468,7 @@ def name_clashes(
 
 
 def _uses(name: str, kind: str, ends: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """Iterate over the variables of one of a model's quantities, and their meanings."""
+    """Iterate over the variables of an unknown or component of the state, and their meanings."""
     yield name, f"{kind} '{name}'"
     if name.startswith(NOTE):
         yield name, "a note of the law"
@@ -491,8 +491,8 @@ def field_names(data: xr.Dataset) -> list[str]:
 def interval_95(data: xr.Dataset, name: str) -> tuple[Array, Array]:
     """Return the ends of the 95 % interval of a variable with a standard deviation.
 
-    The ends stored in the dataset are mapped through a transform and lie within bounds; without
-    them the interval is the value +- 1.96 standard deviations.
+    The dataset contains the ends for unknowns with a transform or bounds. For other variables the
+    interval is the value +- 1.96 standard deviations.
     """
     if f"{name}_low" in data:
         return data[f"{name}_low"].values, data[f"{name}_high"].values
