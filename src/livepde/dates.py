@@ -1,4 +1,4 @@
-"""Times of a run as dates, where it has them."""
+"""Conversion between times of a run and dates."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ if TYPE_CHECKING:
 
 CLOCKS = {"s": "seconds", "min": "minutes", "h": "hours", "d": "days", "day": "days"}
 TIMES = ("time", "snapshot")  # coordinates of a dataset that are times
-OWN = "units_of_run"  # attribute of a time with an epoch: its unit as the run has it
+OWN = "units_of_run"  # attribute of a time with an epoch: the unit of time of the run
 
 SECOND = np.timedelta64(1, "s")
 SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "day": 86400.0}
 
 
 def origin_at(stamp: float) -> datetime:
-    """Return the date of seconds since 1970 as origins are kept: in UTC, without a zone."""
+    """Convert seconds since 1970 to an origin: a date in UTC without a zone."""
     return datetime.fromtimestamp(stamp, UTC).replace(tzinfo=None)
 
 
 def since_1970(origin: datetime) -> float:
-    """Return the seconds since 1970 of a date in UTC without a zone, as of `origin_at`."""
+    """Convert an origin, a date in UTC without a zone, to seconds since 1970."""
     return origin.replace(tzinfo=UTC).timestamp()
 
 
 def stamp_of(time: Any) -> float | None:
-    """Return the seconds since 1970 of a date, None of anything else; without a zone it is UTC.
+    """Convert a date to seconds since 1970; a date without zone is UTC. None for other values.
 
     >>> stamp_of(np.datetime64("1970-01-02")), stamp_of(3.0)
     (86400.0, None)
@@ -45,7 +45,7 @@ def stamp_of(time: Any) -> float | None:
 
 
 def dated(data: xr.Dataset) -> tuple[datetime, float] | None:
-    """Return the date of t = 0 and the seconds of a unit of time; None if times are numbers."""
+    """Return the date of t = 0 and the unit of time in seconds; None if times are numbers."""
     unit, origin = str(data["time"].attrs.get("units", "")), data.attrs.get("origin")
     if origin is None or unit not in SECONDS:
         return None
@@ -53,16 +53,16 @@ def dated(data: xr.Dataset) -> tuple[datetime, float] | None:
 
 
 def since(unit: str, origin: Any) -> dict[str, str]:
-    """Return the CF attributes of times in a unit, counted from a date; none without a date."""
+    """Return the CF attributes of times since a date; empty without a date or a known unit."""
     if origin is None or unit not in CLOCKS:
         return {}
     return {"units": f"{CLOCKS[unit]} since {origin}", "calendar": "standard"}
 
 
 def with_epoch(data: xr.Dataset) -> xr.Dataset:
-    """Return a dataset whose times count from a date, so that other programs read dates.
+    """Return a dataset with CF attributes of its times, so that other programs read dates.
 
-    The numbers stay as they are. A run without dates is returned as it is.
+    The numbers do not change. The dataset of a run without dates is returned unchanged.
     """
     unit = str(data["time"].attrs.get("units", ""))
     attrs = since(unit, data.attrs.get("origin"))
@@ -76,7 +76,7 @@ def with_epoch(data: xr.Dataset) -> xr.Dataset:
 
 
 def without_epoch(data: xr.Dataset) -> xr.Dataset:
-    """Return a dataset of `with_epoch`, read with its times as numbers, as it was before."""
+    """Undo `with_epoch` for a dataset that was read with its times as numbers."""
     if OWN not in data["time"].attrs:
         return data
     found = data.copy(deep=False)
@@ -87,7 +87,7 @@ def without_epoch(data: xr.Dataset) -> xr.Dataset:
 
 
 def when(data: xr.Dataset, t: float) -> str:
-    """Return a time of a run as text: a date if it has one."""
+    """Format a time of a run, as a date if the run has dates."""
     dates = dated(data)
     if dates is None:
         return f"t = {t:.6g} {data['time'].attrs.get('units', '')}".rstrip()
@@ -96,7 +96,7 @@ def when(data: xr.Dataset, t: float) -> str:
 
 
 def instants(data: xr.Dataset, times: Any) -> Any:
-    """Return times of a run as dates (a pandas index); None if it has none."""
+    """Return times of a run as a pandas index of dates; None if the run has no dates."""
     dates = dated(data)
     if dates is None:
         return None

@@ -1,4 +1,4 @@
-"""Progress on standard error; silent where it is not a terminal."""
+"""Progress bars on standard error, if it is a terminal."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rich.console import Console
 def watched(
     stream: Iterable[Any], total: int | None = None, what: str = "samples"
 ) -> Iterator[Any]:
-    """Yield the items of a stream behind a bar on standard error; `total`: default its length."""
+    """Yield the items of a stream and show a progress bar; `total` defaults to its length."""
     if total is None:
         total = getattr(stream, "__len__", lambda: None)()
     console = Console(stderr=True)
@@ -40,9 +40,9 @@ def watched(
 def timed(
     names: Sequence[str], quiet: bool = False
 ) -> Iterator[Callable[[int], AbstractContextManager[None]]]:
-    """Show a line for each name, unless `quiet`; yield what runs the clock of a line by its index.
+    """Show a line with a clock for each name; yield a function: index -> context that runs it.
 
-    Several lines may run at once, each in its own thread.
+    Several clocks may run at once, each in its own thread. With `quiet` nothing is shown.
     """
     console = Console(stderr=True)
     if quiet or not console.is_terminal:

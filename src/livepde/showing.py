@@ -1,4 +1,4 @@
-"""Objects as text for a terminal, and as HTML for a notebook."""
+"""Representation of objects as text in a terminal and as HTML in a notebook."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
-MOST = 8  # names in a line
-LONG = 200  # characters of an expression
+MOST = 8  # largest number of names in a line
+LONG = 200  # largest number of characters of an expression
 
 
 class Shown(ABC):
@@ -20,15 +20,15 @@ class Shown(ABC):
 
     @abstractmethod
     def _shown(self) -> tuple[str, Mapping[str, str]]:
-        """Return the title, and name -> text of each row."""
+        """Return the title and the rows, name -> text."""
 
     def __repr__(self) -> str:
-        """Return the title, and a line for each row."""
+        """Return the title and one line for each row."""
         title, rows = self._shown()
         return "\n".join([title, *(f"  {name}: {text}" for name, text in rows.items())])
 
     def _repr_html_(self) -> str:
-        """Return the same as a table, which notebooks show."""
+        """Return the title and a table of the rows as HTML, for notebooks."""
         title, rows = self._shown()
         cells = "".join(
             f'<tr><th style="text-align:left">{html.escape(name)}</th>'
@@ -39,7 +39,7 @@ class Shown(ABC):
 
 
 def in_percent(share: float) -> str:
-    """Return a share in per cent, with two digits and no exponent.
+    """Format a share in per cent, with two digits and without exponent.
 
     >>> in_percent(0.0234), in_percent(0.997), in_percent(2.5)
     ('2.3 %', '100 %', '250 %')
@@ -49,7 +49,7 @@ def in_percent(share: float) -> str:
 
 
 def listed(names: Iterable[str]) -> str:
-    """Return names in one line, the first ones of many.
+    """Join names by commas; of more than `MOST` names, list the first and the count.
 
     >>> listed("ab"), listed("abcdefghij")
     ('a, b', 'a, b, c, d, e, f, g, h, ... (10)')
@@ -60,7 +60,7 @@ def listed(names: Iterable[str]) -> str:
 
 
 def options_of(value: Any) -> str:
-    """Return a frozen configuration with those of its options that are not the defaults."""
+    """Return a dataclass as text, with the options that differ from their defaults."""
     said = []
     for field in dataclasses.fields(value) if dataclasses.is_dataclass(value) else ():
         usual = field.default
@@ -73,7 +73,7 @@ def options_of(value: Any) -> str:
 
 
 def expression(function: Callable[..., Any]) -> str:
-    """Return the expression that a function returns, from its source; else its name.
+    """Return the source of the expression that a function returns; if not available, its name.
 
     >>> expression(len)
     'len(...)'
@@ -87,12 +87,12 @@ def expression(function: Callable[..., Any]) -> str:
         found = list(_returned(source, list(code.co_varnames[: code.co_argcount])))
     except (OSError, SyntaxError, TypeError):
         return name
-    # Several functions with the same arguments in one statement cannot be told apart.
+    # Functions with the same arguments in one statement cannot be distinguished.
     return found[0] if len(found) == 1 and len(found[0]) <= LONG else name
 
 
 def _returned(source: str, arguments: list[str]) -> Iterator[str]:
-    """Iterate over the expressions that functions with these arguments return in some source."""
+    """Iterate over the expressions that functions in `source` with these arguments return."""
     for node in ast.walk(_parsed(source)):
         if not isinstance(node, ast.Lambda | ast.FunctionDef):
             continue
@@ -106,7 +106,7 @@ def _returned(source: str, arguments: list[str]) -> Iterator[str]:
 
 
 def _parsed(source: str) -> ast.AST:
-    """Return the syntax of a piece of source, which may be the arguments of a call."""
+    """Return the syntax tree of source code, which may be only the arguments of a call."""
     try:
         return ast.parse(source)
     except SyntaxError:  # a line of a call, such as `A=lambda ...,`

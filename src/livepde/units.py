@@ -1,4 +1,4 @@
-"""Quantities with units, converted to the model's; pint is imported when the first one is met."""
+"""Conversion of quantities to the units of the model; pint is imported on first use."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from typing import Any
 
 from livepde.errors import CaseError
 
-LARGEST = 1e60  # of a number: products of four are finite
-SMALLEST = 1e-60  # of a standard deviation, a rate, a length
-UNIT = 100  # characters of a unit
+LARGEST = 1e60  # largest number: products of four are finite
+SMALLEST = 1e-60  # smallest standard deviation, rate or length
+UNIT = 100  # largest number of characters of a unit
 POWER = r"(?:\^|\*\*)"
 KINDS = (("s", "min", "h", "d"), ("mm", "cm", "m", "ft"), ("degC", "K", "degF"))  # for hints
-# What pint's parser lets through for text that is no unit at all.
+# Exceptions that pint's parser raises for text that is not a unit.
 NOT_A_UNIT = (
     ArithmeticError,
     AssertionError,
@@ -33,16 +33,16 @@ NOT_A_UNIT = (
 IN_BRACKETS = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]\s*$")  # T [degC], time (min)
 AFTER_SLASH = re.compile(r"^[^\s/]+\s*/\s*([^\s/]+)$")  # Ewe/V, T / K; not flow m3/h
 AT_THE_END = re.compile(r"(?:_|^(?=\w{3}))([A-Za-z]+)$")  # time_s, minutes
-# power_kW, T_30cm degF, T_1 degF; not T_1 cm, which is a place
+# power_kW, T_30cm degF, T_1 degF; not T_1 cm, which is a position
 AFTER_A_WORD = re.compile(r"(?:(?<=[^\W\d])[_ ]|(?<=\d)[_ ](?=deg))(deg[CF]|[kM]W|[mc]m|ft)$")
-OF_TIMES = (IN_BRACKETS, AFTER_SLASH, AT_THE_END)  # where the name of a column states their unit
-# hours since 2023-06-01 00:00:00, as the CF conventions write it
+OF_TIMES = (IN_BRACKETS, AFTER_SLASH, AT_THE_END)  # units in the name of a column of times
+# hours since 2023-06-01 00:00:00, in the notation of the CF conventions
 SINCE = re.compile(r"\b(\w+ since \d{4}-\d{1,2}-\d{1,2}(?!\d)[^\[\]()]*)")
 OF_TIME = re.compile(r"[mu]?s|sec|min|hr?|d|(second|minute|hour|day|week|year)s?", re.I)
 QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
 
 
-# A temperature in C or F is no charge or capacity.
+# For temperatures, C and F are not coulomb and farad.
 SCALES = {"C": "degC", "F": "degF", "deg C": "degC", "deg F": "degF"}
 TEMPERATURES = ("degC", "degF", "K")
 
@@ -60,8 +60,8 @@ TIMES = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 LENGTHS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "km": 1000.0}
 RATES = (("m^2", "m^2"), ("m", "m"), ("1", "1"), ("K", "K"), ("degC", "K"), ("K", "degC"))
 
-# What pint finds for units of many cases, to one rounding: its registry takes longer to load than
-# all the rest of a case. (given, unit) -> factor and offset.
+# (given, unit) -> factor and offset, equal to pint's to one rounding, for common units: loading the
+# registry of pint takes longer than loading the rest of a case.
 USUAL = {
     **{
         (given, unit): (kind[given] / kind[unit], 0.0)
@@ -83,7 +83,7 @@ USUAL = {
 
 @dataclass(frozen=True)
 class SI:
-    """value in SI units = factor * value + offset; `exponents` of the base units."""
+    """Value in SI units = factor * value + offset; base unit -> its power in `exponents`."""
 
     factor: float
     offset: float
@@ -92,19 +92,19 @@ class SI:
 
 @dataclass(frozen=True)
 class Affine:
-    """value in the model's unit = factor * value + offset."""
+    """Value in the unit of the model = factor * value + offset."""
 
     factor: float = 1.0
     offset: float = 0.0
 
 
 def convert(value: float | str, unit: str, where: str, *, difference: bool = False) -> float:
-    """Return a quantity, a number in the model's unit or text such as "20 h", in that unit.
+    """Convert text such as "20 h" to the unit of the model; a number is already in that unit.
 
-    `where`: file and key, for the message.
-    `difference`: a difference of two values, such as a standard deviation: the offset of
-    temperature scales drops out.
-    Raises `CaseError`: not a quantity, an unknown unit, or one of another dimension.
+    `where`: file and key, for messages.
+    `difference`: the value is a difference, such as a standard deviation, so that the offset of a
+    temperature scale is ignored.
+    Raises `CaseError`: not a quantity, an unknown unit, or a unit of another dimension.
     """
     if not isinstance(value, str):
         return float(value)
@@ -129,7 +129,7 @@ def convert(value: float | str, unit: str, where: str, *, difference: bool = Fal
 
 @cache
 def conversion(given: str, unit: str, where: str) -> Affine:
-    """Return how values in the unit `given` become values in the model's unit."""
+    """Return the conversion from the unit `given` to `unit`; raise `CaseError` if none exists."""
     if unit in TEMPERATURES:
         given = SCALES.get(given, given)
     if given == unit:
@@ -138,14 +138,14 @@ def conversion(given: str, unit: str, where: str) -> Affine:
         return Affine(*usual)
     check_unit(given, where)
     zero, one, two = _converted(given, unit, where)
-    # Units as decibels are logarithmic: three points do not lie on a line.
+    # In logarithmic units such as decibels, three equidistant values do not lie on a line.
     if not math.isclose(two - one, one - zero):
         raise CaseError(f"{where}: '{given}' has no linear scale; {_expected(unit)}.")
     return Affine(float(one - zero), float(zero))
 
 
 def _converted(given: str, unit: str, where: str) -> tuple[float, float, float]:
-    """Return what 0, 1 and 2 of a unit are in another one."""
+    """Return the values 0, 1 and 2 of the unit `given` in another unit."""
     registry = pint_registry()
     import pint
 
@@ -167,7 +167,7 @@ def _converted(given: str, unit: str, where: str) -> tuple[float, float, float]:
 
 
 def with_powers(unit: str) -> str:
-    """Return a unit with the sign of its powers.
+    """Insert the operator of powers that a unit omits.
 
     >>> with_powers("m3/h"), with_powers("W m-2 K-1"), with_powers("m^2/s**0.5")
     ('m^3/h', 'W m^-2 K^-1', 'm^2/s**0.5')
@@ -176,7 +176,7 @@ def with_powers(unit: str) -> str:
 
 
 def parsed_unit(registry: Any, unit: str) -> Any:
-    """Return a unit as pint reads it, whose powers may lack their sign."""
+    """Return a unit parsed by pint; the operator of powers may be omitted."""
     import pint
 
     with suppress(pint.PintError, *NOT_A_UNIT):
@@ -185,7 +185,7 @@ def parsed_unit(registry: Any, unit: str) -> Any:
 
 
 def converts(given: str, unit: str) -> bool:
-    """Return whether numbers in a unit can be converted to another one."""
+    """Return whether `given` can be converted to `unit`; False if either is empty."""
     try:
         conversion(given, unit, given)
     except CaseError:
@@ -194,7 +194,7 @@ def converts(given: str, unit: str) -> bool:
 
 
 def has_states(unit: str) -> bool:
-    """Return whether a constant of an input is a state of it, such as off: a temperature has none.
+    """Return whether a constant input of this unit may be a state such as off; not a temperature.
 
     >>> has_states("W"), has_states("degC")
     (True, False)
@@ -203,7 +203,7 @@ def has_states(unit: str) -> bool:
 
 
 def unit_in(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
-    """Return the unit in the name of a column; empty if none can be converted to `unit`."""
+    """Return the unit in the name of a column, if it can be converted to `unit`; else empty."""
     for given in filter(None, (pattern.search(name) for pattern in patterns)):
         powers = with_powers(given[1])
         for text in (powers, given[1], powers.replace("_", "/")):  # L_s is L/s
@@ -214,7 +214,7 @@ def unit_in(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
 
 
 def counted_since(name: str) -> str:
-    """Return unit and date in the name of a column of times that count from a date; else empty.
+    """Return text such as "hours since 2023-06-01" in the name of a column; else empty.
 
     >>> counted_since("time [hours since 2023-06-01 00:00:00]"), counted_since("s since start")
     ('hours since 2023-06-01 00:00:00', '')
@@ -233,12 +233,12 @@ def other_time_unit(name: str, unit: str) -> str:
         return counted
     stated = (pattern.search(name) for pattern in OF_TIMES)
     if not (unit and any(found and OF_TIME.fullmatch(found[1]) for found in stated)):
-        return ""  # before pint is loaded
+        return ""  # without loading pint
     return other_unit(name, unit, *OF_TIMES)
 
 
 def other_unit(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
-    """Return the unit in the name of a column if its numbers are others in `unit`; else empty.
+    """Return the unit in the name of a column if it converts to `unit` but differs; else empty.
 
     >>> other_unit("T [degF]", "degC", IN_BRACKETS), other_unit("q (W/m2)", "W/m^2", IN_BRACKETS)
     ('degF', '')
@@ -250,7 +250,7 @@ def other_unit(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
 
 
 def in_si(unit: str) -> SI | None:
-    """Return how values in a unit become values in units of the SI; None if it has none.
+    """Return the conversion from a unit to SI base units; None if there is none.
 
     >>> in_si("km/h").exponents, round(in_si("degC").offset, 2)
     ({'m': 1, 's': -1}, 273.15)
@@ -266,7 +266,7 @@ def in_si(unit: str) -> SI | None:
         return None
     if not math.isclose((two - one).magnitude, (one - zero).magnitude):
         return None
-    # A unit definition of FMI has whole powers of the seven SI base units, and no others.
+    # Units of FMI are products of integer powers of the seven SI base units.
     exponents = {BASE[name]: power for name, power in one.dimensionality.items() if name in BASE}
     if len(exponents) < len(one.dimensionality) or any(p != int(p) for p in exponents.values()):
         return None
@@ -276,7 +276,7 @@ def in_si(unit: str) -> SI | None:
 
 
 def check_unit(unit: str, where: str) -> None:
-    """Refuse a unit that is too long, or that raises a power to a power."""
+    """Raise `CaseError` for a unit that is too long, or has large or nested powers."""
     if len(unit) > UNIT:
         raise CaseError(f"{where}: a unit has at most {UNIT} characters; got {len(unit)}.")
     flat = re.sub(rf"\s*({POWER}|[()])\s*", r"\1", with_powers(unit))
@@ -290,7 +290,7 @@ def check_unit(unit: str, where: str) -> None:
 
 
 def _towers(unit: str) -> bool:
-    """Return whether a power, or a group with a power in it, is raised to a power."""
+    """Return whether a power, or a group that contains a power, is raised to a power."""
     if re.search(rf"{POWER}[-+(]*[0-9.]*\)*{POWER}", unit):
         return True
     powers, marks = 0, []
@@ -318,7 +318,7 @@ def _expected(unit: str) -> str:
 
 @cache
 def pint_registry() -> Any:
-    """Return the registry of units, made when it is first asked for."""
+    """Return the unit registry of pint, created on first use."""
     import pint
 
     return pint.UnitRegistry()
