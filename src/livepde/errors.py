@@ -6,19 +6,19 @@
     ├── ConfigurationError          parts or options that do not fit together
     │   ├── SpaceError              mesh, element, inner product, prior
     │   ├── ModelError              weak forms and their arguments
-    │   │   └── NameClashError      a name that stands for two things in a run's dataset
+    │   │   └── NameClashError      a name with two meanings in a run's dataset
     │   ├── ObservationError        sensors, subdomains, matrices
-    │   ├── LawError                an update law on a problem it cannot serve
+    │   ├── LawError                an update law that does not support the problem
     │   └── CaseError               a case file: wrong key, value, unit, range
     ├── DataError                   one sample that cannot be used; the estimate is unchanged
     │   ├── SampleError             wrong shape, text, infinity, unknown channel
     │   ├── TimeOrderError          time going backwards
     │   ├── MissingInputError       an input without any value yet
-    │   └── OffsetError             a batch that does not continue where a shard stands
-    ├── RunError                    a run directory that is taken, missing or damaged
+    │   └── OffsetError             a batch that does not continue at the offset of a shard
+    ├── RunError                    a run directory that is occupied, missing or damaged
     └── LinearAlgebraError          a matrix that cannot be factorised
 
-A step that fails numerically is not an exception: it is reported as `Status` of the estimate.
+A step that fails numerically raises no exception: the `Status` of the estimate reports it.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ __all__ = [
 
 
 class LivepdeError(Exception):
-    """Base of everything livepde raises on purpose; the message has place, problem and remedy.
+    """Base class of all errors of livepde; messages contain place, problem and remedy.
 
     Examples
     --------
@@ -73,7 +73,7 @@ class ModelError(ConfigurationError):
 
 
 class NameClashError(ModelError):
-    """Unknowns or components with names that mean something else in a run's dataset."""
+    """Unknowns or components with names that have another meaning in a run's dataset."""
 
 
 class ObservationError(ConfigurationError):
@@ -81,7 +81,7 @@ class ObservationError(ConfigurationError):
 
 
 class LawError(ConfigurationError):
-    """An update law asked to serve a problem it is not made for."""
+    """An update law that does not support the problem."""
 
 
 class CaseError(ConfigurationError):
@@ -89,7 +89,7 @@ class CaseError(ConfigurationError):
 
 
 class DataError(LivepdeError, ValueError):
-    """A sample that cannot be used; nothing was changed by it."""
+    """A sample that cannot be used; the estimate is unchanged."""
 
 
 class SampleError(DataError):
@@ -97,19 +97,19 @@ class SampleError(DataError):
 
 
 class TimeOrderError(DataError):
-    """A sample that is not later than the one before."""
+    """A sample that is not later than the previous sample."""
 
 
 class MissingInputError(DataError):
-    """An input or boundary channel that has not had any value yet."""
+    """An input or boundary channel without any value yet."""
 
 
 class OffsetError(DataError):
-    """A batch that does not begin at the offset of a shard: a repetition, or after a gap."""
+    """A batch that does not begin at the offset of a shard: repeated, or after a gap."""
 
 
 class RunError(LivepdeError, OSError):
-    """A run directory that is taken, missing or damaged."""
+    """A run directory that is occupied, missing or damaged."""
 
 
 class LinearAlgebraError(LivepdeError, ArithmeticError):
@@ -117,7 +117,7 @@ class LinearAlgebraError(LivepdeError, ArithmeticError):
 
 
 def require_positive(what: str, value: float, kind: type[LivepdeError]) -> None:
-    """Raise an error of a kind unless a number is finite and above zero."""
+    """Raise an error of type `kind` unless a number is positive and finite."""
     if not (math.isfinite(value) and value > 0):
         raise kind(f"{what} must be a positive number; got {value}.")
 
@@ -126,7 +126,7 @@ def require_positive(what: str, value: float, kind: type[LivepdeError]) -> None:
 def optional(
     extra: str, what: str, kind: type[LivepdeError] = ConfigurationError
 ) -> Iterator[None]:
-    """Turn the import of a package that is not installed into an error that names its extra.
+    """Convert the ImportError of an optional package to an error that names its extra.
 
     >>> with optional("mqtt", "MQTT needs paho-mqtt"):
     ...     import no_such_package

@@ -53,7 +53,7 @@ class Forecast:
 
 
 def future_times(times: Array, given: object, t: float, control: Advance) -> list[float]:
-    """Return the times of a forecast after the last sample at t, checked; `given` as they were."""
+    """Return validated times of a forecast after the last sample at t; `given` is for messages."""
     if times.ndim != 1 or not np.isfinite(times).all():
         raise SampleError(f"forecast: times must be finite numbers; got {given!r}.")
     if not len(times) or times[0] < t or np.any(np.diff(times) <= 0.0):
@@ -109,7 +109,7 @@ def _seen(sensors: Observed, belief: Belief, moment: Moment) -> tuple[Array, Arr
 def seen_rows(sensors: Observed, belief: Belief, moment: Moment) -> Array | None:
     """Return the square root of the covariance of predicted readings, shape (sensors, r).
 
-    Its columns belong to those of the factors of the belief; None for one without.
+    Its columns correspond to columns of the factors of the belief; None if there are no factors.
     """
     if belief.u_factor is None or belief.q_factor is None:
         return None

@@ -1,4 +1,4 @@
-"""The samples of a run, taken again: smoothed estimates, and readings for given unknowns."""
+"""Results that require all samples of a run: smoothed estimates, readings for given unknowns."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Hindsight:
         self._opening: Interval | None = None
         self._intervals: list[Interval] = []
         self._jumps: set[int] = set()
-        self._estimates: list[tuple[int, float, Status]] = []  # with the number of intervals
+        self._estimates: list[tuple[int, float, Status]] = []  # number of intervals, time, status
 
     def add(self, estimate: Estimate, interval: Interval, q: Array) -> None:
         """Add a sample.
@@ -50,7 +50,7 @@ class Hindsight:
         elif taken:
             self._intervals.append(interval)
             self._q.append(q)
-        # NaN without an alarm: then the comparison is false.
+        # NaN if there is no alarm, so that the comparison is false.
         onset = estimate.diagnostics.jump_samples
         if onset > 0:
             self._jumps.add(len(self._intervals) - int(onset))
@@ -81,9 +81,9 @@ class Hindsight:
         self, result: Result, problem: Problem, beliefs: Iterable[Belief]
     ) -> Iterator[Record]:
         count = len(self._estimates)
-        # Samples that were not taken have the belief of the last one that was.
+        # A sample whose step failed has the belief of the last accepted sample.
         said = groupby(reversed(list(enumerate(self._estimates))), key=lambda item: item[1][0])
-        for (_, estimates), belief in zip(said, beliefs, strict=False):  # none may be at the start
+        for (_, estimates), belief in zip(said, beliefs, strict=False):  # t0 may have no estimate
             known = problem.physical(belief)
             for k, (_, t, status) in estimates:
                 keeps = k % result.fields_every == 0 or k == count - 1
@@ -108,7 +108,7 @@ class Hindsight:
 class LinearReadings:
     """Readings of samples for draws of the unknowns, to first order.
 
-    `shifts`: latent coefficients of the draws minus those of the linearisation point, shape (n, m).
+    `shifts`: latent coefficients of the draws relative to the linearisation point, shape (n, m).
     """
 
     def __init__(self, shifts: Array) -> None:
@@ -120,16 +120,16 @@ class LinearReadings:
     def add(self, predicted: Array, rows: Array, factor: Array, noise: Array) -> None:
         """Add a sample.
 
-        `predicted`: its readings at the linearisation point, shape (sensors,).
+        `predicted`: readings at the linearisation point, shape (sensors,).
         `rows`, `factor`: joint square root of the covariance of readings and latent unknowns,
         shapes (sensors, r) and (m, r).
         `noise`: standard deviation of each reading, shape (sensors,).
         """
-        if not np.array_equal(factor, self._factor):  # of constant unknowns it stays the same
+        if not np.array_equal(factor, self._factor):  # equal for constant unknowns
             inverse = np.linalg.pinv(factor)
             self._factor, self._weights = factor, self._shifts @ inverse.T
             self._known = inverse @ factor
-        # What the unknowns do not explain is the state's own uncertainty.
+        # The remainder is the uncertainty of the state given the unknowns.
         left = rows - rows @ self._known
         self._readings.append(predicted + self._weights @ rows.T)
         self._std.append(np.sqrt(noise**2 + (left * left).sum(axis=1)))
@@ -141,14 +141,14 @@ class LinearReadings:
 
     @property
     def std(self) -> Array:
-        """Standard deviation of each reading about them, shape (samples, sensors)."""
+        """Standard deviations of the readings about `readings`, shape (samples, sensors)."""
         return np.array(self._std)
 
 
 def with_smoothed(data: xr.Dataset, smoothed: xr.Dataset) -> xr.Dataset:
-    """Return the dataset of a run with added `k_smoothed`, `k_smoothed_std`, and interval ends.
+    """Add smoothed variables, such as `k_smoothed`, `k_smoothed_std` and interval ends, to a run.
 
-    `smoothed`: smoothed dataset of the same samples, as `Identifier.smoothed` returns it.
+    `smoothed`: dataset of the same samples from `Identifier.smoothed`.
     """
     attrs, found = data.attrs, dict[str, Any]()
     own = {*attrs["scalars"].split("\n"), *attrs["fields"].split(), *attrs["state"].split()}

@@ -1,4 +1,4 @@
-"""Warnings and logged exceptions of libraries, as one line each of a program's standard error."""
+"""Warnings and logged exceptions of libraries, shortened to one line each on standard error."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LOG = logging.getLogger("livepde.libraries")
 
 
 class OneLine(logging.Filter):
-    """Shortens an exception that a library logs to one line: its traceback helps no user."""
+    """Filter that shortens an exception logged by a library to one line without traceback."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         error = record.exc_info[1] if record.exc_info else None

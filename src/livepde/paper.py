@@ -43,7 +43,7 @@ def law(
     Parameters
     ----------
     gain
-        Scale of the inner product of Q; the paper's is 1, and it does not name it.
+        Scale of the inner product of Q, implicitly 1 in the paper.
     damping
         Rule for mu; default `ResidualDamping()`, the lower bound of Assumption cond:mu02, c_1 = 1.
     D
