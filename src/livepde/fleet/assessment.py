@@ -26,16 +26,16 @@ def assessed(
     ends: Mapping[str, Array],
     samples: int,
 ) -> Verdict:
-    """Return the verdict on a member: its stored samples are taken again by a law that judges.
+    """Return the verdict on a member, by processing its stored samples with a law that judges.
 
     Parameters
     ----------
     one
         Identifier of the member before its first sample.
     law
-        The law, with its tests.
+        The law, with its verdict enabled.
     begun, state
-        The member's own parts of the law of the fleet, and its state.
+        Prepared data of the fleet's law for this member, and its state.
     ends, samples
         As for `Identifier._placed`.
     """
@@ -50,7 +50,7 @@ def assessed(
         again, _ = stepped(law, work, problem, again, first_interval(state.log, channels))
     for interval in intervals_since(state.log, channels):
         again, _ = stepped(law, work, problem, again, interval)
-    # Readings of sensors that were set aside are no longer stored.
+    # The log lacks readings of excluded sensors: the memory of the gate comes from the last state.
     now = changed(again.now, screened=state.now.screened)
     found = one._placed(changed(again, now=now), ends, samples)
     return found._settled(found.estimate()).verdict

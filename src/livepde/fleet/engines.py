@@ -1,4 +1,4 @@
-"""Engines of a fleet: all members as the blocks of one array, or one after the other."""
+"""Engines of a fleet, which step all members as blocks of arrays or one after the other."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from livepde.linalg.member_arrays import join, take
 from livepde.stepping import Span
 
 State: TypeAlias = Any
-"""What evolves: the arrays or values of an engine."""
+"""State of all members, of a type that depends on the engine."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,13 +33,13 @@ class Factors:
 
 @dataclass(frozen=True, eq=False)
 class Beliefs:
-    """Estimates of all members, of the physical parameter; see `livepde.laws.Belief`."""
+    """Estimates of all members, in physical parameters; see `livepde.laws.Belief`."""
 
     # q, u: shapes (members, m) and (members, n)
     q: Array
     u: Array
-    q_std: Array | None  # standard deviations of q, or None if the law has no covariance
-    # Covariances; None where members step separately, each with its own
+    q_std: Array | None  # standard deviations of q; None if the law has no covariance
+    # Square roots of covariances; None if members are stepped separately
     factors: Factors | None = None
 
 
@@ -49,14 +49,14 @@ def beginnings(
     errors: Sequence[Array],
     initial: Sequence[Any],
 ) -> list[Any]:
-    """Return the parts of a law with which each member begins.
+    """Return the prepared data of the law for the start of each member.
 
-    `readings` are those that the initial state of each member was made of, `errors` its own errors,
-    (errors, n), `initial` how it was given: laws with a covariance evaluate it on other meshes.
+    `readings`: readings from which each initial state was computed. `errors`: its own errors,
+    (errors, n). `initial`: u0 as specified, which laws with a covariance evaluate on other meshes.
     """
     if not isinstance(work, SensitivityWork):
         return [work] * len(initial)
-    made: dict[int, SensitivityWork] = {}  # of members that begin alike: it caches matrices
+    made: dict[int, SensitivityWork] = {}  # shared by members with one u0, since it caches matrices
     found = []
     for one, off, u0 in zip(readings, errors, initial, strict=True):
         own = bool(one) or bool(len(off))
@@ -69,29 +69,29 @@ def beginnings(
 
 
 class FleetEngine(ABC):
-    """Abstract stepper of all members by one law.
+    """Abstract base of engines, which step all members with one law.
 
-    A state is a value: a returned state never changes.
+    States are values: a returned state never changes.
     """
 
     def __init__(self, law: Any, work: Any, begins: Sequence[Any]) -> None:
         self.law = law
         self.work = work
-        self._begins = begins  # the parts of the law with which each member begins
+        self._begins = begins  # prepared data of the law for the start of each member
 
     def subset(self, which: IntArray) -> Self:
-        """Return a stepper of some members, by number."""
+        """Return an engine for the members with these numbers."""
         other = copy.copy(self)
         other._begins = [self._begins[k] for k in which]
         return other
 
     def begun(self, k: int) -> Any:
-        """Return the parts of the law with which a member begins."""
+        """Return the prepared data of the law for the start of a member."""
         return self._begins[k]
 
     @abstractmethod
     def start(self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]) -> State:
-        """Return the state at the start, from coefficients of each member."""
+        """Return the initial state, from coefficients of each member."""
 
     @abstractmethod
     def begin(self, state: State, span: Span) -> State:
@@ -99,33 +99,33 @@ class FleetEngine(ABC):
 
     @abstractmethod
     def step(self, state: State, span: Span) -> tuple[State, laws.MemberReports]:
-        """Return the state at the end of a span, with that before it for members that failed."""
+        """Return the state at the end of a span; members that fail keep their previous state."""
 
     @abstractmethod
     def settled(self, state: State) -> State:
-        """Return the state after the work that the law spreads over samples; see `Law.settled`."""
+        """Return the state after the deferred work of the law; see `Law.settled`."""
 
     @abstractmethod
     def believed(self, state: State, k: int) -> laws.Belief:
-        """Return the belief about a member, in latent coefficients."""
+        """Return the belief of a member, in latent coefficients."""
 
     @abstractmethod
     def beliefs(self, state: State) -> Beliefs:
-        """Return the beliefs about all members."""
+        """Return the beliefs of all members."""
 
     @abstractmethod
     def member(self, state: State, k: int) -> Any:
-        """Return the state of a member as the law itself has it."""
+        """Return the state of a member in the form that the law uses for a single process."""
 
     def restored(self, template: State, leaves: Mapping[str, Array]) -> State:
-        """Return the state of these leaves; raises KeyError or ValueError if they do not fit."""
+        """Return the state stored in `leaves`; raise KeyError or ValueError if they do not fit."""
         return checkpoint.rebuild(template, leaves)
 
 
 class SeparateEngine(FleetEngine):
-    """Any law, member by member, with its precomputed parts shared by all members.
+    """Engine for any law, which steps members one by one and shares the prepared data of the law.
 
-    The state is a tuple of the states of the law.
+    The state is a tuple with the state of each member.
     """
 
     def __init__(
@@ -177,7 +177,7 @@ class SeparateEngine(FleetEngine):
 
 
 class BlockEngine(FleetEngine):
-    """All members as arrays, by `SensitivityLaw.step_members`; the leading axis is the members."""
+    """Engine of `SensitivityLaw.step_members`: arrays with the members as the leading axis."""
 
     law: laws.SensitivityLaw
     work: SensitivityWork
@@ -207,7 +207,7 @@ class BlockEngine(FleetEngine):
     def believed(self, state: SensitivityState, k: int) -> laws.Belief:
         return self.law.member_belief(self.work, state.now, k)
 
-    @nonfinite_allowed()  # of members whose step has failed
+    @nonfinite_allowed()  # members with a failed step
     def beliefs(self, state: SensitivityState) -> Beliefs:
         now, reduction = state.now, self.work.filter.reduction
         latent = self.work.filter.problem.model.latent

@@ -1,4 +1,4 @@
-"""Many identifications of one model, stepped together."""
+"""Fleet: identification of many processes with one model, stepped together."""
 
 from __future__ import annotations
 
@@ -44,35 +44,35 @@ from livepde.start import assumes_zero, initial_errors, initial_readings
 from livepde.stepping import Advance, Between, Scheme, Span, own_noise
 from livepde.verdict import Verdict
 
-FORMAT = 12  # of the checkpoint
+FORMAT = 12  # version of the checkpoint format
 
 Values = ArrayLike | Mapping[str, ArrayLike]
 
 
 def columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Return numbers by name, NaN where a row has none; the noise of a pair has its own name."""
+    """Return name -> its values in all rows, NaN if missing; noise has its own name."""
     rows = [by_name(row, ()) for row in rows]
     names = dict.fromkeys(name for row in rows for name in row)
     return {name: [row.get(name, np.nan) for row in rows] for name in names}
 
 
 class Fleet:
-    """Identifies many processes of one model, with sensors and sample times in common.
+    """Estimate the unknowns of many processes with one model, sensors and sample times.
 
-    Members differ in data, inputs, and where they start. The estimates are those of one
-    `Identifier` for each, to rounding. With `SensitivityLaw` for numbers, on a model in one
-    dimension that is linear in state and inputs, all are stepped as blocks; else, and wherever
-    something out of the ordinary happens, one by one: `note` says why.
+    Members differ in data, inputs and initial values. Estimates equal those of one `Identifier` for
+    each member, to rounding. `SensitivityLaw` steps members as blocks, if unknowns are numbers, the
+    model is one-dimensional and linear in state and inputs, and sensors are linear and fixed.
+    Otherwise (`note` is the reason), and at events such as an alarm, they are stepped one by one.
 
     Parameters
     ----------
     model, observation, law
         As for `Identifier`.
     members
-        How many, or their names.
+        Number of members, or their names.
     q0, u0, u0_from, u0_errors
-        As for `Identifier`, for all members; or a list with one for each, so that the errors of
-        one u0 are a tuple.
+        As for `Identifier`: one value for all members, or a list with a value for each. The errors
+        of one u0 are a tuple.
     t0, validation, scheme, dt_max, halvings, assimilate_from, between, input_noise
         As for `Identifier`.
 
@@ -113,7 +113,7 @@ class Fleet:
     ) -> None:
         self.members = _named(members)
         self._judging = law
-        if isinstance(law, SensitivityLaw):  # the sums of each member would cost more than its step
+        if isinstance(law, SensitivityLaw):  # statistics of a verdict cost more than the step
             law = replace(law, verdict=False)
         q0s, u0s = self._each("q0", q0), self._each("u0", u0)
         made_of = [one or {} for one in self._each("u0_from", u0_from)]
@@ -139,7 +139,7 @@ class Fleet:
         self.model = model = self._one.model
         self.law = law
         self.problem = self._one.problem
-        # Laws evaluate this description on other meshes: it has to be that of all members.
+        # Laws evaluate `initial` on other meshes, which is only possible if members share it.
         if len({*map(id, u0s)}) > 1:
             self.problem = replace(self.problem, initial=None)
         self._work = law.prepare(self.problem)
@@ -158,7 +158,7 @@ class Fleet:
         self._begin_without_inputs()
 
     def _stated_at_start(self, u0s: Sequence[Any]) -> Array:
-        """Return the inputs at t0 that u0 states, shape (members, channels), NaN elsewhere."""
+        """Return the inputs at t0 that u0 implies, shape (members, channels); NaN: none."""
         found = np.full((len(self.members), len(self.inputs)), np.nan)
         for k, u in enumerate(u0s):
             if k == 0 or u is not u0s[k - 1]:
@@ -167,7 +167,7 @@ class Fleet:
         return found
 
     def _stepper(self, made_of: list[Mapping[str, Any]], u0s: list[Any]) -> FleetEngine:
-        """Return the engine that steps members as blocks if the law can, else one by one."""
+        """Return an engine that steps members as blocks if the law supports it, else one by one."""
         readings = [initial_readings(self.model, self.observed, one) for one in made_of]
         begins = beginnings(self._work, readings, self._errors, u0s)
         if not self.note:
@@ -187,7 +187,7 @@ class Fleet:
         return SeparateEngine(self.law, self._work, begins, self.problem)
 
     def _each(self, what: str, value: Any) -> list[Any]:
-        """Return a value for each member: a list has one for each."""
+        """Return a list with a value for each member, from a list or a common value."""
         if not isinstance(value, list):
             return [value] * len(self.members)
         if len(value) != len(self.members):
@@ -202,17 +202,17 @@ class Fleet:
 
     @property
     def observed(self) -> Observed:
-        """Observation by the assimilated sensors."""
+        """Observation operator of the assimilated sensors."""
         return self._one.observed
 
     @property
     def validation(self) -> Observed | None:
-        """Sensors that are only scored."""
+        """Observation operator of the validation sensors, or None."""
         return self._one.validation
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Channels that the model and the sensors read."""
+        """Names of the input channels of the model and the sensors."""
         return self._one.inputs
 
     @property
@@ -232,15 +232,15 @@ class Fleet:
         ]
 
     def _begin_without_inputs(self) -> None:
-        """Begin at once if no input has to come with the first sample."""
+        """Initialise the state immediately if it does not depend on inputs."""
         if self._state is None and not self.inputs:
             none = np.zeros((len(self), 0))
             self._begin(none, none > 0.0)
 
     def _begun_by(self, values: Array, missing: Mask, *, later: bool) -> dict[str, Mask]:
-        """Begin with the inputs of a first sample, at the initial time or later.
+        """Initialise the state by the inputs of a first sample; `later`: it is after t0.
 
-        Return the channels of the model that have no value at the initial time.
+        Return channel -> mask of members without a known value at t0, or in this sample.
         """
         unstated = self._unstated & later
         self._begin(self._opening(values) if later else values, unstated)
@@ -249,7 +249,7 @@ class Fleet:
 
     def _begin(self, inputs: Array, unstated: Mask) -> None:
         moments, u0 = self._moments(self._so_far.t, inputs), self._u0
-        with nonfinite_allowed():  # refused below
+        with nonfinite_allowed():  # checked below
             if self.model.form_initial is None:
                 starts = [self.model.impose(u, at) for u, at in zip(u0, moments, strict=True)]
             else:
@@ -267,23 +267,23 @@ class Fleet:
     def step(
         self, t: float, z: Values, inputs: Mapping[str, ArrayLike] | None = None
     ) -> FleetEstimate:
-        """Take one sample of every member and return the estimates at its time.
+        """Process one sample of each member and return the estimates at its time.
 
-        A member whose step fails numerically stays as it was, says so in its status, and tries
-        again with the next sample; the others do not notice. Bad input raises and changes nothing.
+        If the step of a member fails numerically, its status is the reason, and its next step
+        starts from its last successful state; other members are not affected. Invalid input raises
+        an error and changes nothing.
 
         Parameters
         ----------
         t
-            Time, the same for all.
+            Time, common to all members.
         z
-            Measurements, shape (members, sensors), NaN where missing, or (members, sensors, 2) with
-            the noise of each; or channel name -> a number for all members, or one for each, noise
-            as "noise of T_1", such as a pandas table with a row for each member. Values with
-            labels, as of a series or a mapping, are those of the members of these names. A list of
-            such rows, one for each member, is in the order of the members.
+            Measurements: an array of shape (members, sensors), NaN where missing, or (members,
+            sensors, 2) with noise; a mapping from channel, or "noise of T_1", to one number or a
+            number for each member, such as a table with a row for each member; or a list of such
+            rows. Values with labels, such as a series or mapping, are assigned to members by name.
         inputs
-            Input channels, each a number for all members, or one for each; NaN holds the last one.
+            Input channel -> one number, or a number for each member; NaN holds the last value.
 
         Raises
         ------
@@ -300,7 +300,7 @@ class Fleet:
             raise errors.SampleError(f"time t is {t}; give the time of the sample.")
         measured, noise, validation, named = self._parsed(z, inputs)
         self._one._check_weighs(noise)
-        # The times of members differ after a failed step: a sample has to be later than all.
+        # Times of members differ after a failed step: a sample must be later than all of them.
         last = float(self._so_far.t.max())
         self._refuse_earlier(t, last)
         values, held = self._filled(named)
@@ -337,15 +337,15 @@ class Fleet:
             )
 
     def _opening(self, inputs: Array) -> Array:
-        """Return the inputs at the initial time, from those of a later first sample."""
+        """Return the inputs at the initial time, given the inputs of a later first sample."""
         unknown = np.isnan(self._stated)
-        # The same object at both ends says that inputs are held.
+        # The same object at both ends of an interval marks held inputs.
         return inputs if unknown.all() else np.where(unknown, inputs, self._stated)
 
     @property
     def _unstated(self) -> Mask:
-        """True for channels of the model without a value at the initial time, by member."""
-        # The mean over the first interval comes with its end.
+        """Mask of channels of the model without a value at t0, shape (members, channels)."""
+        # A "next" input requires no initial value: its first reading is the mean since t0.
         read = {*self.model.channels} - {*self.problem.control.held.next}
         asked: Mask = np.array([name in read for name in self.inputs], dtype=bool)
         return np.isnan(self._stated) & asked
@@ -387,7 +387,7 @@ class Fleet:
 
     @staticmethod
     def _shown(observed: Observed, beliefs: Beliefs, span: Span) -> Array:
-        """Return the predicted readings, shape (members, sensors)."""
+        """Return the predicted readings of all members, shape (members, sensors)."""
         u, q = beliefs.u, beliefs.q
         if type(observed) is Observed and observed.linear:
             shown: Array = (observed.G @ u.T).T
@@ -396,20 +396,20 @@ class Fleet:
         return np.array(rows)
 
     def _settled(self, estimate: FleetEstimate) -> FleetEstimate:
-        """Return the last estimate, settled as that of an identifier; see an identifier."""
+        """Return the last estimate after the deferred work of the law, for the end of a run."""
         engine, state = self._engine, self._engine.settled(self._state)
         read, belief = lambda: engine.beliefs(state), lambda k: self._believed(state, k)
         return replace(estimate, read=read, belief=belief)
 
     def identifier(self, member: str | int) -> Identifier:
-        """Return an identifier that continues from the state of a member, by name or number.
+        """Return an identifier in the state of a member, specified by name or number.
 
         Steps of this identifier do not change the fleet.
         """
         k = number_of(self.members, member)
         state = None if self._state is None else self._engine.member(self._state, k)
         ends = {name: values[k].copy() for name, values in self.ends.items()}
-        # Kept, since its fingerprint is computed once for all checkpoints of this member.
+        # Cached, since its fingerprint is computed once for all checkpoints of this member.
         start = self._starts[k] = self._starts.get(k) or self._begun(k)
         return start._placed(state, ends, self._samples)
 
@@ -423,8 +423,8 @@ class Fleet:
     def verdict(self, member: str | int) -> Verdict:
         """Return the verdict that a separate run of a member would have, by name or number.
 
-        Members are not assessed while they are stepped together. This takes the stored samples of
-        one member again, which is as slow as a separate run of it.
+        A fleet computes no verdicts while it steps. This method processes the stored samples of the
+        member again, which takes as long as a separate run.
         """
         k = number_of(self.members, member)
         law, begun = self._judging, self._engine.begun(k)
@@ -435,7 +435,7 @@ class Fleet:
         return assessed(one, law, begun, state, ends, self._samples)
 
     def template(self) -> Any:
-        """Return the state of the first member at its start without inputs: for its structure."""
+        """Return a state of the first member with zero inputs, as a template of the structure."""
         moments = self._moments(self._so_far.t[:1], np.zeros((1, len(self.inputs))))
         engine = self._engine.subset(np.array([0]))
         return engine.start(self._q0[:1], self._u0[:1], moments)
@@ -444,8 +444,8 @@ class Fleet:
         """Return a fleet of some members in their present states; for `Shard`.
 
         `which`: numbers of the members.
-        `state`: of the engine; None before the first sample.
-        `samples`: how many they have taken.
+        `state`: state of their engine; None before the first sample.
+        `samples`: number of their samples so far.
         """
         other = copy.copy(self)
         other._starts = {}
@@ -463,17 +463,17 @@ class Fleet:
         return other
 
     def adopt(self, which: IntArray, part: Fleet) -> Any:
-        """Take over times and values of a subset, and return its state; for `Shard`."""
+        """Copy times and values from a subset, and return its state; for `Shard`."""
         self._so_far = put(self._so_far, which, part._so_far)
         return part._state
 
     @property
     def ends(self) -> dict[str, Array]:
-        """Times, measurements, inputs, their gaps and what verdicts count, by member."""
+        """Last times, readings and inputs of all members, with gaps and counts for verdicts."""
         return dict(vars(self._so_far))
 
     def run(self, stream: Iterable[Sequence[Any]]) -> FleetResult:
-        """Take every sample of a stream, (t, z) or (t, z, inputs), and collect the estimates."""
+        """Process all samples of a stream, (t, z) or (t, z, inputs), and return the estimates."""
         if is_tabular(stream):
             raise errors.SampleError(
                 "a fleet takes no table as a whole: give (t, z) or (t, z, inputs) for each time."
@@ -487,13 +487,13 @@ class Fleet:
         return result
 
     def labelled(self, z: Any) -> Any:
-        """Return the readings of one member, those with labels as a mapping of channels."""
+        """Convert labelled readings of a member to a mapping from channels; see `Channels`."""
         return self._one._channels.labelled(z)
 
     def _parsed(
         self, z: Values, inputs: Mapping[str, ArrayLike] | None
     ) -> tuple[Array, Array | None, Array, dict[str, Array]]:
-        """Return assimilated values and their noise, validation values and inputs, all checked."""
+        """Return validated measurements, their noise, validation values and inputs."""
         z = mapped(z, "z") if is_frame(z) else z
         if isinstance(z, list | tuple) and z:
             rows = list(map(self.labelled, z))
@@ -509,7 +509,7 @@ class Fleet:
         return measured, None if noise is None else own_noise(noise), validation, named
 
     def _given_once(self, name: str, before: Array | None, column: Array) -> Array:
-        """Return the values of an input; `before` are those among the readings, None without."""
+        """Return the values of an input; `before`: its values among the readings, or None."""
         if before is None:
             return column
         twice = (before != column) & ~np.isnan(before) & ~np.isnan(column)
@@ -558,12 +558,12 @@ class Fleet:
             )
         for name, column in zip(names, array.T, strict=True):
             self._refuse_infinite(name, column)
-        # Without names a sample has no values for validation.
+        # A sample without names contains no values of validation sensors.
         hidden = len(self.validation.names) if self.validation else 0
         return array, noise, np.full((len(self), hidden), np.nan), {}
 
     def _column(self, name: str, values: ArrayLike) -> Array:
-        """Return a value of a channel for each member."""
+        """Return the validated values of a channel, shape (members,)."""
         what = f"channel '{name}'"
         array = _numbers(what, in_order_of(self.members, values, what))
         if array.shape not in ((), (len(self),)):
@@ -583,7 +583,7 @@ class Fleet:
             )
 
     def _filled(self, named: Mapping[str, Array]) -> tuple[Array, dict[str, Mask]]:
-        """Return all inputs, (members, channels), and which members hold their last value."""
+        """Return all inputs, (members, channels), and channel -> members that hold its value."""
         values, held = np.full((len(self), len(self.inputs)), np.nan), {}
         for k, name in enumerate(self.inputs):
             column = named.get(name, values[:, k])
@@ -596,19 +596,19 @@ class Fleet:
                         f"input '{name}' of member '{member}' has no value in the first sample; "
                         "start the stream where every member has one."
                     )
-                if name not in self.problem.control.held.last:  # else its value is known
+                if name not in self.problem.control.held.last:  # else the held value is exact
                     held[name] = missing
             values[:, k] = column
         return values, held
 
     @cached_property
     def fingerprint(self) -> Fingerprint:
-        """Numbers by which a checkpoint of this fleet is known; computed when first asked for."""
+        """Fingerprint of the problem, stored in checkpoints; computed on first access."""
         return self._one.fingerprint.of_members(self._q0, self._u0, self._errors)
 
     @cached_property
     def header(self) -> dict[str, Any]:
-        """Properties that a fleet must share with the one whose checkpoint it takes over."""
+        """Properties that must agree between a fleet and a checkpoint."""
         return {
             "format": FORMAT,
             "law": type(self.law).__name__,
@@ -621,7 +621,7 @@ class Fleet:
         }
 
     def check(self, header: Mapping[str, Any], leaves: Mapping[str, Array], where: str) -> None:
-        """Raise `RunError` unless a checkpoint, named `where` in messages, is of such a fleet."""
+        """Raise `RunError` if a checkpoint is of another fleet; `where` names it in messages."""
         other = [key for key, value in self.header.items() if header.get(key) != value]
         if differs := other[0] if other else self.fingerprint.differing(leaves):
             raise errors.RunError(
@@ -633,7 +633,7 @@ class Fleet:
         checkpoint.write(path, self.dump())
 
     def dump(self) -> bytes:
-        """Return the state as `save` writes it."""
+        """Return the state as bytes, in the format of `save`."""
         header = {**self.header, "begun": self._state is not None}
         leaves = {"samples": self._samples, **self.ends, **self.fingerprint.leaves}
         if self._state is not None:
@@ -642,14 +642,14 @@ class Fleet:
         return checkpoint.packed(header, leaves)
 
     def load(self, path: str | os.PathLike[str]) -> None:
-        """Continue from a saved state; the fleet must be built as the one that was saved.
+        """Continue from a saved state; the fleet must be built with the same arguments.
 
-        Raises `RunError`: the file is damaged, or of another fleet.
+        Raises `RunError`: the file is damaged or of another fleet.
         """
         self.restore(checkpoint.read(path), str(path))
 
     def restore(self, content: bytes, where: str = "the checkpoint") -> None:
-        """Continue from the bytes of `dump`, named `where` in messages. Raises as `load`."""
+        """Continue from the bytes of `dump`; `where` names them in the errors listed at `load`."""
         header, leaves = checkpoint.unpacked(content, where)
         self.check(header, leaves, where)
         state = None
@@ -670,7 +670,7 @@ class Fleet:
 
 
 def _named(members: int | Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the members: numbers from 0 if only their count is given."""
+    """Return the names of the members; the default names are numbers from 0."""
     if isinstance(members, str) or not isinstance(members, int | Iterable):
         raise errors.ConfigurationError(
             f"members: got {members!r}; expected their count, or a list of their names."
@@ -684,7 +684,7 @@ def _named(members: int | Sequence[str]) -> tuple[str, ...]:
 
 
 def _check_positive(name: str, noise: Array) -> None:
-    """Refuse a standard deviation of readings that is not positive and not NaN."""
+    """Raise `SampleError` for a standard deviation that is neither positive nor NaN."""
     good = np.isnan(noise) | (noise > 0.0) & np.isfinite(noise)
     for value in noise[~good].tolist():
         check_noise(name, value)
