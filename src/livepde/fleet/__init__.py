@@ -1,4 +1,4 @@
-"""Many identifications of one model at once."""
+"""Identification of many processes with one model."""
 
 from livepde.fleet.estimate import FleetEstimate, FleetRecords, FleetResult
 from livepde.fleet.fleet import Fleet

@@ -1,4 +1,4 @@
-"""Estimates of all members of a fleet at one time, and as a table with axes."""
+"""Estimates of all members of a fleet at one time, and over time as a dataset."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MEMBER = "member"  # dimension of the dataset
 
 
 def number_of(members: Sequence[str], member: str | int) -> int:
-    """Return the number of a member, which is given by its name or number."""
+    """Return the number of a member, specified by name or number."""
     if member in members:
         return members.index(str(member))
     if isinstance(member, int) and -len(members) <= member < len(members):
@@ -54,20 +54,20 @@ class FleetEstimate:
     innovation, validation_error
         As for `Estimate`, shapes (members, sensors) and (members, validation).
     statuses
-        Status of the step of each member; unless ok, its q and u are those of its last good step.
+        Status of the step of each member; unless ok, q and u are from its last successful step.
     steps
-        Substeps taken, shape (members,).
+        Number of substeps, shape (members,).
     diagnose
-        Function that returns the diagnostics of the law, numbers of shape (members,).
+        Function that returns the diagnostics of the law, as arrays of shape (members,).
     held
-        Input channels whose last value was held, or at the first sample the first one -> which
-        members had none, shape (members,).
+        Input channel whose last value (at the first sample, first value) was held -> mask of the
+        members without a value, shape (members,).
     space
-        The unknowns.
+        Function space of the unknowns.
     belief
-        Function: number of a member -> its belief under the law.
+        Function: number of a member -> its belief.
     state_space
-        The components of the state; None for an estimate that was pickled.
+        Function space of the state; None for an estimate that was pickled.
     """
 
     t: float
@@ -84,7 +84,7 @@ class FleetEstimate:
     state_space: FunctionSpace | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the values themselves, for pickle and copies; as of an `Estimate`."""
+        """Return the attributes for pickle and copies, with values instead of functions."""
         each = tuple(map(self.belief, range(len(self.members))))
         own = {
             "read": partial(kept, self.beliefs),
@@ -97,7 +97,7 @@ class FleetEstimate:
 
     @cached_property
     def beliefs(self) -> Beliefs:
-        """Coefficients of parameter and state, and their covariances: computed when first read."""
+        """Coefficients of parameter and state with covariances, computed on first access."""
         return self.read()
 
     @property
@@ -112,17 +112,17 @@ class FleetEstimate:
 
     @property
     def q_std(self) -> Array | None:
-        """Standard deviations of q, or None if the law has none."""
+        """Standard deviations of q, (members, m); None for a law without covariance."""
         return self.beliefs.q_std
 
     @cached_property
     def diagnostics(self) -> Diagnostics[Array]:
-        """Innovation statistics, safeguards, and other numbers of the law."""
+        """Diagnostics of the law, such as innovation statistics and safeguards."""
         return self.diagnose()
 
     @property
     def ok(self) -> Mask:
-        """Members whose step was taken, shape (members,)."""
+        """Mask of members whose step succeeded, shape (members,)."""
         return np.array([status.ok for status in self.statuses])
 
     @property
@@ -132,7 +132,7 @@ class FleetEstimate:
         return {label: (self.q[:, k], std[:, k]) for label, k in self.space.labels.items()}
 
     def member(self, name: str | int) -> Estimate:
-        """Return the estimate of one member, by name or number, as `Identifier.step` does."""
+        """Return the estimate of a member, by name or number, as from `Identifier.step`."""
         k = number_of(self.members, name)
         return Estimate(
             t=self.t,
@@ -150,7 +150,7 @@ class FleetEstimate:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Row:
-    """Record of an estimate: numbers over members, and no state."""
+    """Record of an estimate without its state: arrays of numbers over the members."""
 
     t: float
     parameters: Mapping[str, tuple[Array, Array]]
@@ -162,7 +162,7 @@ class _Row:
 
     @classmethod
     def of(cls, estimate: FleetEstimate, **more: Any) -> Self:
-        """Return the record of an estimate, with the numbers that a subclass adds."""
+        """Return the record of an estimate; `more`: fields of a subclass."""
         codes = [STATUS_CODES.index(status.code) for status in estimate.statuses]
         return cls(
             t=estimate.t,
@@ -177,7 +177,7 @@ class _Row:
 
 
 class FleetResult:
-    """Estimates of a fleet, as they are added: numbers, innovations and statuses of all samples."""
+    """Estimates of a fleet, added one by one: numbers, innovations and statuses of all samples."""
 
     def __init__(self, members: Sequence[str], layout: Layout) -> None:
         if MEMBER in layout.scalars:
@@ -194,20 +194,20 @@ class FleetResult:
         return len(self._rows)
 
     def add(self, estimate: FleetEstimate) -> None:
-        """Add one estimate."""
+        """Add an estimate."""
         self._rows.append(_Row.of(estimate))
         self.last = estimate
 
     def _settle(self, estimate: FleetEstimate) -> None:
-        """Take the last parameters from the end of a run."""
+        """Replace the last parameters by the final ones of a run."""
         self._rows[-1] = replace(self._rows[-1], parameters=estimate.parameters)
         self.last = estimate
 
     def to_xarray(self) -> xr.Dataset:
         """Return a dataset with dimensions member, time, sensor and validation.
 
-        Scalar unknowns, with `_std` variables beside them, status, steps and diagnostics are over
-        (`member`, `time`); innovations over (`member`, `time`, `sensor`).
+        Scalar unknowns, their standard deviations `_std`, status, steps and diagnostics are over
+        (`member`, `time`), innovations over (`member`, `time`, `sensor`).
         """
         import xarray as xr
 
@@ -235,13 +235,13 @@ class FleetResult:
         steps = self._series("steps")
         data["steps"] = (both, steps.astype(np.int32), {"long_name": "substeps taken"})
         for name, values in self._diagnostics():
-            # A diagnostic may have the name of an unknown, which comes first.
+            # A diagnostic with the name of an unknown gets a prefix.
             data[f"{NOTE}{name}" if name in data else name] = (both, values)
         data.attrs["scalars"] = "\n".join(layout.scalars)
         return data
 
     def _diagnostics(self) -> Iterator[tuple[str, Array]]:
-        """Iterate over the diagnostics of the law by name, NaN at samples without one."""
+        """Iterate over the diagnostics of the law by name, NaN where a sample has no value."""
         nothing = np.full(len(self.members), np.nan)
         for name in dict.fromkeys(chain.from_iterable(row.diagnostics for row in self._rows)):
             yield name, self._table([row.diagnostics.get(name, nothing) for row in self._rows])
@@ -256,7 +256,7 @@ class FleetResult:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _MemberRow(_Row):
-    """Record with `Record.numbers` and, where they are kept, the fields."""
+    """Record with `Record.numbers` and, at some samples, the fields."""
 
     numbers: Array
     profiles: Mapping[str, Array] | None
@@ -283,23 +283,23 @@ class _MemberRow(_Row):
 
 
 class FleetRecords:
-    """Estimates of members that step together, as `Result` keeps those of one.
+    """Estimates of members that are stepped together, as records of single processes.
 
-    `model`: whose unknowns are numbers.
-    `fields_every`: fields of every so many samples are kept.
+    `model`: model whose unknowns are numbers.
+    `fields_every`: fields of every `fields_every`-th sample are stored.
     """
 
     def __init__(self, model: Model, fields_every: int = 1) -> None:
         self.model = model
         self.fields_every = fields_every
-        self.size = 0  # numbers that wait
+        self.size = 0  # count of stored numbers
         self._count = 0
         self._rows: list[_MemberRow] = []
 
     def add(self, estimate: FleetEstimate) -> None:
-        """Add one estimate of all members.
+        """Add an estimate of all members.
 
-        Raises `ConfigurationError`: members step separately: each has an `Estimate` of its own.
+        Raises `ConfigurationError`: members are stepped separately.
         """
         beliefs, profiles, correlation = estimate.beliefs, None, None
         factors = beliefs.factors
@@ -321,7 +321,7 @@ class FleetRecords:
         return (row.record(k) for row in self._rows)
 
     def clear(self) -> None:
-        """Drop the rows, once they are written."""
+        """Delete all records, after they have been written."""
         self._rows.clear()
         self.size = 0
 
@@ -329,7 +329,7 @@ class FleetRecords:
         """Return `Record.numbers` of all members, shape (members, numbers)."""
         space, columns = self.model.parameter_space, []
         after, before = (np.linalg.norm(factor, axis=2) for factor in (factors.q, factors.prior))
-        # Share of the prior standard deviation that remains; NaN where the prior had none.
+        # Remaining share of the prior standard deviation; NaN where the prior has none.
         shares = after / np.where(before > 0.0, before, np.nan)
         for label, k in space.labels.items():
             value, std = beliefs.q[:, k], after[:, k]
@@ -345,7 +345,7 @@ class FleetRecords:
         for name, block in self.model.state_space.fields.items():
             part, names = self.model.state_space.part(name), block.variables(name)
             columns = factors.u[:, part].transpose(1, 0, 2).reshape(-1, members * r)
-            # Variances at the vertices: sums of squares of the rows of the factor there.
+            # Variances at the vertices are sums of squares of rows of the factor.
             squares = ((block.at_vertices @ columns) ** 2).reshape(-1, members, r).sum(axis=2)
             deviations = np.sqrt(squares)
             for end, values in {"": block.at_vertices @ u[:, part].T, "_std": deviations}.items():

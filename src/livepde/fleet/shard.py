@@ -1,4 +1,4 @@
-"""A fleet for live streams: members with their own sample times, and an offset."""
+"""Fleet for live streams, whose members have their own sample times and whose log has offsets."""
 
 from __future__ import annotations
 
@@ -27,32 +27,32 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 REFUSED = "refused"
-FORMAT = 1  # of `dump`
-BLOCK = 256  # members that step at once: more need more memory and are no faster
+FORMAT = 1  # version of the format of `dump`
+BLOCK = 256  # members in a block: larger blocks need more memory and are not faster
 Item: TypeAlias = Sequence[Any]  # (member, t, z) or (member, t, z, inputs)
-LOG = "state.log"  # its second axis has as many rows as a member needs
-ROOM = 8  # rows by which a log grows
+LOG = "state.log"  # leaf whose second axis has a different number of rows for each member
+ROOM = 8  # additional rows when a log grows
 
 
 @dataclass(frozen=True, eq=False)
 class ShardEstimates:
-    """Estimates of the samples of a batch, in its order.
+    """Estimates of the samples of a batch, in the same order.
 
     Attributes
     ----------
     offset
-        Place of the first sample in the log.
+        Offset of the first sample.
     member, t
-        Name of the member, and time as it was given, of each sample, shape (samples,).
+        Member and specified time of each sample, shape (samples,).
     q, q_std
-        Coefficients of the parameter and their standard deviations, shape (samples, m); NaN in rows
-        that were refused, and where the law has no covariance.
+        Coefficients of the parameter and their standard deviations, shape (samples, m). NaN for
+        refused samples; standard deviations are also NaN for a law without covariance.
     innovation
         Measured minus predicted values, shape (samples, sensors).
     status
-        "ok", "refused", or why the step failed, as `Status.code`.
+        "ok", "refused", or the `Status.code` of a failed step.
     message
-        Sentences on samples that were refused and steps that failed; else empty.
+        Reason of a refused sample or a failed step; else empty.
     labels, sensors
         Label of each scalar unknown -> its column of q; names of the sensors.
     """
@@ -76,7 +76,7 @@ class ShardEstimates:
         space: FunctionSpace,
         sensors: Sequence[str],
     ) -> ShardEstimates:
-        """Return rows of NaN for samples (member, t, ...)."""
+        """Return estimates of NaN for samples (member, t, ...)."""
         count = len(items)
         return cls(
             offset,
@@ -92,11 +92,11 @@ class ShardEstimates:
         )
 
     def refuse(self, row: int, message: str) -> None:
-        """Mark a sample that was not taken."""
+        """Mark a sample as refused."""
         self.status[row], self.message[row] = REFUSED, message
 
     def put(self, rows: Sequence[int], estimate: FleetEstimate) -> None:
-        """Fill in the rows of samples that were stepped as a block."""
+        """Set the rows of samples that were stepped as a block."""
         self.q[rows], self.innovation[rows] = estimate.q, estimate.innovation
         if estimate.q_std is not None:
             self.q_std[rows] = estimate.q_std
@@ -110,10 +110,10 @@ class ShardEstimates:
         return {label: (self.q[:, k], self.q_std[:, k]) for label, k in self.labels.items()}
 
     def to_arrow(self) -> pa.Table:
-        """Return an Arrow table: offset, member, t, status, message, and numbers.
+        """Return an Arrow table with offset, member, t, status, message, and numbers.
 
-        Each scalar unknown has a column of its name and one with "_std", each sensor one called
-        "innovation NAME". Where an unknown is a field, `q` and `q_std` are columns of lists.
+        Each scalar unknown has columns NAME and NAME_std, each sensor a column "innovation NAME".
+        If an unknown is a field, `q` and `q_std` are columns of lists.
 
         Raises `ConfigurationError`: pyarrow is not installed.
         """
@@ -132,7 +132,7 @@ class ShardEstimates:
             columns |= {"q": list(self.q), "q_std": list(self.q_std)}
         for k, name in enumerate(self.sensors):
             columns[f"innovation {name}"] = self.innovation[:, k]
-        # Without rows Arrow cannot tell the type of a list.
+        # Arrow cannot infer the type of an empty list.
         texts = dict.fromkeys(("member", "status", "message"), pa.string())
         return pa.table(
             {name: pa.array(values, texts.get(name)) for name, values in columns.items()}
@@ -140,20 +140,20 @@ class ShardEstimates:
 
 
 def _time(value: object) -> float:
-    """Return a time, NaN if it is none: the sample is refused."""
+    """Return a time as a float; NaN for other types, whose sample is refused."""
     return float(value) if isinstance(value, int | float | np.number) else np.nan
 
 
 class Shard:
-    """Identifies many processes of one model from a stream of samples that carry an offset.
+    """Estimate the unknowns of many processes from a stream of samples with offsets.
 
-    The offset of a sample is its place in the log of record, counted from 0. A shard takes every
-    sample of the log once and in order: `step` refuses a batch that does not begin at `offset`. A
-    state that was restored from an older `dump` therefore takes the same samples again, and comes
-    to the same numbers, or says that it cannot.
+    The offset of a sample is its position in the log of record, counted from 0. A shard processes
+    all samples of the log once and in order: `step` raises an error for a batch that does not begin
+    at `offset`. A shard restored from an older `dump` therefore processes the same samples again
+    and returns the same numbers, or it raises an error.
 
-    Members are those of a `Fleet`, but each has sample times of its own. Samples of one batch are
-    stepped as blocks where the members' last two sample times agree. Estimates are those of one
+    In contrast to a `Fleet`, each member has its own sample times. Samples of a batch are stepped
+    as a block if the last two sample times of their members agree. Estimates equal those of one
     `Identifier` for each member, to rounding.
 
     Parameters
@@ -166,7 +166,7 @@ class Shard:
     Attributes
     ----------
     offset
-        Of the next sample.
+        Offset of the next sample.
 
     Raises
     ------
@@ -209,35 +209,35 @@ class Shard:
 
     @property
     def members(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the members."""
         return self._fleet.members
 
     @property
     def note(self) -> str:
-        """Why members are stepped one by one; empty if they are stepped as blocks."""
+        """Reason why members are stepped one by one; empty if they are stepped as blocks."""
         return self._fleet.note
 
     def step(self, offset: int, batch: Iterable[Item]) -> ShardEstimates:
-        """Take the next samples of the log and return an estimate for each.
+        """Process the next samples of the log and return an estimate for each.
 
-        A sample that cannot be used (an unknown member, a time that is not later than the member's
-        last one, a text in the place of a number) changes nothing and is told in its row: its
-        status is "refused". So is a step that fails numerically, as in `Identifier.step`.
+        An invalid sample (an unknown member, a time that is not later than the member's last, text
+        instead of a number) changes nothing; its status is "refused". If a step fails numerically,
+        its status is the reason, as in `Identifier.step`.
 
         Parameters
         ----------
         offset
-            Place of the first sample of the batch in the log.
+            Offset of the first sample of the batch.
         batch
             Samples (member, t, z) or (member, t, z, inputs), in the order of the log; z and inputs
-            as for `Identifier.step`. A member may come more than once.
+            as for `Identifier.step`. Several samples of a member are allowed.
 
         Raises
         ------
         OffsetError
-            The batch does not begin at `offset` of the shard; nothing was changed.
+            The batch does not begin at `offset` of the shard; the shard is unchanged.
         RunError
-            An earlier step was broken off by an exception: the state is between two batches.
+            An exception interrupted an earlier step, so that the batch is partly processed.
         """
         self._refuse_torn()
         items: list[Item] = [item if isinstance(item, tuple | list) else () for item in batch]
@@ -279,9 +279,9 @@ class Shard:
         )
 
     def _waves(self, items: list[Item], estimates: ShardEstimates) -> Iterable[list[int]]:
-        """Return rows in waves, in each of which a member has one sample at most.
+        """Group the rows into waves with at most one sample of each member.
 
-        Readings with labels become mappings.
+        Invalid samples are refused; labelled readings in `items` are replaced by mappings.
         """
         waves: dict[int, list[int]] = {}
         counts: Counter[str] = Counter()
@@ -296,7 +296,7 @@ class Shard:
         return waves.values()
 
     def _checked(self, item: Item) -> Item:
-        """Return a sample that has the right parts; its readings with labels are a mapping."""
+        """Return a validated sample, whose labelled readings are converted to a mapping."""
         if not 3 <= len(item) <= 4:
             raise SampleError(f"a sample has {len(item)} parts; give (member, t, z, inputs).")
         if not isinstance(item[0], str) or item[0] not in self._places:
@@ -308,7 +308,7 @@ class Shard:
         return name, t, self._fleet.labelled(z), *inputs
 
     def _blocks(self, items: Sequence[Item], wave: Sequence[int]) -> Iterator[list[int]]:
-        """Yield rows whose members have their last two sample times in common."""
+        """Yield blocks of rows whose members have the same last two sample times."""
         alike: dict[tuple[Any, ...], list[int]] = {}
         for row in wave:
             name, t, z, *_ = items[row]
@@ -321,7 +321,7 @@ class Shard:
                 yield rows[first : first + BLOCK]
 
     def _take(self, items: Sequence[Item], rows: Sequence[int], estimates: ShardEstimates) -> None:
-        """Step the members of some samples together; if one cannot be used, one by one."""
+        """Step the members of samples together; if one is invalid, one by one."""
         which = np.array([self._places[items[row][0]] for row in rows])
         block = self._subset(which)
         try:
@@ -333,29 +333,29 @@ class Shard:
             for row in rows:
                 self._take(items, [row], estimates)
             return
-        # Estimates are read before the states, of which they are made, are written in place.
+        # Estimates are read first, since they refer to states that are overwritten in place.
         estimates.put(rows, estimate)
         self._states.put(which, self._fleet.adopt(which, block))
         self._taken[which] += 1
 
     def _subset(self, which: IntArray) -> Fleet:
-        """Return a fleet of some members that have taken as many samples, or begun."""
+        """Return a fleet of members that are all at their start, or all have a state."""
         samples = int(self._taken[which[0]])
         state = self._states.take(which) if samples else None
         return self._fleet.subset(which, state, samples)
 
     def identifier(self, member: str) -> Identifier:
-        """Return an identifier that continues from the state of a member; for forecasts and fields.
+        """Return an identifier in the state of a member, for example for forecasts and fields.
 
         Steps of this identifier do not change the shard.
         """
-        # A copy, as states of the shard are written in place.
+        # A copy, since states of the shard are overwritten in place.
         return copy.deepcopy(self._subset(np.array([self._places[member]])).identifier(0))
 
     def dump(self) -> bytes:
-        """Return offset and states of all members as one buffer with a checksum.
+        """Return offset and states of all members as bytes with a checksum.
 
-        Raises `RunError`: a step was broken off by an exception.
+        Raises `RunError`: an exception interrupted a step.
         """
         self._refuse_torn()
         header = {**self._fleet.header, "shard": FORMAT}
@@ -365,11 +365,11 @@ class Shard:
         return checkpoint.packed(header, leaves)
 
     def load(self, content: bytes) -> None:
-        """Continue from the bytes of `dump`, with identical numbers, at its offset.
+        """Continue from the bytes of `dump` at its offset, with identical numbers.
 
-        The shard must be built as the one that was dumped.
+        The shard must be built with the same arguments.
 
-        Raises `RunError`: the content is damaged, or of another shard; nothing was changed.
+        Raises `RunError`: the content is damaged or of another shard; the shard is unchanged.
         """
         header, leaves = checkpoint.unpacked(content, "the dump")
         if header.get("shard") != FORMAT:
@@ -390,7 +390,7 @@ class Shard:
 
 
 def _joined(items: Sequence[Item], observed: Observed) -> tuple[float, Any, dict[str, Any]]:
-    """Return time, measurements and inputs of several samples as `Fleet.step` takes them."""
+    """Combine samples at one time to the arguments of `Fleet.step`: time, readings and inputs."""
     t, z = float(items[0][1]), [item[2] for item in items]
     inputs = [(item[3] or {}) if len(item) == 4 else {} for item in items]
     measured = columns(z) if isinstance(z[0], Mapping) else _rows(z, observed)
@@ -398,29 +398,29 @@ def _joined(items: Sequence[Item], observed: Observed) -> tuple[float, Any, dict
 
 
 def _rows(rows: Sequence[Any], observed: Observed) -> Array:
-    """Return measurements and the noise of each, NaN without, shape (members, sensors, 2)."""
+    """Return measurements and their noise (NaN: default), shape (members, sensors, 2)."""
     nothing = np.full(observed.size, np.nan)
     pairs = (readings(row, observed) for row in rows)
     return np.stack([(z, nothing if noise is None else noise) for z, noise in pairs]).swapaxes(1, 2)
 
 
 class OwnStates:
-    """States of members that step one by one, each a separate value."""
+    """States of members that are stepped one by one, stored as separate values."""
 
     def __init__(self, template: State, count: int) -> None:
         self._template = template[0]
         self._states = [self._template] * count
 
     def rows(self, k: int) -> int:
-        """Return 0: states that are stepped one by one need not be alike."""
+        """Return 0, since separate states need not have logs of equal length."""
         return 0
 
     def take(self, which: IntArray) -> State:
-        """Return the states of some members as their engine steps them."""
+        """Return the states of members for their engine."""
         return tuple(self._states[k] for k in which)
 
     def put(self, which: IntArray, state: State) -> None:
-        """Store states that were stepped."""
+        """Store the states of members after a step."""
         for k, one in zip(which.tolist(), state, strict=True):
             self._states[k] = one
 
@@ -429,7 +429,7 @@ class OwnStates:
         return checkpoint.flatten(tuple(self._states))
 
     def restored(self, leaves: Mapping[str, Array]) -> OwnStates:
-        """Return the states from their `leaves`; raises KeyError or ValueError if they misfit."""
+        """Return the states from `leaves`; raise KeyError or ValueError if they do not fit."""
         other = OwnStates((self._template,), 0)
         each = range(len(self._states))
         other._states = [checkpoint.rebuild(self._template, leaves, f"state.{k}") for k in each]
@@ -437,10 +437,10 @@ class OwnStates:
 
 
 class JoinedStates:
-    """States of members that step as blocks: arrays over members, written in place.
+    """States of members that are stepped as blocks, stored in arrays that are written in place.
 
-    A leaf that is equal for all members (such as a fit before the first one) is stored
-    once. Of the log each member has rows of its own.
+    A leaf that is equal for all members, such as the fit before the first refit, is stored once.
+    The log has a different number of rows for each member.
     """
 
     def __init__(self, template: State, count: int) -> None:
@@ -453,11 +453,11 @@ class JoinedStates:
         self._taken: dict[str, Array] = {}
 
     def rows(self, k: int) -> int:
-        """Return how many rows the log of a member has: those of a block are as long."""
+        """Return the number of rows in the log of a member, equal for all members of a block."""
         return int(self._rows[k])
 
     def take(self, which: IntArray) -> State:
-        """Return the states of some members, with as many rows in their logs."""
+        """Return the states of members, whose logs have the same number of rows."""
         length, first = len(which), int(which[0])
         index: Any = which
         if np.array_equal(which, np.arange(first, first + length)):
@@ -466,7 +466,7 @@ class JoinedStates:
         for path, leaf in self._leaves.items():
             if path not in self._once:
                 found[path] = leaf[index]
-            else:  # one without members stays so
+            else:  # a leaf of length 0 keeps that length
                 found[path] = (
                     np.broadcast_to(leaf, (length, *leaf.shape[1:])) if len(leaf) else leaf
                 )
@@ -475,7 +475,7 @@ class JoinedStates:
         return checkpoint.rebuild(self._template, {**found, LOG: log})
 
     def put(self, which: IntArray, state: State) -> None:
-        """Store states that were stepped: those that were taken last, or begun."""
+        """Store the states of members after a step from the states of the last `take`."""
         leaves = checkpoint.flatten(state)
         log = leaves.pop(LOG)
         rows = log.shape[1]
@@ -484,8 +484,8 @@ class JoinedStates:
         self._log[which, :rows], self._log[which, rows:] = log, np.inf
         self._rows[which] = rows
         changed = {path: new for path, new in leaves.items() if new is not self._taken.get(path)}
-        # An array may be a view of one that is overwritten now, as of a filter that becomes the
-        # older one: it is copied first.
+        # An array may be a view of an array that is overwritten below, for example if the filter
+        # becomes the older filter. Views are copied first.
         changed = {path: new if new.base is None else new.copy() for path, new in changed.items()}
         for path, new in changed.items():
             self._put_leaf(which, path, new)
@@ -493,7 +493,7 @@ class JoinedStates:
 
     def _put_leaf(self, which: IntArray, path: str, new: Array) -> None:
         leaf = self._leaves[path]
-        if not len(new):  # there is nothing of any member
+        if not len(new):  # a leaf without values of members
             self._leaves[path] = new
             return
         if path in self._once:  # stored once as long as no member differs
@@ -503,7 +503,7 @@ class JoinedStates:
                 return
             self._once.remove(path)
             leaf = np.repeat(leaf, self._count, axis=0)
-        if leaf.ndim > 2:  # square roots of covariances, whose rows may become more
+        if leaf.ndim > 2:  # square roots of covariances, whose number of rows may increase
             room = max(leaf.shape[1], new.shape[1])
             leaf, new = (_widened(array, room, 0.0) for array in (leaf, new))
         leaf[which] = new
@@ -514,7 +514,7 @@ class JoinedStates:
         return {"rows": self._rows, LOG: self._log, **self._leaves}
 
     def restored(self, leaves: Mapping[str, Array]) -> JoinedStates:
-        """Return the states from their `leaves`; raises KeyError or ValueError if they misfit."""
+        """Return the states from `leaves`; raise KeyError or ValueError if they do not fit."""
         other = JoinedStates(self._template, self._count)
         other._rows, other._log = leaves["rows"].astype(np.int64), leaves[LOG]
         other._leaves = {path: leaves[path] for path in self._leaves}
@@ -524,12 +524,12 @@ class JoinedStates:
             raise ValueError(f"states of other than {self._count} members")
         if self._count == 1:
             other._once = set()
-        other.take(np.array([0]))  # raises unless they have the structure of the template
+        other.take(np.array([0]))  # raises an error if the structure differs from the template
         return other
 
 
 def _widened(array: Array, room: int, value: float) -> Array:
-    """Return an array with so many entries on its second axis."""
+    """Return an array padded with `value` to at least `room` entries on its second axis."""
     more = room - array.shape[1]
     if more <= 0:
         return array

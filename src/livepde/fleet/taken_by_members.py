@@ -1,4 +1,4 @@
-"""Samples that the members of a fleet have taken: the last ones, and counts for verdicts."""
+"""Last samples of the members of a fleet, and counts of all their samples for verdicts."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class TakenByMembers:
     """`TakenSamples` of all members; the leading axis of every array is the members."""
 
     t: Array  # time of the last accepted sample, shape (members,)
-    z: Array  # its readings, (members, sensors), and inputs, (members, channels)
+    z: Array  # readings of this sample, (members, sensors), and inputs, (members, channels)
     inputs: Array
-    known: Array  # the same inputs, or what holds since the sample of a failed step
-    held: Array  # for how long each input has been held by now, (members, channels)
-    # Numbers that verdicts count, as `InputLedger` and `StepLedger` do.
+    known: Array  # last known inputs, which include held inputs of later failed steps
+    held: Array  # time for which each input has been held so far, (members, channels)
+    # Counts for verdicts, as in `InputLedger` and `StepLedger`.
     held_counts: IntArray
     unstated: Array
     steps: IntArray
@@ -45,7 +45,7 @@ class TakenByMembers:
         )
 
     def begun(self, inputs: Array, unstated: Mask) -> TakenByMembers:
-        """Return the value at the start; `unstated`: True for inputs without a value there."""
+        """Return the value at the start; `unstated`: True for inputs without an initial value."""
         return changed(self, inputs=inputs, known=inputs, unstated=unstated.astype(float))
 
     def after(
@@ -62,8 +62,8 @@ class TakenByMembers:
 
         A member whose step failed keeps its time and values: its next step covers both intervals.
 
-        `missing`: 1 for each input whose last value was held.
-        `holding`: True for inputs that hold until the next reading, which may not be read again.
+        `missing`: 1 for each input that holds its last value.
+        `holding`: True for inputs with "hold", whose value stays valid after a failed step.
         """
         codes = [STATUS_CODES.index(status.code) for status in statuses]
         steps = self.steps + np.eye(COUNTS, dtype=np.int64)[codes]
@@ -86,7 +86,7 @@ class TakenByMembers:
         )
 
     def restored(self, leaves: Mapping[str, Array]) -> TakenByMembers:
-        """Return the value that leaves of a checkpoint hold; raises `KeyError` or `ValueError`."""
+        """Return the value stored in leaves of a checkpoint; raise `KeyError` or `ValueError`."""
         for name, own in vars(self).items():
             if leaves[name].shape != own.shape:
                 raise ValueError(f"{name} has shape {leaves[name].shape}, needs {own.shape}")
