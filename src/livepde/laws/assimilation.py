@@ -347,9 +347,9 @@ def _judged(
 def _noise_level(x: FilterState, used: Mask, d: Array, update: Update) -> dict[str, Array]:
     """Return the fields of the noise level after a sample.
 
-    One step of expectation maximisation. At the right level, the mean square of the residuals after
-    the update plus the posterior variance of the predictions equals the noise variance, even while
-    the unknowns are uncertain.
+    This is one step of expectation maximisation. At the right level, the noise variance equals the
+    mean square of the residuals after the update plus the posterior variance of the predictions.
+    This also holds while the unknowns are uncertain.
     """
     left = update.left
     residual = d - (update.half[:, None] @ left)[:, 0]

@@ -2,8 +2,8 @@
 
 The filter of Moireau, Chapelle and Le Tallec (2008), for several members at once: the leading axis
 of every array is the members. An identifier has one member, a fleet any number. Let a ~ N(0, I) be
-the reduced unknowns, S the Jacobian of a step, A the derivative of A(u) q in q and
-P = [U C]^T [U C] the joint covariance of u and a. Then
+the reduced unknowns, and P = [U C]^T [U C] the joint covariance of u and a. Let S be the Jacobian
+of a step, and A the derivative of A(u) q in q. Then
 
     predict   one implicit step for u;   U+ S^T = U M/h - C Phi^T A(u+)^T
     update    d = z - h(u, q),  Y = U H_u^T + C Phi^T H_q^T,  W W^T = (I + Y N^-1 Y^T)^-1
@@ -337,7 +337,7 @@ class Filter:
         shadows = x.shadows.u.shape[1]
 
         at_end = self._directions(end, end.C, deviates)
-        factors: dict[float, Any] = {}  # of all stages of a step that have the same q
+        factors: dict[float, Any] = {}  # factorised matrices, for stages of a step with the same q
         begun, length = start, stop - start
 
         def begin(t: float, h: float) -> None:

@@ -121,8 +121,8 @@ class ShadowState:
     # it; shapes (members,) and (members, channels).
     length: Array
     slope: Array
-    # Integral over the last interval of the deviation of the inputs from straight lines, and sum of
-    # these integrals since the last shadow step that used them, shapes (members, channels).
+    # Integral of the deviation of the inputs from straight lines over the last interval, and sum of
+    # such integrals that no shadow step has used yet, shapes (members, channels).
     bend: Array
     missed: Array
     # For inputs that are held: last value, last change, and sums of squares of the changes and of

@@ -120,9 +120,9 @@ class Gate:
     or more than `LASTING` do not: a passing disturbance has no information about constants. Sensors
     with fewer than `SETTLED` used readings also correct the unknowns: their start may be poor.
 
-    Readings are implausible if they repeat a value more often than any earlier reading, if they
-    repeat a value outside the earlier range by more than the largest range of all sensors, or if
-    they exceed it by ten times that range. Ranges below `MOVED` times the noise are ignored.
+    Readings are implausible if they repeat a value more often than any earlier reading. So are
+    readings beyond the earlier range by more than the largest range of all sensors if they repeat a
+    value, and by ten times that range otherwise. Ranges below `MOVED` times the noise do not count.
     """
 
     beyond: float = math.inf

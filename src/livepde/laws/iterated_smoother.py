@@ -172,8 +172,8 @@ def _searched(
     more = now.U[0, size:].any() or now.C[0, size:].any()
     square = not more and best.x.C.shape[1] == size
     if moved <= holds and usual(now) and square:
-        # Ledger and discretisation errors refer to the rows of the square root, which are the rows
-        # of the prior in both filters, and remain valid about the same trajectory.
+        # Ledger and discretisation errors remain valid about the same trajectory: they refer to the
+        # rows of the square root, which are the rows of the prior in both filters.
         causes = now.causes[:, :size]
         parts = {"ledger": now.ledger, "causes": causes, "shadows": now.shadows}
         return changed(best.x, **parts), moved

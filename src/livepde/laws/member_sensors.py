@@ -1,9 +1,9 @@
 """Predicted readings of several members, their Jacobians, and corrections of the state alone.
 
-A misfit after a pause or a disturbance is most likely due to a wrong state. With the Riesz
-representers R of the sensors H, u += K d with K = R (H R)^-1 is the smoothest correction that
+A misfit after a pause or a disturbance is most likely due to a wrong state. Let R be the Riesz
+representers of the sensors H, and K = R (H R)^-1. Then u += K d is the smoothest correction that
 matches the readings. The unknowns and their covariance do not change. The square root of the state
-becomes U - (H U + D C) K, so that the observed part no longer depends on the unknowns.
+becomes U - (H U + D C) K: the observed part no longer depends on the unknowns.
 """
 
 from __future__ import annotations

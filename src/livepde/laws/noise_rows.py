@@ -108,7 +108,6 @@ class NoiseRows:
         """Return rows of C from the values of ramps and arches, shape (2, moving)."""
         moving = len(self.columns)
         rows = np.zeros((len(self.scale), 2, moving, self.k))
-        # Indices with a slice between them come first.
         rows[:, :, np.arange(moving), self.columns] = self.scale[:, None] * paths
         return rows.reshape(len(self.scale), 2 * moving, self.k)
 
@@ -195,8 +194,8 @@ def with_input_errors(
     `sizes`: standard deviation of each such channel, a number or shape (members, 1). The error is
     constant in a span and independent between spans. Over many spans, its integral has the same
     variance as for errors interpolated linearly between readings. If a state follows its boundary
-    within a span, the variance is too large by up to a quarter. A row is the change of the state if
-    the input changes by one standard deviation, which is exact for a model affine in the input.
+    within a span, the variance is too large by up to a quarter. A row is the change of the state
+    when the input changes by one standard deviation: exact for a model affine in the input.
     """
     bare, rows = _without_tangents(x), []
     for name, size in sizes.items():
@@ -221,7 +220,7 @@ def unread_inputs(problem: Problem, x: FilterState, span: Span) -> dict[str, Arr
     for name in lines(problem):
         held, missing = span.gaps[:, :, span.channels.index(name)].T
         if np.count_nonzero(missing):
-            length = 2.0 * (held + span.t1 - span.t0)  # the end of a gap is open
+            length = 2.0 * (held + span.t1 - span.t0)  # twice: no reading at the end of the gap
             size = x.driven.deviation(length)[:, problem.channels.index(name)] * missing
             sizes[name] = size[:, None]
     return sizes
@@ -333,7 +332,7 @@ def with_initial_rows(
     Errors of u0 (`Problem.initial_errors`) are separate rows. If u0 is made of readings,
     u0 = sum_i w_i z_i, its error is -sum_i w_i (noise_i + H_q Phi a). The noise of each reading is
     a separate row. The effect of unknowns on the sensors, such as an offset, is part of the rows of
-    these unknowns, so that these readings give no further information about them.
+    these unknowns. Therefore these readings give no further information about them.
 
     `noise`: standard deviation of each sensor, shape (sensors,).
     """

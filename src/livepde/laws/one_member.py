@@ -1,7 +1,7 @@
 """Step of one member of a sensitivity law, with safeguards and alarms.
 
-It is used if a sample moves an unknown too far, if a step fails or the estimate runs away, or if an
-alarm indicates a jump. All states in this module have one member.
+It is used if a sample moves an unknown too far, a step fails, the estimate runs away, or an alarm
+indicates a jump. All states in this module have one member.
 """
 
 from __future__ import annotations

@@ -77,10 +77,10 @@ class Guards:
 
     *Overconfident linearisation.* Some samples move an unknown by more than `reach` prior standard
     deviations, and by more than half a posterior standard deviation. Such a sample is assimilated
-    by Gauss-Newton steps over its interval, each at most one prior standard deviation long, until
-    reference and estimate agree within half a posterior standard deviation. If the steps do not
-    converge, the sample is tried again up to `temperings` times, each time with ten times the
-    noise, and then not used. Notes: "iterated", "tempered", "held".
+    by Gauss-Newton steps over its interval, of at most one prior standard deviation. They end when
+    reference and estimate agree within half a posterior standard deviation. If they do not
+    converge, the sample is tried up to `temperings` times more, each time with ten times the noise.
+    If that fails too, it is not used. Notes: "iterated", "tempered", "held".
 
     *Runaway.* A step fails, or an innovation exceeds `runaway` times the largest range of any
     sensor so far (both in units of the noise). The law then returns to a state before the last
@@ -202,9 +202,9 @@ class Jumps:
 
     A chi-square test is applied to the innovations of the last 1, 2, 4, ... samples, normalised by
     their expected standard deviation and by their usual size and correlation. After an alarm the
-    law returns to the most likely time of the change, adds `size` prior standard deviations to the
-    uncertainty of the unknowns that may jump, and assimilates the samples since. The state and the
-    other unknowns keep their estimates from before the jump.
+    law returns to the most likely time of the change. It adds `size` prior standard deviations to
+    the uncertainty of the unknowns that may jump, and assimilates the samples since. The state and
+    the other unknowns keep their estimates from before the jump.
 
     The usual size and correlation are averages over about 500 samples, including the first `settle`
     samples but not the samples of rest after an alarm. After the first `settle` samples,

@@ -165,7 +165,7 @@ class Reduction:
         gained = _growth(self.evolutions, h)
         if not drift.any():
             return np.broadcast_to(gained, variance.shape)
-        # V' = drift (1 - V), whatever the length of the step.
+        # Exact solution of V' = drift (1 - V) for a step of any length.
         more = -np.expm1(-drift * h)[:, None] * np.maximum(1.0 - variance, 0.0)
         return np.where(self.still, more, gained)
 

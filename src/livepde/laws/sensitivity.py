@@ -92,7 +92,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     A sample costs one step and one block of back-substitutions. For constant unknowns, U = L C with
     the sensitivity L = du/da. The process noise of a moving unknown (`evolution`, or `drift` for
-    all) adds independent columns at each substep, and the factor is compressed to `rank` columns.
+    all) adds independent columns at each substep. The factor is compressed to `rank` columns.
 
     Bounds of numbers and of latent values (`within` of an unknown) apply to the linearisation point
     and to reported estimates; the filter itself stays linear.

@@ -159,9 +159,9 @@ class SensitivityState:
     """State of the law for each member; the leading axis of every array is the members."""
 
     now: FilterState  # the present filter
-    # Start of the window of a refit or of an iterated start: the filter, its row of the log, True
-    # if that row has a sample that the filter has not assimilated, and True if the state is the
-    # initial state of the model (`Model.initial`).
+    # Start of the window of a refit or an iterated start: filter and row of the log. `opening`: the
+    # row has a sample that the filter has not assimilated. `initial`: the state is the initial
+    # state of the model (`Model.initial`).
     start: FilterState
     window: IntArray
     opening: Mask

@@ -8,8 +8,8 @@ xi' are jointly Gaussian:
 
 Here P is T before the update, and zeta ~ N(0, I) is the part that the truncation drops.
 `FilterState.past` and `dpast` propagate xi through predict and update: T and g are the images of I
-and 0. The distribution xi ~ N(mu, B^T B) given all samples follows backwards in time from mu = 0
-and B = I at the end (Rauch, Tung and Striebel 1965). It has one coordinate for each row:
+and 0. Given all samples, xi ~ N(mu, B^T B) with one coordinate for each row. This follows backwards
+in time from mu = 0 and B = I at the end (Rauch, Tung and Striebel 1965):
 
     mu = g + T^T mu',    B = upper triangle of a QR factorisation of [B' T; R]
 
