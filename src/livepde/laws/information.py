@@ -48,10 +48,10 @@ determine, S is at least a small share of the J of these rows.
 H is updated when S or the trace of J has changed by more than `AGED`, or J along the last step has
 grown by more than `STEEPER`. Between updates a step is a quasi-Newton step with cached factors.
 
-All constants are ratios of equal units: they depend neither on the mesh nor on the sampling rate.
+All constants are dimensionless, and depend neither on the mesh nor on the sampling interval.
 
 Under these assumptions ||q - q0||_Q^2 is a sum of chi-squares with weights of at most 1. The sum k
-of the weights is at most m and at most trace(G_Q^{-1} J)/S, J without forgetting. The sum exceeds
+of the weights is at most m and at most trace(G_Q^{-1} J)/S, J without forgetting. The norm exceeds
 k + 2 sqrt(k s) + 2 s with a probability below exp(-s) (Laurent and Massart 2000). Beyond this
 bound the step holds q and reports "departed"; J, b and S are updated as usual. S does not contain a
 bias that q absorbs, such as the bias of too strong smoothing (`livepde.laws.observed_part`).

@@ -462,7 +462,7 @@ class InputShadow(Shadow):
         expected = s.slope * (held + 0.5 * h) * h
         line = 0.5 * held * (change - s.slope * held)
         missed = s.missed + np.where(missing, -expected, bend - line)
-        # After a gap no error is expected in the next steps.
+        # In a gap and at its end, no error of later steps is predicted.
         in_gap: Mask = np.asarray((gaps > 0.0).any(axis=(1, 2)))
         bend = np.where(in_gap[:, None], 0.0, bend)
         length = np.where(missing.all(axis=1), s.length, whole.max(axis=1))

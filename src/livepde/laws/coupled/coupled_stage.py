@@ -176,7 +176,7 @@ class CoupledStage:
         return imposed
 
     def _factor(self, kept: KeptFactor, problem: StageProblem) -> Factor | None:
-        """Return the cached factor, recomputed if it is no longer in memory."""
+        """Return the cached factor, recomputed if it was replaced; None if the step has changed."""
         if not len(kept.y) or abs(kept.h - problem.h) > SAME * problem.h:
             return None
         last = self._last
