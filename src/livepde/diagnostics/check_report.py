@@ -23,7 +23,7 @@ class Check:
     name
         The measured quantity, in words or as an equation.
     value
-        The number; NaN never satisfies anything.
+        Measured number; NaN never satisfies a bound.
     bound, sense
         One number for "<=" and ">=", a pair (low, high) for "in".
     remedy
@@ -89,7 +89,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows to print; numbers stay numbers until they are shown."""
+    """Table whose numbers are only formatted when it is shown."""
 
     title: str
     columns: Sequence[str]
@@ -103,7 +103,7 @@ class Table:
         }
 
     def markdown(self, digits: int = 5) -> str:
-        """Return the table in Markdown, with so many significant digits; without rows its title."""
+        """Return the table in Markdown with `digits` significant digits, or its title if empty."""
 
         def line(cells: Iterable[Any]) -> str:
             shown = (f"{c:.{digits}g}" if isinstance(c, float) else str(c) for c in cells)
@@ -171,7 +171,7 @@ class CheckReport:
 
 
 def _number(value: Bound) -> str:
-    """Return a number as text: counts and rates plainly, others in scientific notation."""
+    """Format a number: counts and rates as decimals, others in scientific notation."""
     if isinstance(value, tuple):
         return f"[{_number(value[0])}, {_number(value[1])}]"
     if not np.isfinite(value):

@@ -114,14 +114,14 @@ def check_model(
     inputs: Mapping[str, float] | None = None,
     seed: int = 0,
 ) -> CheckReport:
-    """Check a model's forms by random evaluations, at the scale where they will be used.
+    """Check the forms of a model by random evaluations at typical values.
 
-    Linearity in q and in the test function v, transpose and adjoint (A(u)* r, xi)_Q = <A(u) xi, r>,
-    derivatives by Taylor tests (the remainder f(u + s du) - f(u) - s f'(u) du falls like s^2, or
-    vanishes for affine forms), the assembled matrices against plain quadrature of the integrand,
-    and the mass. If mass and diffusion grow with x[0] as the volume around an axis or a point, the
-    state has to state it (`Field.weight`). Where components have no mass term, their equations must
-    determine them. Print the report, or call `raise_if_failed`, which raises `ModelError`.
+    Tested are linearity in q and in the test function v; transpose and adjoint, (A(u)* r, xi)_Q =
+    <A(u) xi, r>; derivatives, by Taylor remainders f(u + s du) - f(u) - s f'(u) du, which decrease
+    as s^2 or vanish for affine forms; assembled matrices against quadrature of the integrand; and
+    the mass. If mass and diffusion increase with x[0] like the volume around an axis or a point,
+    `Field.weight` must specify this. Components without a mass term must be determined by their
+    equations. Print the report, or call `raise_if_failed`, which raises `ModelError`.
 
     Parameters
     ----------
@@ -130,9 +130,9 @@ def check_model(
         of the model, or zero): numbers, functions of x, or coefficients.
     spread
         Size of the random variations of u; default a tenth of the largest |u| of each component.
-        For a component that is zero, a tenth of the largest of all, or 1 if u = 0.
+        For a component that is zero, a tenth of the largest |u| of all, or 1 if u = 0.
     t, inputs
-        Time and input channels; channels that are not given are 1.
+        Time, and channel -> value; the default value of a channel is 1.
     seed
         Seed of the random vectors.
 
@@ -398,7 +398,7 @@ def _taylor(
     """Return the rate of the Taylor remainder, or its size if it is at rounding level.
 
     `parts`: names and coefficients of the parts of the value, and of the argument. Each pair is
-    tested, because an error in a small one would vanish in rounding errors of the others.
+    tested, because rounding errors of the other parts would hide an error in a small part.
     """
     remedy = (
         f"{given}= does not match {given[1]}: correct it, or leave it out and let a complex "
@@ -429,7 +429,7 @@ def _taylor(
 
 
 def _rate(name: str, remainders: Array, size: float, remedy: str) -> Check:
-    """Return the check of Taylor remainders for the steps 1 and `STEPS`, of values of a size."""
+    """Return the check of Taylor remainders for steps 1 and `STEPS`; `size`: of the values."""
     if remainders[0] <= FLOOR * size:
         value = relative_to(float(remainders[0]), size)
         return Check.at_most(f"{name}: affine, remainder", value, FLOOR, remedy)
@@ -458,10 +458,10 @@ def _mass(model: Model) -> list[Check]:
 
 
 def _volume_element(model: Model) -> list[Check]:
-    """Return a check that terms do not contain the volume element, which no field states then.
+    """Check that the terms contain no volume element, which `Field.weight` should specify.
 
-    In each cell, mass and diffusion are proportional to the distance from an axis, or to its
-    square: a material that is so in both, cell by cell, is a cross-section, and as well a volume.
+    The check fails if both mass and diffusion are proportional to x[0], or to its square, in each
+    cell: a factor common to both is a cross-section or volume rather than a property of a material.
     """
     measure = model.form_M.terms[0].measure
     x = measure.points[0]
@@ -483,7 +483,7 @@ def _volume_element(model: Model) -> list[Check]:
 
 
 def _own_factors(model: Model) -> list[Array]:
-    """Return the factors of each component in its mass, and of its gradient in its diffusion."""
+    """Return the mass factor of each component, and the diffusion factors of its gradient."""
     q = model.parameter_space.prior
     return [
         model.form_M.factor(k, k, 0.0)
@@ -495,7 +495,7 @@ def _own_factors(model: Model) -> list[Array]:
 
 
 def _is_constant(factor: Array) -> bool:
-    """Whether a factor is constant in each cell, and not zero in all; shape (cells, points)."""
+    """Return whether a factor, (cells, points), is constant in each cell and not zero in all."""
     same = np.ptp(factor, axis=1) <= LINEARITY * np.abs(factor).max(axis=1)
     return bool(same.all() and factor.any())
 

@@ -40,11 +40,11 @@ class InformationGain:
         Remaining share of the prior standard deviation; for a field the root mean square over its
         modes.
     modes
-        For a field the numbers of pinned and of flat combinations of its modes, and of modes.
+        For a field: numbers of pinned and of flat combinations of its modes, and of all modes.
     bound
-        The bound at which a number lies, NaN for none.
+        Bound at which the number lies; NaN if it lies at none.
     moves
-        True if it has an evolution: its uncertainty then grows again.
+        True if the unknown has an evolution, so that its uncertainty may increase again.
     """
 
     name: str
@@ -144,7 +144,7 @@ def identifiability(identifier: Identifier) -> Identifiability:
 
 
 def information_gains(model: Model, belief: Belief) -> Identifiability:
-    """Compare a belief in latent coefficients with its prior, as `identifiability` does."""
+    """Compare a belief in latent coefficients with its prior; see `identifiability`."""
     prior, posterior = belief.prior_factor, belief.q_factor
     if prior is None or posterior is None:
         raise ConfigurationError(
@@ -185,7 +185,7 @@ def information_gains(model: Model, belief: Belief) -> Identifiability:
 
 
 def _bound(model: Model, belief: Belief, label: str) -> float:
-    """Return the bound at which a number lies; NaN for none."""
+    """Return the bound at which a number lies; NaN if it lies at none."""
     k = model.parameter_space.labels[label]
     value = model.latent.value(belief.q)[k]
     ends = [end[k] for end in model.latent.limits if end[k] == value]

@@ -304,7 +304,7 @@ def _count(name: str, count: Callable[[], int], remedy: str) -> Check:
     """Return a line that holds if the count is zero; an exception of the law fails it."""
     try:
         return Check.at_most(name, count(), 0, remedy)
-    except Exception as error:  # noqa: BLE001  the report says it, and goes on to the next line
+    except Exception as error:  # noqa: BLE001  reported as a failed line
         return Check.at_most(name, np.inf, 0, f"{type(error).__name__}: {error} ({remedy})")
 
 
@@ -347,7 +347,7 @@ def _restarted(
 def _without(
     items: list[Sample], at: int, names: tuple[str, ...], gone: tuple[str, ...]
 ) -> list[Sample]:
-    """Return the samples with the first or all of the sensors missing in two of them."""
+    """Return the samples without the readings of sensors `gone` in samples `at` and `at` + 1."""
     changed = list(items)
     for k in (at, at + 1):
         z = items[k].z
@@ -362,7 +362,7 @@ def _without(
 
 @dataclass(frozen=True)
 class _Wrapped(Law[Any, Any]):
-    """Law that delegates to another one; subclasses add the instrumentation."""
+    """Law that delegates to another law; subclasses add the instrumentation."""
 
     law: AnyLaw
 
@@ -467,6 +467,6 @@ def _failing(
     provoked = len(fragile.calls) > 2
     fragile.calls.clear()
     after = _step(identifier, items[middle + 1])
-    if not provoked:  # a law that does not step by problem.control: nothing to see
+    if not provoked:  # a law that does not step by problem.control cannot be tested
         return _unusable(after)
     return int(failed.status.ok) + _differing([before], [failed]) + _unusable(after)

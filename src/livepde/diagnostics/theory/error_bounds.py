@@ -485,7 +485,7 @@ class OnlineStopping:
         return float(c.c_M / (2.0 * c.C_M) * VX / (X * d.V))
 
     def add(self, state: StoppingState, t: float, r_alpha: Norms, d: Norms) -> StoppingState:
-        """Take one sample's residual and noise size; return the new state."""
+        """Add the residual and the noise size of a sample and return the new state."""
         margin = self.margin(r_alpha, d)
         T = t if margin < 1.0 and not np.isfinite(state.T) else state.T
         return replace(state, t=t, T=T, margin=margin)

@@ -140,7 +140,7 @@ class Excitation:
         inputs: Mapping[str, float] | None = None,
         q: Array | None = None,
     ) -> ExcitationState:
-        """Take the state estimate w at a time; return the new state.
+        """Add the state estimate w at time t and return the new state.
 
         `w`: u_alpha + P u, or u where both are close, shape (n,). `inputs`: input
         channels at t. `q`: estimate of the parameter, shape (m,), default the prior mean: the

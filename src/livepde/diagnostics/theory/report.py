@@ -108,8 +108,8 @@ class OnlineTracker:
     window
         gamma_0 of the excitation Gramian and the link conditions.
     noise
-        Standard deviation of the sensors: one number, one each, or a function of z that returns
-        them; default that of the observation.
+        Standard deviation of the sensors: one number, one for each, or a function of z that returns
+        them; default from the observation.
     """
 
     def __init__(self, identifier: Identifier, window: float, noise: Any = None) -> None:
@@ -257,14 +257,14 @@ def theory_report(
     window
         gamma_0; default a twentieth of the run.
     noise
-        Standard deviation of the sensors, for the surrogate of T*; default that of the observation.
+        Standard deviation of the sensors, for the surrogate of T*; default from the observation.
     twin
         Twin with the truth, if available; its samples are then used.
 
     Raises
     ------
     ConfigurationError
-        The stream holds fewer than two samples, or the gain is not constant.
+        The stream contains fewer than two samples, or the gain is not constant.
     """
     items = [sample_of(item) for item in samples]
     _check(identifier, items)
