@@ -66,7 +66,7 @@ class Goal:
     def __post_init__(self) -> None:
         for what, valid, expected in (
             ("track", lambda weight: _finite(weight) and weight >= 0.0, "a positive number"),
-            # R of the Riccati equation is made of these and must be regular.
+            # These weights are the diagonal of R in the Riccati equation, which must be regular.
             ("move", lambda weight: _finite(weight) and weight >= 1e-300, "a positive number"),
             ("inputs", _range, "(least, largest) with least < largest"),
             ("limits", _range, "(least, largest) with least < largest"),
@@ -91,7 +91,7 @@ class Goal:
         return 100.0 * (sum(self.track.values()) or 1.0) if self.penalty is None else self.penalty
 
     def check(self, model: ReducedModel) -> None:
-        """Raise `ConfigurationError` if it names quantities that the model does not have."""
+        """Raise `ConfigurationError` if the goal does not fit a reduced model."""
         for what, names, known in (
             ("track", self.track, model.outputs.names),
             ("limits", self.limits, model.outputs.names),
@@ -314,7 +314,7 @@ class LQ:
         try:
             x, v = self.target(step, plan.reference[0], plan.disturbances[0])
             m, kept = len(known.q), np.isfinite(memory).all()
-            if known.model is not None:  # another one at each sample: its gain is not kept
+            if known.model is not None:  # it differs at each sample: the gain is not cached
                 gain = self.gain(step)
             elif kept and np.array_equal(memory[:m], known.q):
                 gain = memory[m:].reshape(len(before), -1)
@@ -370,10 +370,10 @@ class LQ:
         pair = one + along @ np.linalg.lstsq(root[:, None] * (C @ along), missed, rcond=None)[0]
         v = np.clip(pair[r:], low, high)
         if not np.array_equal(v, pair[r:]):
-            if len(v) > 1:  # where one of them is at its end, the others may do its work
+            if len(v) > 1:  # if one control is at its bound, the others may compensate for it
                 from scipy.optimize import lsq_linear
 
-                move = along @ np.linalg.pinv(along[r:])  # of the pair, with v
+                move = along @ np.linalg.pinv(along[r:])  # derivative of (x, v) in v
                 effect = root[:, None] * (C @ move)
                 rest = missed + effect @ one[r:]
                 v = np.clip(lsq_linear(effect, rest, (low, high), method="bvls").x, low, high)
@@ -427,7 +427,7 @@ class MPC:
                 "MPC: kappa must be a number, at least 0, and directions at least 1; got "
                 f"{self.kappa} and {self.directions}."
             )
-        self.problem  # noqa: B018  a package that is missing is told now
+        self.problem  # noqa: B018  raises an error now if a package is missing
 
     @property
     def scenarios(self) -> int:

@@ -100,7 +100,7 @@ class Kalman:
         return self._q
 
     def set(self, q: Mapping[str, float] | None) -> None:
-        """Change the unknown numbers; those that are not named are set to the prior."""
+        """Change the unknown numbers; numbers without a value are set to the prior."""
         self._q = self.model.given(q)
         self._usual = self._over(self.period)
 
@@ -125,7 +125,7 @@ class Kalman:
         Early and late samples are predicted over their actual interval.
 
         Raises `SampleError`: wrong shape, text, infinity, a date, or a sensor that does not exist.
-        Raises `TimeOrderError`: t is not later than the sample before.
+        Raises `TimeOrderError`: t is not later than the previous sample.
         """
         t = number(t, "time t")
         if not math.isfinite(t):
@@ -190,18 +190,18 @@ class Kalman:
 class Trust:
     """Conditions for using an estimate in control; otherwise the nominal model is used.
 
-    *The rule*: while any of these tests fails, and until `patience` samples in a row have passed
-    them, the controller gets state and unknown numbers from the nominal model, which has the
-    unknown numbers at the prior and a filter of its own, exactly as without learning.
+    *The rule*: while any of these tests fails, and until `patience` consecutive samples have passed
+    them, the controller uses state and unknown numbers of the nominal model, with the unknown
+    numbers at the prior and its own filter, exactly as without learning.
 
-    - The step of the identifier was taken (status ok).
+    - The step of the identifier succeeded (status ok).
     - The model explains the data: the mean square of the normalised innovations is at most
       `misfit`.
     - Each unknown number is well determined: its standard deviation is at most `spread` times its
       value or, if it may be negative, times the prior standard deviation where that is larger.
-    - Each lies inside of its bounds, not at one.
-    - It was tested at all: by these innovations, or by the verdict of the run. A law that makes no
-      tests gives no estimate to control by.
+    - Each unknown number lies inside its bounds, not at a bound.
+    - The estimate was tested, by these innovations or by the verdict of the run. Estimates of a law
+      without tests are not used.
 
     Parameters
     ----------
@@ -272,7 +272,7 @@ class Estimator(Protocol):
 
 
 class Learned:
-    """An identifier with a nominal model in parallel, as a fallback for the controller.
+    """Identifier with a nominal model in parallel, as a fallback for the controller.
 
     Parameters
     ----------
@@ -321,7 +321,7 @@ class Learned:
     def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
         identifier, model = self.identifier, self.nominal.model
         self.estimate = estimate = identifier.step(t, z, inputs)  # a bad sample changes nothing
-        # The nominal filter has the assimilated sensors alone.
+        # The nominal filter uses only the assimilated sensors.
         seen, noise, *_ = identifier._channels.parse(z, inputs)
         pairs = seen if noise is None else np.column_stack([seen, noise])
         # The nominal filter runs at every sample, trusted or not, so that a fallback starts from a

@@ -20,7 +20,7 @@ from livepde.linalg import Array
 from livepde.samples import labelled, number, numbers
 
 Future: TypeAlias = Mapping[str, ArrayLike]
-"""Name -> a number that holds, or one for each coming period."""
+"""Name -> one number, or a number for each coming period."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -131,16 +131,16 @@ class Loop:
         forecast: Future | None = None,
         limits: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
     ) -> Action:
-        """Process a sample and return the inputs to apply until the next one.
+        """Process a sample and return the inputs to apply until the next sample.
 
         Parameters
         ----------
         t, z
-            As for `Identifier.step`: measurements of the sensors; by name with inputs among them.
+            As for `Identifier.step`; a mapping of measurements may also contain inputs.
         inputs
-            Measured disturbances, and actually applied controls if they differ from the requested
-            ones. NaN means missing: a disturbance holds its last value, a control the requested
-            one.
+            Measured disturbances, and applied controls if they differ from the requested values.
+            NaN means missing: a disturbance holds its last value, a control has the requested
+            value.
         reference
             Mapping from tracked output to a number, or to values at the end of each coming period.
         forecast
@@ -170,7 +170,7 @@ class Loop:
         # All arguments are validated before the estimator is stepped, so that an invalid sample
         # changes nothing.
         known = self.estimator.step(t, z, channels)
-        self._before, self._disturbances = applied, now  # should the controller raise
+        self._before, self._disturbances = applied, now  # also if the controller raises an error
         decision = self._possible(controller.decide(known, plan, applied, self._memory), applied)
         self._before, self._memory = decision.inputs, decision.memory
         y = model.outputs(known.x, model.values(channels))
@@ -185,11 +185,11 @@ class Loop:
         )
 
     def _separated(self, z: Any, inputs: Mapping[str, float]) -> tuple[Any, dict[str, float]]:
-        """Return the measurements, and the inputs, which a sample with names may contain."""
+        """Separate measurements from inputs, which a mapping `z` may contain."""
         model = self.controller.model
         if isinstance(z, Mapping):
             inputs = {name: z[name] for name in model.channels if name in z} | dict(inputs)
-            # A channel may be measured by a sensor of the same name: it is both then.
+            # A channel that a sensor of the same name measures is both.
             z = {k: v for k, v in z.items() if k not in model.channels or k in model.sensors.names}
         given = {name: number(v, f"input '{name}'") for name, v in inputs.items()}
         for name in given:
@@ -261,7 +261,7 @@ class Loop:
         checkpoint.write(path, checkpoint.packed({"kind": "loop"}, leaves))
 
     def load(self, path: str | os.PathLike[str]) -> None:
-        """Restore a saved state; the loop must be built as the saved one was.
+        """Restore a saved state; the loop must be built with the same arguments.
 
         Raises `RunError`: the file is damaged or of another loop.
         """

@@ -89,7 +89,7 @@ def _modes(K: sp.csc_array, M: sp.csc_array, count: int, shift: float) -> Array:
     """Return the slowest eigenmodes; real and imaginary parts for a nonsymmetric K."""
     n = K.shape[0]
     start, count = np.ones(n), min(count, n - 2)
-    if count < 1:  # the static responses are all there is
+    if count < 1:  # the basis consists of static responses only
         return np.zeros((n, 0))
     if abs(K - K.T).max() <= SYMMETRIC * abs(K).max():
         return np.asarray(eigsh(K, count, M, sigma=-shift, v0=start)[1])
@@ -105,7 +105,7 @@ def _orthonormal(columns: Array, M: sp.csc_array) -> Array:
     weights, axes = np.linalg.eigh(columns.T @ (M @ columns))
     kept = weights > KEPT**2 * weights.max()
     found = columns @ (axes[:, kept][:, ::-1] / np.sqrt(weights[kept][::-1]))
-    root = np.linalg.cholesky(found.T @ (M @ found))  # once more: squares have lost digits
+    root = np.linalg.cholesky(found.T @ (M @ found))  # again: the Gram matrix has lost digits
     return np.asarray(np.linalg.solve(root, found.T).T)
 
 
@@ -118,8 +118,8 @@ class GalerkinReduction:
     outputs: Observed
     sensors: Observed
     V: Array  # basis, shape (n, r)
-    test: Array  # V^T M, shape (r, n); of a basis that is not orthonormal its dual in M
-    # u, q, inputs: linearisation point: state, parameter, and value of each channel
+    test: Array  # V^T M, shape (r, n); the dual basis in M if V is not orthonormal
+    # u, q, inputs: state, parameter and channel -> value of the linearisation point
     u: Array
     q: Array
     inputs: Mapping[str, float]
@@ -134,7 +134,7 @@ class GalerkinReduction:
         q: Any,
         inputs: Mapping[str, float] | None,
     ) -> GalerkinReduction:
-        """Return the data at a linearisation point, with a basis that is still empty."""
+        """Return the data at a linearisation point, with an empty basis."""
         given = dict.fromkeys(model.channels, 0.0) | dict(inputs or {})
         physical = model.latent.value(model.initial_parameter(q))
         start = model.initial(0.0 if u is None else u, Moment(0.0, Inputs(given)))
@@ -151,8 +151,8 @@ class GalerkinReduction:
     def with_basis(self, modes: int, rates: Sequence[float]) -> GalerkinReduction:
         """Return the reduction on an M-orthonormal basis, zero on fixed coefficients.
 
-        It has the static responses at each of `extremes`, those to exponential inputs exp(rate t),
-        and the slowest eigenmodes at the linearisation point.
+        It contains the static responses and the responses to inputs exp(rate t) at each of
+        `extremes`, and the slowest eigenmodes at the linearisation point.
         """
         mass, free = self.model.mass, np.flatnonzero(self.model.X.free)
         M = sp.csc_array(mass[free][:, free])
@@ -244,7 +244,7 @@ class GalerkinReduction:
         return u
 
     def extremes(self) -> list[Array]:
-        """Return the reference parameter, and those with one number at an end of its interval."""
+        """Return the reference parameter, and for each number its two ends of an interval."""
         found, space = [self.q], self.model.parameter_space
         for label, k in space.labels.items():
             unknown = space.unknown_of(label)

@@ -26,7 +26,7 @@ class ReducedModel:
     """Reduced model x' = -K(q) x + E(q) c + f(q), affine in the unknown numbers q.
 
     The coordinates x = V^T M u refer to a basis V that is orthonormal in the mass M. They include
-    boundary values, so that no time derivative of a boundary channel occurs. Made by `reduce`.
+    boundary values, so that no time derivative of a boundary channel occurs. See `reduce`.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class ReducedModel:
     lower, upper
         Bounds of the unknown numbers, shapes (m,).
     frame
-        Galerkin reduction from which it was made.
+        Galerkin reduction of the full model.
     """
 
     unknowns: tuple[str, ...]
@@ -209,19 +209,19 @@ class ReducedModel:
     ) -> ReducedModel:
         """Return the model on the same basis, linearised at another point.
 
-        For models that are not affine in u, or have unknown fields. A loop does this automatically.
+        Models with unknown fields or not affine in u require it. A loop does this automatically.
 
         Parameters
         ----------
         u, q
-            Coefficients of state and parameter, shapes (n,) and (m,); default as before.
+            Coefficients of state and parameter, shapes (n,) and (m,); default the present ones.
         inputs
-            Channel -> value; the others as before.
+            Channel -> value; other channels keep their present value.
 
         Raises
         ------
         ConfigurationError
-            Another shape, or a channel that the model does not have.
+            Wrong shape, or a channel that the model does not have.
         """
         frame = self.frame
         for what, given, mine in (("u", u, frame.u), ("q", q, frame.q)):
