@@ -43,8 +43,8 @@ class Spaces:
     M_op, N_op
         Integrands (u, v, x) of M and N, (MN1) and (MN2), as in the law.
     VX, V
-        Integrands of other squared norms for both parts; default those of M and N themselves, for
-        which c_M = C_M = c_N = C_N = 1.
+        Integrands of other squared norms for both parts. The default norms are defined by M and N,
+        so that c_M = C_M = c_N = C_N = 1.
 
     Examples
     --------

@@ -88,12 +88,12 @@ class TwinTracker:
     Parameters
     ----------
     spaces
-        Spaces that define the norms; `Spaces.of(model, observed, law)` for those of the law's
-        operators.
+        Spaces that define the norms; `Spaces.of(model, observed, law)` uses the operators of the
+        law.
     gain, damping
-        Those of the law: ||e||_Q^2 is divided by the gain, and the rule gives theta.
+        Gain and damping rule of the law: ||e||_Q^2 is divided by the gain; the rule returns theta.
     reconstruct
-        Function z -> u_alpha as used by the law; default that of the observation.
+        Function z -> u_alpha as used by the law; default `reconstruct` of the observation.
 
     Raises
     ------
@@ -207,26 +207,26 @@ def conditions(
 ) -> CheckReport:
     """Report the share of samples at which the paper's conditions on mu, nu and d hold.
 
-    These are the conditions of the propositions on the errors (`bounds`). That q converges needs
-    more: persistence of excitation (asspof, `Excitation`) and the link conditions (cond:link,
-    `link`). Those fail for every data error d that does not vanish: theta tends to zero with
-    r_alpha, ||p||_V^ + ||d||_V~ does not.
+    These are the conditions of the propositions on the errors (`bounds`). Convergence of q also
+    requires persistence of excitation (asspof, `Excitation`) and the link conditions (cond:link,
+    `link`). The link conditions fail for every data error d that does not vanish: theta tends to
+    zero with r_alpha, ||p||_V^ + ||d||_V~ does not.
 
     With data on a subdomain all conditions assume a p without flux D grad p through the boundary of
-    omega, as in the paper's V^. A continuous discrete u has such a flux: it acts on r at the nodes
-    there, in addition to nu times that of u, and a mu that just satisfies the conditions need not
-    suffice.
+    omega, as in the paper's V^. A continuous discrete u has such a flux. It acts on r at the nodes
+    of that boundary, in addition to nu times the flux of u, so that a mu that barely satisfies the
+    conditions may be insufficient.
 
     Parameters
     ----------
     data
-        Which section: "exact" (cond:mu_1, cond:mu02, cond:nu), "noisy" (ass:mu_nu, ass:mu_noisy,
-        (cond_d)) or "smoothed" (ass:mu_nu_smooth, cond:mu_smooth_2).
+        Section of the paper: "exact" (cond:mu_1, cond:mu02, cond:nu), "noisy" (ass:mu_nu,
+        ass:mu_noisy, (cond_d)) or "smoothed" (ass:mu_nu_smooth, cond:mu_smooth_2).
     c1
         Constant of the stronger bound on mu for the convergence of the state.
     floor
-        Floor of the damping rule: where ||r_alpha||_X is below this share of ||u_alpha||_X it
-        counts as zero, and a bound on mu as satisfied (mu r/||r|| is any vector up to mu there).
+        Floor of the damping rule. If ||r_alpha||_X is below this share of ||u_alpha||_X, it counts
+        as zero and the bounds on mu as satisfied (mu r/||r|| is then any vector up to mu).
     """
     n = len(errors)
     if not n:
@@ -294,7 +294,7 @@ def bounds(
     """Evaluate the error bounds of one of the paper's propositions along a run.
 
     "exact": prop:welldefine; "noisy": well_defined_noisy, up to T*; "smoothed":
-    prop:wellposed_noisesmooth, where r_alpha stands for r.
+    prop:wellposed_noisesmooth, with r_alpha instead of r.
 
     1. ||e||_Q^2 + ||r||_X^2 <= its value at the start (sigma > 0: or ||q*||_Q^2 if that is larger).
     2. ||p||_X^2 <= max{||p(0)||_X^2, 2 b} with b = C_N^2 C^4/c_N^2 sup ||P u*||_V^^2
@@ -308,7 +308,7 @@ def bounds(
     sigma > 0; `until` is T*, for noisy data. The report has one line for each bound; their
     hypotheses are checked by `conditions`.
     """
-    # For noisy data the bounds hold before T*; they are made of the errors at the first sample.
+    # For noisy data the bounds hold before T*; they depend on the errors at the first sample.
     kept = [item for item in errors if item.t < until or item is errors[0]]
     if not kept:
         raise ConfigurationError("bounds: the tracker has not seen any estimate.")
@@ -342,7 +342,7 @@ def bounds(
 
 
 def _unobserved(kept: Sequence[Errors], c: Constants, nu: float, limit: float) -> Iterator[Check]:
-    """Iterate over the bound of the unobserved error, if there is one; `limit`: of the others."""
+    """Yield the check of the bound on p, if nu > 0; `limit`: bound on ||e||_Q^2 + ||r||_X^2."""
     largest = float(_values(kept, attrgetter("p.X")).max()) ** 2
     if nu > 0:
         C = c.hidden_VX_X

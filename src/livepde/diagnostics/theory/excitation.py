@@ -214,7 +214,7 @@ class Excitation:
         return Spectrum(np.sqrt(np.maximum(values[order], 0.0)), modes, windows)
 
 
-# Growth of the constant from the first to the second half of a run that counts as none.
+# Largest growth of the constant from the first to the second half of a run that is ignored.
 STEADY = 1.5
 
 

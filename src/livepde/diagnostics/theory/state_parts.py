@@ -115,11 +115,11 @@ class Part:
 
     On a subdomain the functional M v has a second part: the flux D grad v through the boundary of
     omega, which is not represented by a function of X. An element of the paper's V~ has no flux.
-    Therefore the constants are those of the discrete V~, where M v is tested with all functions of
-    the part: the norm of a function with flux grows there with mesh refinement. The norm of a given
-    v, as of an error r or p, whose flux need not vanish, is that of the smoothest function that
-    agrees with M v on all tests within the part. The law's own norm (`stage_norms`) is that of the
-    least such function, which vanishes at the boundary of omega; both tend to the same.
+    Therefore the constants refer to the discrete V~, where M v is tested with all functions of the
+    part, and the norm of a function with flux increases with mesh refinement. The flux of a given
+    v, such as an error r or p, may be nonzero: its norm is the norm of the smoothest function that
+    agrees with M v on all tests within the part. The law (`stage_norms`) uses the function of least
+    norm instead, which vanishes at the boundary of omega. Both norms have the same limit.
 
     Parameters
     ----------
@@ -296,8 +296,8 @@ class Part:
         """Upper bound of ||v||_V ||v||_X / ||v||_VX^2, which is 1/c_int of (interpol).
 
         By Kantorovich's inequality: with M x = lambda S x on this part the quotient is at most
-        (a + b)/(2 sqrt(a b)) for the extreme lambdas a and b; the norm of X exceeds that of S by at
-        most the factor of the mass that couples the two parts.
+        (a + b)/(2 sqrt(a b)) for the extreme lambdas a and b. The ratio of the norms of X and S is
+        at most the factor of the mass that couples the two parts.
         """
         if not self.size:
             return 1.0
