@@ -175,7 +175,7 @@ class Estimate(Shown):
         """Label of each scalar unknown -> (value, standard deviation; NaN without covariance).
 
         Mean and standard deviation for a `Normal`. Under a transform, the median and the standard
-        deviation to first order; `estimate[label]` also has the exact mean and standard deviation.
+        deviation to first order; `estimate[label]` also has the mean and its standard deviation.
         """
         std = self.q_std
         return {

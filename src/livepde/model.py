@@ -433,7 +433,7 @@ class Model(Shown):
 
     @cached_property
     def order(self) -> int:
-        """Quadrature order: that of the fields, or exact for A(u) q with polynomial factors."""
+        """Quadrature order: stated by the fields, or exact for A(u) q with polynomial factors."""
         states = [block.field for block in self.state_space.fields.values()]
         if given := [field.quadrature for field in states if field.quadrature is not None]:
             return max(given)

@@ -32,7 +32,7 @@ class TakenSamples:
     t: float
     z: Array
     inputs: Inputs
-    known: Inputs  # last known inputs, which include held inputs of later failed steps
+    known: Inputs  # last known inputs; inputs with "hold" also from samples of failed steps
     samples: int  # number of samples, including failed steps
     origin: float  # seconds from 1970 to t = 0 if times are dates; NaN if they are numbers
     validation: ValidationLedger

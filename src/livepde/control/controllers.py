@@ -133,8 +133,8 @@ class Known:
         acts on the state equation.
     model
         Reduced model relinearised at the estimate, for unknown fields and models that are not
-        affine in u. None: the model of the controller. Its basis is that of the controller's model;
-        a controller uses its own outputs.
+        affine in u, on the basis of the controller's model; the outputs of the controller are used.
+        None: the model of the controller.
     source, why
         "estimate", or "fallback" with the reason why the estimate is not trusted.
     """

@@ -19,7 +19,7 @@ from livepde.identifier import Identifier
 from livepde.linalg import Array
 from livepde.samples import Channels, number
 
-# Standard deviation of the isotropic process noise, relative to that of the channels.
+# Standard deviation of the isotropic process noise, relative to the noise of the channels.
 FLOOR = 1e-6
 # Relative difference of two sampling intervals that is attributed to rounding.
 SAME = 1e-6

@@ -148,7 +148,7 @@ class Loop:
             present value.
         limits
             Mapping from output to (least, largest), each a number or values at the end of each
-            coming period; default those of the goal.
+            coming period; default the limits of the goal.
 
         Raises
         ------

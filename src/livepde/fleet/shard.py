@@ -475,7 +475,7 @@ class JoinedStates:
         return checkpoint.rebuild(self._template, {**found, LOG: log})
 
     def put(self, which: IntArray, state: State) -> None:
-        """Store the states of members after a step from the states of the last `take`."""
+        """Store the states of members after a start, or a step from the states of `take`."""
         leaves = checkpoint.flatten(state)
         log = leaves.pop(LOG)
         rows = log.shape[1]

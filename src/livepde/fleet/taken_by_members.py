@@ -22,7 +22,7 @@ class TakenByMembers:
     t: Array  # time of the last accepted sample, shape (members,)
     z: Array  # readings of this sample, (members, sensors), and inputs, (members, channels)
     inputs: Array
-    known: Array  # last known inputs, which include held inputs of later failed steps
+    known: Array  # last known inputs; inputs with "hold" also from samples of failed steps
     held: Array  # time for which each input has been held so far, (members, channels)
     # Counts for verdicts, as in `InputLedger` and `StepLedger`.
     held_counts: IntArray

@@ -244,8 +244,8 @@ class ReducedModel:
     ) -> dict[str, float]:
         """Return the relative model reduction error of each output, the largest over all times.
 
-        The error is that of the response to a unit step of each control in turn, relative to the
-        largest response of that output to any control.
+        It is the error of the response to a unit step of each control in turn, relative to the
+        largest response of the output to any control.
 
         Parameters
         ----------

@@ -342,7 +342,7 @@ def bounds(
 
 
 def _unobserved(kept: Sequence[Errors], c: Constants, nu: float, limit: float) -> Iterator[Check]:
-    """Yield the check of the bound on p, if nu > 0; `limit`: bound on ||e||_Q^2 + ||r||_X^2."""
+    """Yield the check of ||p||_X^2, if nu > 0 or p = 0; `limit`: bound on ||e||_Q^2 + ||r||_X^2."""
     largest = float(_values(kept, attrgetter("p.X")).max()) ** 2
     if nu > 0:
         C = c.hidden_VX_X
