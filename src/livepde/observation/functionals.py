@@ -162,8 +162,8 @@ class FluxPlates(Observation):
     Raises
     ------
     ObservationError
-        There is no sensor. On binding: the mesh is not an interval, a position is outside the mesh,
-        or the model lacks the unknown D.
+        There is no sensor. On binding: the mesh is not an interval, a position is outside the mesh
+        or at its right end, or the model lacks the unknown D.
 
     Examples
     --------
@@ -234,6 +234,11 @@ class FluxPlatesObserved(Observed):
         if not low <= place <= high:
             raise ObservationError(
                 f"FluxPlates: '{name}' is at {place:g}, outside the mesh from {low:g} to {high:g}."
+            )
+        if place == high and not isinstance(at, str):
+            raise ObservationError(
+                f"FluxPlates: '{name}' is at {place:g}, the end of the mesh; give the name of "
+                "this end, where a flux into the domain is positive."
             )
         k = int(np.clip(np.searchsorted(middles, place) - 1, 0, len(middles) - 2))
         share = (place - middles[k]) / (middles[k + 1] - middles[k])
