@@ -16,7 +16,7 @@ import livepde as lp
 from livepde import cases
 from livepde.cases.proposals import proposed
 from livepde.cases.read import parse
-from livepde.cases.remedies import freed, with_settings
+from livepde.cases.remedies import freed, held, with_settings
 from livepde.cases.variants import Variant, VariantRun
 from livepde.errors import (
     CaseError,
@@ -274,6 +274,20 @@ def test_a_late_sensor_may_be_a_slow_one(tmp_path):
     assert freed(found, Cause("response", "near", "", size=60.0)) == ()
     plain = replace(base, verdict=Verdict.of([]).to_dict())
     assert "no time constants" in [one.name for one in proposed(found, plain)]
+
+
+def test_an_input_that_seems_early_by_half_an_interval_may_switch(tmp_path):
+    """A switch on lines between its rows was named a wrong clock, and only that was compared."""
+    prepared = cases.load(case_file(tmp_path)).prepare()
+    name, half = next(iter(prepared.case.roles("boundary"))), 0.5 * np.diff(prepared.raw.t)[0]
+    early = Cause("lag", name, "it is early", setting=f'channels.{name}.late="-9 s"', size=-half)
+    verdict = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=(early,))])
+    verdict = with_settings(prepared, verdict)
+    setting = f'channels.{name}.between="hold"'
+    assert f"set `{setting}`" in verdict.findings[0].causes[0].remedy
+    base = VariantRun(Variant("as stated"), verdict=verdict.to_dict(), log_evidence=1.0)
+    assert proposed(prepared, base)[0].settings == (setting,)
+    assert held(prepared, replace(early, size=-1.8 * half)) == ""
 
 
 def test_the_evidence_of_readings_that_a_late_variant_lacks_is_no_loss():

@@ -16,6 +16,7 @@ from livepde.cases.read import parse, settings_in, toml_key, toml_value
 from livepde.cases.remedies import (
     first_miss,
     freed,
+    held,
     later_start,
     switching,
     usual_shift,
@@ -71,6 +72,9 @@ def _candidates(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     for name in switching(case, prepared.raw) if isinstance(prepared.raw, DataTable) else ():
         # Lines between the rows of a switch look like many other errors, too.
         yield Variant(f"{name} held", (channel_setting(name, "between", '"hold"'),))
+    for cause in base.causes:
+        if setting := held(prepared, cause):
+            yield Variant(f"{cause.subject} held", (setting,))
     if later := later_start(prepared):
         yield Variant("later start", (later,))
     for cause in base.causes:

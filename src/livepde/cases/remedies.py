@@ -44,7 +44,7 @@ def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
 
     def named(cause: Cause) -> Cause:
         settings = freed(prepared, cause)
-        cause = _with_remedy(prepared.case, cause, settings)
+        cause = _with_remedy(prepared, cause, settings)
         if settings:
             return replace(cause, setting="; ".join(settings))
         plain = cause.remedy.removesuffix(NO_SETTING).strip()
@@ -133,16 +133,19 @@ def start_missed(prepared: Prepared, verdict: Verdict) -> list[Finding]:
     return [Finding("start", severity, text, "", missed, remedy=remedy)]
 
 
-def _with_remedy(case: Case, cause: Cause, settings: tuple[str, ...]) -> Cause:
+def _with_remedy(prepared: Prepared, cause: Cause, settings: tuple[str, ...]) -> Cause:
     """Return a cause whose remedy has the setting, for an error of a sensor or of the start."""
-    stated = settings_in(cause.setting)
+    case, stated = prepared.case, settings_in(cause.setting)
     if cause.kind == "initial" and settings not in ((), stated):
         return replace(cause, remedy=f"Specify its uncertainty: `{settings[0]}`.")
     if cause.kind == "jump" and _may_jump(case, cause.subject):
         return replace(cause, remedy=JUMPED)
     if cause.kind == "lag" and settings:
         check = LIKELY["lag"].remedy.format(name=cause.subject)
-        return replace(cause, remedy=f"{check} If the clock is wrong, set `{settings[0]}`.")
+        clock = f"If the clock is wrong, set `{settings[0]}`."
+        if hold := held(prepared, cause):
+            clock = f"If it switches between its rows, set `{hold}`. {clock}"
+        return replace(cause, remedy=f"{check} {clock}")
     if cause.kind not in KEYS or cause.subject not in case.roles("sensor"):
         return cause
     table = case.families.get(cause.subject, cause.subject)  # a family has one table
@@ -169,6 +172,21 @@ def switching(case: Case, table: DataTable) -> list[str]:
         and name in table.names
         and switches(table.t, table.values[:, table.names.index(name)], has_states(case.unit(name)))
     ]
+
+
+def held(prepared: Prepared, cause: Cause) -> str:
+    """Return the setting that holds an input between its rows, if the cause looks like it.
+
+    On lines between its rows, a switch seems to act half an interval early.
+    """
+    channel = prepared.case.spec.channels.get(cause.subject)
+    if cause.kind != "lag" or channel is None or not channel.drives or channel.between != "line":
+        return ""
+    if not (isinstance(table := prepared.raw, DataTable) and cause.subject in table.names):
+        return ""
+    known = table.t[np.isfinite(table.values[:, table.names.index(cause.subject)])]
+    early = -cause.size / float(np.median(np.diff(known))) if len(known) > 1 else 0.0
+    return channel_setting(cause.subject, "between", '"hold"') if 0.4 < early < 0.6 else ""
 
 
 def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
