@@ -650,3 +650,38 @@ def test_a_column_with_a_unit_fits_a_model_without_one(tmp_path):
     assert convert("1.44", "", "options.ratio") == 1.44  # as `"?"` is filled in
     with pytest.raises(CaseError, match="'mg/L' cannot be converted to '1'; expected no unit"):
         conversion("mg/L", "", "channels.c.unit")
+
+
+def test_a_moisture_in_percent_is_the_state_of_a_case(here):
+    """The equations of a diffusion were refused as no temperature, and named C without a unit."""
+    rows = "".join(f"{h},{20 - h},{20 - h / 2}\n" for h in range(30))
+    Path("t.csv").write_text(f"time_s,u_1cm (%),u_3cm (%)\n{rows}")
+    settings = ["mesh.from=0", "mesh.to=5 cm", "law.noise=0.2 %", "unknowns.alpha.prior=1e-6 m^2/s"]
+    settings = [f"--set={one}" for one in (*settings, "unknowns.alpha.std=1e-6 m^2/s")]
+    written = CliRunner().invoke(app, ["init", "mine", "--data", "t.csv", *settings])
+    assert written.exit_code == 0, written.output
+    added = {"boundary.left.flux": "1e-3 % m/s", "unknowns.source": {"prior": 0, "std": "1e-3 %/s"}}
+    case = cases.load("mine/case.toml", settings=added)
+    assert case.unit("u_1cm") == case.model.state.unit == "%"
+    assert EQUATIONS["heat"].in_unit("mg/l").fluxes.flux == "(mg/l) m/s"
+    with pytest.raises(CaseError, match=r"expected .* degF. If the state .* `options.unit`"):
+        cases.load("mine/case.toml", settings={"options.unit": "degC"}).prepare()
+
+
+def test_a_power_is_not_read_as_power_per_volume(here):
+    """A column `P(W)` of a source in W/m^3 was used as it was, without a word."""
+    rows = "".join(f"{s},20,{20 + s},5\n" for s in range(30))
+    Path("t.csv").write_text(f"time_s,T_room (C),T_1cm,P(W)\n{rows}")
+    case = Path("case.toml")
+    case.write_text(
+        'equation = "conduction"\noptions.C = 2e6\nmesh = { from = 0, to = 0.02, cells = 10 }\n'
+        'data = { file = "t.csv", time = "time_s" }\nlaw.noise = 0.1\nsources.heat.value = "P"\n'
+        "initial = 20\nunknowns.k = { prior = 1, std = 1 }\n"
+        'boundary.left = { transfer = 5, ambient = "T_room" }\n'
+        '[channels]\nT_room = { role = "input", column = "T_room (C)" }\n'
+        'P = { role = "input", column = "P(W)" }\n'
+        'T = { role = "sensor", column = "T_1cm", at = "1 cm" }\n'
+    )
+    with pytest.raises(CaseError, match=r"channels.P: .* 'W', and the model is in W/m.3: set fact"):
+        cases.load(case).prepare()
+    assert cases.load(case, settings={"channels.P.factor": 2e3}).prepare()

@@ -81,6 +81,10 @@ USUAL = {
 }
 
 
+class UnitError(CaseError):
+    """A unit that is not known, or of another dimension."""
+
+
 @dataclass(frozen=True)
 class SI:
     """Value in SI units = factor * value + offset; base unit -> its power in `exponents`."""
@@ -154,16 +158,16 @@ def _converted(given: str, unit: str, where: str) -> tuple[float, float, float]:
         zero, one, two = (registry.Quantity(k, parsed).to(unit).magnitude for k in (0.0, 1.0, 2.0))
         return zero, one, two
     except pint.UndefinedUnitError as error:
-        raise CaseError(
+        raise UnitError(
             f"{where}: '{error.args[0] if error.args else given}' is not a unit that is known; "
             f"{_expected(unit)}."
         ) from None
     except pint.DimensionalityError:
-        raise CaseError(
+        raise UnitError(
             f"{where}: '{given}' cannot be converted to '{unit or '1'}'; {_expected(unit)}."
         ) from None
     except (pint.PintError, *NOT_A_UNIT):
-        raise CaseError(f"{where}: '{given}' is not a unit; {_expected(unit)}.") from None
+        raise UnitError(f"{where}: '{given}' is not a unit; {_expected(unit)}.") from None
 
 
 def with_powers(unit: str) -> str:

@@ -22,7 +22,16 @@ from livepde.observation.sensors import POSITION, shift_names
 from livepde.samples import Sample, by_name, noise_channel
 from livepde.stepping import Between
 from livepde.streams import Column
-from livepde.units import AFTER_A_WORD, AFTER_SLASH, IN_BRACKETS, conversion, other_unit
+from livepde.units import (
+    AFTER_A_WORD,
+    AFTER_SLASH,
+    IN_BRACKETS,
+    conversion,
+    converts,
+    in_si,
+    other_unit,
+    with_powers,
+)
 
 # The first sample interpolated, under two names; or as if it were exact, and the lines between.
 EXACT = "interpolate-exact"
@@ -39,7 +48,8 @@ def columns_of(case: CaseContent) -> dict[str, Column]:
     for name, channel in case.spec.channels.items():
         unit = case.unit(name)
         _check_stated(case, name, unit)
-        rule = conversion(channel.unit or unit, unit, case.where(f"channels.{name}.unit"))
+        with case.of_state(unit):
+            rule = conversion(channel.unit or unit, unit, case.where(f"channels.{name}.unit"))
         valid = (-np.inf, np.inf)
         if channel.valid is not None:
             valid = case.pair(channel.valid, unit, f"channels.{name}.valid")
@@ -69,6 +79,25 @@ def _check_stated(case: CaseContent, name: str, unit: str) -> None:
                 f"the name of the column '{column}' states the unit '{given}', which is not that "
                 f"of the model: set unit = '{given}', or unit = '{unit}' if the name is wrong.",
             )
+        stated = IN_BRACKETS.search(column)
+        if stated and unit and _is_of_another_kind(stated[1], unit, channel.role == "input"):
+            raise case.error(
+                f"channels.{name}",
+                f"the name of the column '{column}' states the unit '{stated[1]}', and the model "
+                f"is in {unit}: set factor, by which its numbers are multiplied, or "
+                f"unit = '{unit}' if the name is wrong.",
+            )
+
+
+def _is_of_another_kind(given: str, unit: str, whole: bool) -> bool:
+    """Return whether a name states a unit that does not convert; `whole`: also one as short as W.
+
+    A word in the name of a sensor, such as T (min), is rather its place or a mean.
+    """
+    if not (whole or "/" in given) or converts(with_powers(given), unit):
+        return False
+    known = in_si(given)
+    return known is not None and bool(known.exponents)
 
 
 def observation_of(case: CaseContent, *roles: str) -> observation.Observation | None:

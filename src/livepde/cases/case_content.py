@@ -23,7 +23,7 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.models import EQUATIONS, Equation, Fluxes, Option, Variable
 from livepde.streams.table import no_file
-from livepde.units import LARGEST, SMALLEST, conversion, convert
+from livepde.units import LARGEST, SMALLEST, UnitError, conversion, convert
 
 CELLS = 2_000_000  # of a mesh that a case describes itself
 
@@ -126,7 +126,19 @@ class CaseContent:
 
     def convert(self, value: Any, unit: str, key: str, *, difference: bool = False) -> float:
         """Return a quantity in the model's unit."""
-        return convert(value, unit, self.where(key), difference=difference)
+        with self.of_state(unit):
+            return convert(value, unit, self.where(key), difference=difference)
+
+    @contextmanager
+    def of_state(self, unit: str) -> Iterator[None]:
+        """Name the option of another unit of the state if a unit does not convert to it."""
+        try:
+            yield
+        except UnitError as error:
+            if unit != self.equation.state.unit or "unit" not in self.equation.options:
+                raise
+            text = "If the state is another quantity, set its unit as `options.unit`."
+            raise UnitError(f"{error} {text}") from None
 
     def positive(self, value: Any, unit: str, key: str, default: float = np.nan) -> float:
         """Return a difference or duration in the model's unit, > 0; a default if there is none."""
@@ -353,7 +365,9 @@ def resolve(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Equat
                 f"{where}: equation: there is no equation '{name}'; "
                 f"{did_you_mean(name, EQUATIONS)} For your own equation, use 'file.py:function'."
             )
-        return EQUATIONS[name]
+        equation, unit = EQUATIONS[name], spec.options.get("unit")
+        known = isinstance(unit, str) and "unit" in equation.options
+        return equation.in_unit(str(unit)) if known else equation
     expected = "(mesh, unknowns, dirichlet, **options) -> livepde.Model"
     found = load_code(name, folder, f"{where}: equation", expected, allow_code)
     return found if isinstance(found, Equation) else _plain(name, found, spec, where)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from itertools import groupby
 from pathlib import Path
+from statistics import mode
 from typing import Any
 
 import numpy as np
@@ -95,8 +96,10 @@ OPEN = """\
 VALUES = """\
 # A measured value at an end: role = "boundary", at = "left" or "right". Other ends are closed, or
 # have a flux or an exchange in [boundary], such as left = {{ flux = "1 {flux}" }}."""
-ENDS = """\
-# A measured value at a boundary: role = "boundary", at = its name. Other boundaries are closed."""
+ENDS = {
+    1: '# Measured value at an end: role = "boundary", at = "left" or "right"; others are closed.',
+    2: '# Measured value at a boundary: role = "boundary", at = its name; others are closed.',
+}  # dimension -> where a case has values of the state
 ROD = Path(__file__).with_name("rod.toml")  # the case of the made-up data beside it
 
 
@@ -201,6 +204,8 @@ def _top(table: Measured, equation: Equation, inputs: set[str]) -> Iterator[str]
         if option.default is None or name in asked:
             yield _told(f'options.{name} = "{_open(option.unit)}"', option.text)
     unit = equation.state.unit
+    if unit != EQUATIONS[equation.name].state.unit:
+        yield _told(f"options.{toml_line('unit', unit)}", "of the state, and of its sensors")
     if equation.components:
         parts = dict.fromkeys(equation.components, _open(unit))
         yield from _inline("initial", parts, equation.state.text)
@@ -330,14 +335,31 @@ def _constants(found: list[FoundChannel]) -> Iterator[str]:
 def _channels(equation: Equation, found: list[FoundChannel]) -> Iterator[str]:
     """Yield the lines of [channels], with comments on their options."""
     yield f'# Remove what is not {equation.state.text}. role = "validation": predicted only.'
+    if "unit" in equation.options and equation.state == EQUATIONS[equation.name].state:
+        yield '# For another quantity than temperature set its unit, such as options.unit = "mg/l".'
     for name, quantity in equation.quantities.items():
         yield f'# Instead of at = ...: quantity = "{name}", the {quantity.text}.'
     if equation.takes_values:
         units = equation.fluxes
-        yield ENDS if units is None else VALUES.format(flux=units.flux)
+        yield VALUES.format(flux=units.flux) if units else ENDS[equation.dimension]
     for item in found:
         if item.columns:
             yield _told(toml_line(item.name, item.given), item.told)
+
+
+def in_unit_of(table: Measured, equation: Equation, stated: str = "") -> Equation:
+    """Return the equation in the unit of a table's sensors, if the equation leaves that open.
+
+    It is the most frequent one, if every column states its unit and none has that of the equation.
+    `stated`: the unit; empty: found from the columns.
+    """
+    if "unit" not in equation.options:
+        return equation
+    sensors = [item for item in channels_in(table, equation) if item.is_sensor]
+    units = [str(item.given.get("unit", "")) for item in sensors]
+    if stated or (units and all(unit.startswith(BLANK) for unit in units)):
+        return equation.in_unit(stated or mode(units).removeprefix(BLANK).strip())
+    return equation
 
 
 def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:

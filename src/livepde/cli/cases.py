@@ -108,6 +108,7 @@ def _begin(
     how |= {key: str(changes.get(f"data.{key}") or "") for key in ("sensor", "value")}
     first, *others = (measured(file, equation.time_unit, **how) for file in data)
     read = reduce(Measured.joined, others, first)
+    equation = new_case.in_unit_of(read, equation, str(changes.get("options.unit") or ""))
     files = new_case.files_for(read, case.parent, equation)
     _show_read(console, read, equation)
     files["case.toml"] = filled(files["case.toml"], changes, f"{case}")

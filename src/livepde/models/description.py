@@ -179,6 +179,24 @@ class Equation:
         units = {"time_unit": self.time_unit, "length_unit": self.length_unit}
         return {**units, "formula": formula}
 
+    def in_unit(self, unit: str) -> Equation:
+        """Return the equation of a state in another unit; units of fluxes and sources follow."""
+        per = f"({unit})" if re.search(r"[/ ]", unit) else unit or "1"
+
+        def renamed(given: str) -> str:
+            return unit if given == self.state.unit else re.sub(r"\bK\b", lambda _: per, given)
+
+        def variables(known: Mapping[str, Variable]) -> dict[str, Variable]:
+            return {name: replace(one, unit=renamed(one.unit)) for name, one in known.items()}
+
+        return replace(
+            self,
+            state=Variable(unit, f"measured in {unit}"),
+            unknowns=variables(self.unknowns),
+            inputs=variables(self.inputs),
+            fluxes=self.fluxes and Fluxes(*map(renamed, self.fluxes)),
+        )
+
     @property
     def takes_values(self) -> bool:
         """Whether a case may give values of the state on boundaries."""
@@ -258,6 +276,7 @@ def everywhere(equation: str, mesh: Any, **unknowns: Any) -> None:
             )
 
 
+UNIT = Option("", "unit of the state, such as mg/l", "degC")
 INITIAL = Variable("", "initial state, a field; else the case's `initial`", optional=True)
 
 

@@ -15,6 +15,7 @@ from livepde.fem.measure import START, Measure
 from livepde.model import Model
 from livepde.models.description import (
     AMBIENT,
+    UNIT,
     Equation,
     Fluxes,
     Option,
@@ -215,7 +216,7 @@ SURROUNDINGS = {
 
 HEAT = Equation(
     name="heat",
-    summary="heat conduction by diffusivity, with side loss, heat transfer and sources",
+    summary="heat conduction, or another diffusion, with side loss, heat transfer and sources",
     formula="u_t = div(alpha grad u) - loss (u - ambient) + source",
     state=Variable("degC", "temperature"),
     unknowns={
@@ -225,6 +226,7 @@ HEAT = Equation(
         "source": Variable("K/s", "heat gained over heat capacity", True),
     },
     inputs=SURROUNDINGS,
+    options={"unit": UNIT},
     build=by_name(heat),
     element=fem.linear,
     fluxes=Fluxes("K m/s", "m/s", "K/s"),

@@ -24,6 +24,7 @@ from livepde.model import Model
 from livepde.models.description import (
     AMBIENT,
     INITIAL,
+    UNIT,
     Equation,
     Number,
     Option,
@@ -172,9 +173,12 @@ ADVECTION_DIFFUSION = Equation(
     },
     options={
         "L": Option("m", "length over which the head falls by dH", 1.0),
-        "ratio": Option("", "velocity over flux: C of water over C of the wet bed", 1.0),
+        "ratio": Option(
+            "", "velocity over flux: C of water over C of the wet bed; 1 in a river", 1.0
+        ),
         "flow": Option("", "whether the flux is measured; set by an input `flow`", False),
         "stabilise": Option("", "whether to add the diffusion that fast flows need", False),
+        "unit": UNIT,
     },
     build=by_name(advection_diffusion),
     element=linear,
