@@ -652,6 +652,13 @@ def test_a_column_with_a_unit_fits_a_model_without_one(tmp_path):
         conversion("mg/L", "", "channels.c.unit")
 
 
+def test_a_comment_with_as_many_cells_as_a_row_is_no_header(here):
+    Path("t.csv").write_text("# chain; mooring Z3; local time\ntime;a;b\n0;1,5;2,5\n1;2,5;3,5\n")
+    assert measured(Path("t.csv"), "s").samples.names == ("a", "b")
+    Path("t.csv").write_text("# time;a;b\n0;1,5;2,5\n1;2,5;3,5\n")
+    assert measured(Path("t.csv"), "s").samples.names == ("a", "b")
+
+
 def test_a_moisture_in_percent_is_the_state_of_a_case(here):
     """The equations of a diffusion were refused as no temperature, and named C without a unit."""
     rows = "".join(f"{h},{20 - h},{20 - h / 2}\n" for h in range(30))

@@ -368,7 +368,7 @@ def _separator(lines: Sequence[str]) -> str:
 
 
 def _all_numbers(cells: Sequence[str]) -> bool:
-    return bool(cells) and all(number_of(cell.replace(",", "."), ".") is not None for cell in cells)
+    return bool(cells) and all(map(_is_number, cells))
 
 
 def _titles(lines: Sequence[str], separator: str) -> int:
@@ -382,7 +382,13 @@ def _titles(lines: Sequence[str], separator: str) -> int:
     titled = all(found <= 1 for found in widths[:start])
     if not titled or any(number_of(name.strip(), ",") is not None for name in names):
         return 0  # it is the header that is short
-    return start
+    # A comment with as many cells as a row is a title, too, if names follow.
+    names_follow = start + 1 < len(rows) and not any(map(_is_number, rows[start + 1]))
+    return start + (lines[start].startswith("#") and names_follow)
+
+
+def _is_number(cell: str) -> bool:
+    return number_of(cell.strip().replace(",", "."), ".") is not None
 
 
 def _likely(content: bytes, encoding: str) -> str:
