@@ -18,6 +18,7 @@ from test_logger_files import local
 from livepde.runs import clock_findings
 from livepde.runs.feeds import Gathered
 from livepde.runs.live_loop import Live
+from livepde.streams import read_csv
 from livepde.streams.clock import Clock
 from livepde.streams.intake import Habit, Intake, Policy
 from livepde.streams.sources import Follow, Rows
@@ -412,6 +413,16 @@ def test_the_hour_that_clocks_show_twice(again):
         found += [ready.t for ready in outcome.ready]
     assert found == [60.0 * k for k in range(240)]
     assert remarks == ["repeated"] * len(again)
+
+
+def test_a_reading_that_is_the_same_an_hour_later_is_no_repeated_row(tmp_path):
+    """A table of one reading an hour was refused: the second 02:00 had the value of the first."""
+    hours = ["00:00", "01:00", "02:00", "02:00", "03:00", "04:00"]
+    rows = "".join(f"2024-10-27 {hour},7.53\n" for hour in hours)
+    (tmp_path / "t.csv").write_text(f"t,a\n{rows}")
+    clock = Clock("t", zone=ZoneInfo("Europe/Berlin"))
+    found = read_csv(tmp_path / "t.csv", {"a": COLUMNS["a"]}, clock)
+    assert np.diff(found.t).tolist() == [3600.0] * 5
 
 
 def test_a_burst_of_rows_a_minute_is_no_leap():

@@ -187,19 +187,23 @@ def with_second_passes(
     """Return times of dates; hours that clocks show twice are distinguished.
 
     A date without a zone of its own that is not later than those before it belongs to the second
-    pass of such an hour, unless its row repeats an earlier one.
+    pass of such an hour, unless its row repeats an earlier one. One that follows the row before at
+    the usual interval belongs to it even then: a coarse reading may well be the same an hour later.
 
     `times`: in the model's unit since 1970, as of the first pass.
     `cells`: the dates as they are written.
     `repeats`: whether a row has the values of another row.
     """
-    if not (np.diff(times) <= 0.0).any():
+    steps = np.diff(times)
+    if not (steps <= 0.0).any():
         return times
     found, last = times.copy(), -math.inf
+    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
     first: dict[float, int] = {}  # row of each time of the first pass
     for k, t in enumerate(times.tolist()):
         if t <= last and is_naive(cells[k], clock) and (again := clock.repeated_hour(t)):
-            if not (t in first and repeats(first[t], k)):
+            follows = math.isclose(t + again - last, usual, rel_tol=0.01)
+            if follows or not (t in first and repeats(first[t], k)):
                 found[k] = t + again
         else:
             first[t] = k
