@@ -1,4 +1,4 @@
-"""Case: law, identifier and stream made from a case file."""
+"""A case file with its model, sensors, estimator, identifier and stream of samples."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ class Prepared:
     first
         The first sample, which gives the initial state and inputs.
     stream
-        All samples. A `DataTable` can be iterated again, standard input cannot. Gaps of boundary
-        and input channels are interpolated, and spikes refused.
+        All samples. A `DataTable` can be iterated repeatedly, standard input only once. In a table,
+        gaps of boundary and input channels are interpolated and their spikes removed.
     assimilate_from
-        Model time from which sensors are assimilated; scores count from here, too.
+        Model time from which sensors are assimilated and scores are computed.
     origin
-        Date of t = 0, if the data have dates.
+        Date of t = 0; None if the data have no dates.
     raw
-        The table as read, with its gaps; None for a stream.
+        The table as read, including its gaps; None for a stream.
     live
         True for a run that waits for its source.
     """
@@ -86,7 +86,7 @@ class Prepared:
         return identifier
 
     def identifier_with(self, law: laws.AnyLaw, sensors: Observation | None = None) -> Identifier:
-        """Return an identifier for the same case with another law, and with other sensors."""
+        """Return an identifier of this case for a given law and, optionally, other sensors."""
         case = self.case
         return Identifier(
             case.model,
@@ -105,7 +105,7 @@ class Prepared:
 
     @cached_property
     def t0(self) -> float:
-        """Time of the initial state: that of the first sample, or an earlier one."""
+        """Time of the initial state: `data.t0`, by default the time of the first sample."""
         case, first = self.case, float(self.first.t)
         stated = time_of(case, "t0", self.origin)
         if stated is None:
@@ -120,7 +120,7 @@ class Prepared:
         return float(stated)
 
     def uncertain(self, law: laws.AnyLaw) -> dict[str, Any]:
-        """Return the options of an identifier for noise of inputs and errors of the start."""
+        """Return the options of an identifier for input noise and errors of the initial state."""
         case = self.case
         if isinstance(law, laws.GradientLaw):  # it has no covariance
             return {}
@@ -133,7 +133,7 @@ class Prepared:
 
     @cached_property
     def u0(self) -> Any:
-        """The initial state: a number, or a function of x; None if the model defines it."""
+        """The initial state: a number, a function of x, or None if the model defines it."""
         case = self.case
         if case.model.form_initial is None:
             return case_channels.initial_of(case, self.first)
@@ -142,7 +142,7 @@ class Prepared:
         return None
 
     def typical(self, inputs: Mapping[str, float]) -> float:
-        """Return the size of the initial state, 1 if it is zero; for checks."""
+        """Return the mean magnitude of the initial state, or 1 if it is zero, for checks."""
         model, moment = self.case.model, Moment(float(self.first.t), Inputs(inputs))
         if self.u0 is None:
             u = model.initial_state(model.initial_parameter(), moment)
@@ -152,7 +152,7 @@ class Prepared:
 
     @cached_property
     def layout(self) -> Layout:
-        """Layout of the records of a run, with title, start, units and references of the case."""
+        """Layout of the records of a run, with title, origin, units and references of the case."""
         who = self.identifier
         return self.described(layout_of(who.model, who.observed, who.validation, who.ignored))
 
@@ -169,12 +169,12 @@ class Prepared:
         )
 
     def journal(self, path: Path | None = None) -> Journal:
-        """Return a new journal for a run of this case; in memory if there is no path."""
+        """Return a new journal for a run of this case, in memory if `path` is None."""
         return Journal.create(path, self.identifier.channels, self.layout)
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """Attributes of a dataset of this case: title, equation, start and source of references."""
+        """Attributes of a dataset of this case, such as title, equation and origin."""
         equation = self.case.equation
         found: dict[str, Any] = {"title": self.case.title, "equation": equation.formula}
         if np.isfinite(self.assimilate_from):
@@ -199,18 +199,18 @@ def load(
     path
         A TOML file.
     allow_code
-        Load an equation or a reader of the user's own ('module:function', 'file.py:function').
+        Allow user code for equation and reader ('module:function', 'file.py:function').
     settings
-        Key -> value that overrides that of the file, as {"law.noise": "2 K"}; several mappings are
-        applied one after the other.
+        Key -> value that overrides the file, such as {"law.noise": "2 K"}; several mappings are
+        applied in their order.
 
     Raises
     ------
     CaseError
-        An invalid case: one sentence with key, given value, expected value and remedy.
+        The case is invalid. The message contains key, value, expected value and remedy.
     """
     file = Path(path)
-    # A run directory keeps the effective text: settings are written into it, too.
+    # A run directory stores the effective text, including the settings.
     text = original = read_text(file)
     document = read_toml(text, str(file))
     for each in (settings,) if isinstance(settings, Mapping) else settings or ():
@@ -226,7 +226,7 @@ def load(
 
 
 def _expanded(document: Mapping[str, Any], file: Path, allow_code: bool) -> CaseContent:
-    """Return the content of a document, with each family of sensors as single channels."""
+    """Return the content of a document, with families of sensors expanded to single channels."""
     spec = read_spec(document, str(file))
     place = (spec, file.parent, str(file), allow_code)
     return case_channels.expanded(CaseContent(file, spec, resolve(*place), reader_of(*place)))
@@ -235,7 +235,7 @@ def _expanded(document: Mapping[str, Any], file: Path, allow_code: bool) -> Case
 def with_members(
     document: dict[str, Any], settings: Mapping[str, Any], file: Path, allow_code: bool
 ) -> None:
-    """Write the families of which settings name a member as single channels of a document."""
+    """Replace in a document each family with a member named in settings by single channels."""
     paths = [key_path(key, str(file)) for key in settings]
     names = [path[1] for path in paths if path[0] == "channels" and len(path) > 2]
     case_channels.split_families(document, names, lambda: _expanded(document, file, allow_code))
@@ -243,22 +243,22 @@ def with_members(
 
 @dataclass(frozen=True, eq=False)
 class Case(CaseContent):
-    """A case file with consistent parts; `prepare` adds the data.
+    """A case file whose parts have been checked for consistency; `prepare` adds the data.
 
     Attributes
     ----------
     text
-        The effective case: content of the file, or of the file with settings applied.
+        Effective text of the case, with settings applied.
     original
-        The file's content.
+        Content of the file.
     """
 
     text: str
     original: str
 
     def check(self) -> None:
-        """Build all parts that need no data; raises `CaseError`."""
-        # In this order: an error about the mesh comes before those about what lies on it.
+        """Build all parts that require no data; raises `CaseError`."""
+        # The mesh is first: an error about it may cause errors about the parts that use it.
         _ = self.mesh, self.options, self.model, self.observation, self.validation, self.law
         _ = self.columns, self.clock, self.scheme, self.dt_max, self.references
         _ = case_channels.input_noise_of(self), wall_attributes(self, self.model)
@@ -266,7 +266,7 @@ class Case(CaseContent):
         self._check_names()
 
     def _check_names(self) -> None:
-        """Refuse names that a run uses for other numbers, and outputs that no run has."""
+        """Refuse names that are reserved for results of a run, and outputs that do not exist."""
         kinds = (
             ("unknowns", "unknown", self.model.parameter_space.labels, TOTALS),
             ("channels", "channel", self.roles(*SENSORS), ROLES),
@@ -285,7 +285,7 @@ class Case(CaseContent):
 
     @property
     def title(self) -> str:
-        """The title, or the name of the file."""
+        """The title, by default the name of the file."""
         return self.spec.title or self.path.stem
 
     @cached_property
@@ -294,7 +294,7 @@ class Case(CaseContent):
         space = self.model.parameter_space
         found = {}
         for label, value in self.spec.reference.items():
-            # 'source' names the publication, unless an unknown of that name exists.
+            # 'source' is the publication, unless an unknown has this name.
             if label == "source" and label not in space.labels:
                 continue
             text = f"there is no unknown number '{label}'"
@@ -308,18 +308,18 @@ class Case(CaseContent):
 
     @property
     def source(self) -> str:
-        """Source of the references, such as a publication."""
+        """Source of the references, such as a publication; empty if none is given."""
         given = self.spec.reference.get("source", "")
         return given if isinstance(given, str) and "source" not in self.references else ""
 
     @property
     def expected(self) -> dict[str, tuple[Sense, Bound]]:
-        """Numbers that the case expects of its run."""
+        """Name of a result of the run -> how it is compared, and its expected bound or range."""
         return dict(self.spec.expect)
 
     @cached_property
     def model(self) -> Model:
-        """The model, with the states of sensors that respond slowly."""
+        """The model, including the states of sensors with a time constant."""
         return with_sensors(model_of(self), self.observation, self.validation)
 
     @cached_property
@@ -338,18 +338,18 @@ class Case(CaseContent):
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Names of the sensors that are assimilated, in the order of an innovation."""
+        """Names of the assimilated sensors, in the order of the innovation."""
         kinds = case_channels.kinds_of(self.roles("sensor"))
         return tuple(chain.from_iterable(kinds.values()))
 
     @cached_property
     def validation(self) -> Observation | None:
-        """The sensors that are predicted only, or ignored; None if there are none."""
+        """The sensors of role validation or ignored; None if there are none."""
         return case_channels.observation_of(self, "validation", "ignored")
 
     @property
     def ignored(self) -> tuple[str, ...]:
-        """Names of those of them that are shown and never count against a run."""
+        """Names of the ignored sensors, which are displayed but do not affect any verdict."""
         return tuple(self.roles("ignored"))
 
     @cached_property
@@ -373,13 +373,13 @@ class Case(CaseContent):
 
     @cached_property
     def dt_max(self) -> float:
-        """The longest time step."""
+        """The longest time step; infinite by default."""
         unit = self.equation.time_unit
         return self.positive(self.spec.steps.dt_max, unit, "steps.dt_max", np.inf)
 
     @cached_property
     def clock(self) -> Clock:
-        """The clock, which converts the column of times."""
+        """The clock, which converts the time column to model time."""
         return clock_of(self)
 
     @property
@@ -405,7 +405,7 @@ class Case(CaseContent):
 
     @property
     def _expect_notes(self) -> Iterator[str]:
-        # Numbers of a run, see `runs.measures`.
+        # The names of all results of a run are defined in `runs.measures`.
         labels = self.model.parameter_space.labels
         known = [
             *labels,
@@ -419,24 +419,24 @@ class Case(CaseContent):
             yield f"expect.{name}: {text}"
 
     def prepare(self, source: str | Iterable[str] | None = None) -> Prepared:
-        """Return an identifier and its stream.
+        """Return the case with its data, ready to run.
 
         Parameters
         ----------
         source
-            A file instead of the case's own, or lines of JSON.
+            A file that replaces the file of the case, or lines of JSON.
 
         Raises
         ------
         DataError
-            The data cannot be used; the message names file, row and column.
+            The data cannot be used. The message contains file, row and column.
         """
         prepared = self.read(source)
-        _ = prepared.identifier  # built here to raise errors of inconsistent data
+        _ = prepared.identifier  # raises errors about inconsistent data here
         return prepared
 
     def read(self, source: str | Iterable[str] | None = None) -> Prepared:
-        """Return the case with its data, as `prepare` does, before an identifier is built."""
+        """Return the case with its data, without building the identifier as `prepare` does."""
         raw = read_data(self, source)
         table = raw if isinstance(raw, DataTable) else None
         data = raw if table is None else without_gaps(self, table)
@@ -445,7 +445,7 @@ class Case(CaseContent):
         if first is None:
             raise DataError(f"{self.path}: the data contain no sample between start and stop.")
         start = self._assimilated_from(data.origin)
-        # A stream can be read only once, so its first sample is put back.
+        # A stream can be read only once: its first sample is put back.
         stream = chain([first], samples) if table is None else data
         return Prepared(self, first, stream, start, data.origin, table)
 
@@ -455,11 +455,11 @@ class Case(CaseContent):
 
     @property
     def live(self) -> bool:
-        """Whether the case's own source is live: a file that grows, a broker or a server."""
+        """Whether the source in the case file is live: a growing file, a broker or a server."""
         return self.spec.data.live
 
     def goes_on(self, data: str | None) -> bool:
-        """Return whether a source is live: the case's own, or a file instead of a followed one."""
+        """Return whether the source is live; `data` is a file that replaces the case's source."""
         if data is None:
             return self.live
         return self.spec.data.follow and data != "-" and not data.endswith(".parquet")
@@ -474,14 +474,14 @@ class Case(CaseContent):
         first
             The first sample, which gives the initial state and inputs.
         origin
-            The date of t = 0, if times are dates.
+            The date of t = 0; None if times are numbers.
         live
             True for a run that waits for its source.
 
         Raises
         ------
         DataError
-            The sample lacks values needed for the initial state or inputs.
+            A value for the initial state or an input is missing in the sample.
         """
         start = self._assimilated_from(origin)
         prepared = Prepared(self, first, (), start, origin, live=live)
@@ -508,7 +508,7 @@ def _sensitivity(case: CaseContent, spec: SensitivitySpec) -> laws.SensitivityLa
 
 
 def _jumps(case: CaseContent, spec: SensitivitySpec) -> laws.Jumps | None:
-    """Return the test for jumps: of all unknowns (true), of some (names), or with options."""
+    """Return the test for jumps of all unknowns (true), named unknowns, or with given options."""
     given = spec.jumps
     found = laws.Jumps(unknowns=given) if isinstance(given, tuple) else _chosen(laws.Jumps, given)
     known = [*case.spec.unknowns, *case_channels.unknowns_of(case)]
@@ -519,14 +519,14 @@ def _jumps(case: CaseContent, spec: SensitivitySpec) -> laws.Jumps | None:
 
 
 def _chosen(kind: type[Options], given: bool | Options) -> Options | None:
-    """Return options of a law that a case has as true (the defaults), false or a table."""
+    """Return options of a law: defaults for true, None for false, or the options themselves."""
     if isinstance(given, bool):
         return kind() if given else None
     return given
 
 
 def _noise(case: CaseContent, spec: SensitivitySpec) -> float | str | None:
-    """Return the noise of the law, which needs it here or from every sensor."""
+    """Return the noise of the law: a number, 'auto', or None if every sensor states its noise."""
     if spec.noise is not None and spec.noise != "auto":
         if plates := [name for name, item in case.roles("sensor").items() if item.is_flux]:
             text = (

@@ -33,17 +33,17 @@ from livepde.units import (
     with_powers,
 )
 
-# The first sample interpolated, under two names; or as if it were exact, and the lines between.
+# Key of an initial state that is interpolated from the first sample, without any uncertainty.
 EXACT = "interpolate-exact"
-INTERPOLATED = ("readings", "interpolate", EXACT)
+INTERPOLATED = ("readings", "interpolate", EXACT)  # "interpolate" is a synonym of "readings"
 
 Kinds: TypeAlias = dict[tuple[str, str | None, str], dict[str, schema.ChannelSpec]]
-"""(kind of sensor, component of the state, time constant as stated) -> its channels."""
-MEMBERS = 10_000  # channels of one `each`
+"""(kind of sensor, component of the state, time constant as text) -> its channels."""
+MEMBERS = 10_000  # largest number of channels of a family
 
 
 def columns_of(case: CaseContent) -> dict[str, Column]:
-    """Return channel -> its column in the data, and the column of the noise of its readings."""
+    """Return channel -> its column in the data; noise columns have the key `noise_channel`."""
     found, decimal = {}, case.spec.data.decimal
     for name, channel in case.spec.channels.items():
         unit = case.unit(name)
@@ -68,7 +68,7 @@ def columns_of(case: CaseContent) -> dict[str, Column]:
 
 
 def _check_stated(case: CaseContent, name: str, unit: str) -> None:
-    """Refuse a column whose name states another unit than the one that its channel is read in."""
+    """Refuse a column whose name states a unit that differs from the unit of its channel."""
     channel = case.spec.channels[name]
     if channel.unit or channel.factor is not None:
         return
@@ -101,7 +101,7 @@ def _is_of_another_kind(given: str, unit: str, whole: bool) -> bool:
 
 
 def observation_of(case: CaseContent, *roles: str) -> observation.Observation | None:
-    """Return the observation of the channels of some roles; None if there are none."""
+    """Return the observation operator of the channels with given roles; None without channels."""
     channels, assimilated = case.roles(*roles), "sensor" in roles
     if not channels:
         return None
@@ -111,7 +111,7 @@ def observation_of(case: CaseContent, *roles: str) -> observation.Observation | 
     units = {case.unit(name) for name in names}
     outer: dict[str, Any] = {
         "noise": levels and list(map(levels.__getitem__, names)),
-        # Sensors with several units have them from their parts.
+        # If the units differ, each part of the observation has its own unit.
         "unit": units.pop() if len(units) == 1 else "",
         "reconstruction": _reconstruction(case) if assimilated else observation.Pseudoinverse(),
     }
@@ -121,7 +121,7 @@ def observation_of(case: CaseContent, *roles: str) -> observation.Observation | 
 
 
 def kinds_of(channels: Mapping[str, schema.ChannelSpec]) -> Kinds:
-    """Return sensors by kind and component of the state: one observation reads each of them."""
+    """Group sensors by kind, component of the state and time constant, one observation each."""
     kinds: Kinds = {}
     for name, channel in channels.items():
         slow = "" if channel.time_constant is None else str(channel.time_constant)
@@ -130,7 +130,7 @@ def kinds_of(channels: Mapping[str, schema.ChannelSpec]) -> Kinds:
 
 
 def _whole(case: CaseContent, kinds: Kinds, outer: Mapping[str, Any]) -> observation.Observation:
-    """Return one observation of all kinds, which has the keyword arguments `outer`."""
+    """Return one observation of all kinds, constructed with the keyword arguments `outer`."""
     common = outer if len(kinds) == 1 else {}
     parts = []
     for (kind, of, slow), members in kinds.items():
@@ -141,7 +141,7 @@ def _whole(case: CaseContent, kinds: Kinds, outer: Mapping[str, Any]) -> observa
 
 
 def _constant(case: CaseContent, channels: Mapping[str, schema.ChannelSpec]) -> float | fem.Prior:
-    """Return the time constant of channels of one kind, of assimilated ones with its prior."""
+    """Return the time constant of a group of channels; a prior if it is unknown and assimilated."""
     (name, channel), *_ = channels.items()
     given, key, unit = (
         channel.time_constant,
@@ -157,7 +157,7 @@ def _constant(case: CaseContent, channels: Mapping[str, schema.ChannelSpec]) -> 
 
 
 def _kind(channel: schema.ChannelSpec) -> str:
-    """Return what makes a channel a sensor of its kind: a key, or the quantity "flux"."""
+    """Return the kind of a sensor: the quantity "flux", or the key that states its place."""
     if channel.is_flux:
         return schema.FLUX
     given = (key for key in ("over", "along", "follows") if getattr(channel, key) is not None)
@@ -165,7 +165,7 @@ def _kind(channel: schema.ChannelSpec) -> str:
 
 
 def _regions(case: CaseContent, channels: Mapping[str, schema.ChannelSpec]) -> dict[str, Any]:
-    """Return the parts of the mesh over which means are taken."""
+    """Return channel -> part of the mesh over which its mean is taken."""
     known = {**(case.mesh.boundaries or {}), **(case.mesh.subdomains or {})}
     regions: dict[str, Any] = {}
     for name, item in channels.items():
@@ -181,7 +181,7 @@ def _regions(case: CaseContent, channels: Mapping[str, schema.ChannelSpec]) -> d
 def _followed(
     case: CaseContent, channels: Mapping[str, schema.ChannelSpec]
 ) -> dict[str, tuple[str, ...]]:
-    """Return the channels of the positions of sensors that move."""
+    """Return moving sensor -> the channels that contain its position."""
     positions: dict[str, tuple[str, ...]] = {}
     known, needed = case.roles("position"), len(case.mesh.p)
     for name, item in channels.items():
@@ -203,7 +203,7 @@ def _part(
     common: Mapping[str, Any],
     of: str | None,
 ) -> observation.Observation:
-    """Return the observation of channels of one kind, of a component of the state."""
+    """Return the observation of channels of one kind and one component of the state."""
     if of is not None:
         common = {**common, "of": of}
     if kind == schema.FLUX:
@@ -228,7 +228,7 @@ def _points(
     """Return the observation of sensors at points."""
     points = {name: _position(case, name, item) for name, item in channels.items()}
     constants = case.constants
-    direct = {  # what a quantity sees beside the state
+    direct = {  # direct terms of a quantity, in addition to the state at its point
         name: fem.with_constants(
             case.equation.quantities[item.quantity].direct(case.options), constants
         )
@@ -237,7 +237,7 @@ def _points(
     }
     stds = _stated(case, "at_std", "sensor")
     uncertain = {name: std for name, std in stds.items() if name in channels}
-    # A family of point sensors of which one names a component has one for each.
+    # If one point sensor states a component, all sensors of its group must.
     numbers = [item.component for item in channels.values()]
     if set(numbers) != {None}:
         if None in numbers:
@@ -248,7 +248,7 @@ def _points(
 
 
 def _flux_place(case: CaseContent, name: str, channel: schema.ChannelSpec) -> float | str:
-    """Return the end of the mesh where a flux is measured, or a position inside."""
+    """Return where a flux is measured: the name of an end of the mesh, or a position."""
     if not case.equation.conductivity:
         text = f"the equation '{case.equation.name}' has no flux to measure; leave it out."
         raise case.error(f"channels.{name}.quantity", text)
@@ -262,7 +262,7 @@ def _flux_place(case: CaseContent, name: str, channel: schema.ChannelSpec) -> fl
 
 
 def _reconstruction(case: CaseContent) -> observation.Reconstruction:
-    """Return the reconstruction of the observed part, by the key law.tikhonov."""
+    """Return the reconstruction of the observed part that `law.tikhonov` selects."""
     law = case.spec.law
     given = law.tikhonov if isinstance(law, schema.GradientSpec) else False
     if given is False:
@@ -276,7 +276,7 @@ def _reconstruction(case: CaseContent) -> observation.Reconstruction:
 
 
 def _position(case: CaseContent, name: str, channel: schema.ChannelSpec) -> Any:
-    """Return where a point sensor sits: a number, or a list of coordinates."""
+    """Return the position of a point sensor: a number, or a list of coordinates."""
     if channel.quantity is None:
         return _inside_mesh(case, channel.at, f"channels.{name}.at")
     known, asked, x = case.equation.quantities, channel.quantity, case.mesh.p[0]
@@ -286,7 +286,7 @@ def _position(case: CaseContent, name: str, channel: schema.ChannelSpec) -> Any:
 
 
 def _inside_mesh(case: CaseContent, at: Any, key: str) -> Any:
-    """Return a position in the mesh: a number, or a list of coordinates."""
+    """Return a position, which must lie in the mesh: a number, or a list of coordinates."""
     low, high = case.mesh.p.min(axis=1), case.mesh.p.max(axis=1)
     given = at if isinstance(at, tuple) else (at,)
     unit = case.equation.length_unit
@@ -306,7 +306,7 @@ def _inside_mesh(case: CaseContent, at: Any, key: str) -> Any:
 
 
 def flux_notes(case: CaseContent) -> Iterator[str]:
-    """Yield notes on fluxes at a boundary with a noisy value."""
+    """Yield a note for each flux measured at a boundary whose value is noisy."""
     noisy = {item.at: name for name, item in case.roles("boundary").items() if item.noise}
     for name, item in case.roles("sensor").items():
         if item.is_flux and item.at in noisy:
@@ -319,7 +319,7 @@ def flux_notes(case: CaseContent) -> Iterator[str]:
 
 
 def cell_notes(case: CaseContent) -> Iterator[str]:
-    """Yield a note on sensors all in one cell."""
+    """Yield a note if all sensors lie in one cell."""
     shown = case.roles(*schema.SENSORS).items()
     channels = {name: item for name, item in shown if not item.is_flux}
     if len(case.mesh.p) != 1 or not channels or any(item.at is None for item in channels.values()):
@@ -335,7 +335,7 @@ def cell_notes(case: CaseContent) -> Iterator[str]:
 
 
 def noise_of(case: CaseContent) -> dict[str, float] | None:
-    """Return the noise of each assimilated sensor; None if none is given."""
+    """Return the noise of each assimilated sensor; None if no sensor states its noise."""
     channels, levels = case.roles("sensor"), _stated(case, "noise", "sensor")
     if levels and len(levels) < len(channels):
         missing = next(name for name, item in channels.items() if item.noise is None)
@@ -350,13 +350,13 @@ def input_noise_of(case: CaseContent) -> dict[str, float]:
 
 
 def between_of(case: CaseContent) -> dict[str, Between]:
-    """Return channel -> how it behaves between two readings, of those that are no lines."""
+    """Return channel -> interpolation between readings, for channels that are not linear."""
     channels = case.roles("boundary", "input")
     return {name: item.between for name, item in channels.items() if item.between != "line"}
 
 
 def initial_of(case: CaseContent, first: Sample) -> Any:
-    """Return the initial state: a number (of each component), or the first sample interpolated."""
+    """Return the initial state: a number, numbers by component, or an interpolant as f(x)."""
     stated, unit = case.spec.initial, case.equation.state.unit
     if stated is None:
         raise case.missing("initial", "a number, or 'interpolate' from the first sample.")
@@ -374,15 +374,15 @@ def initial_of(case: CaseContent, first: Sample) -> Any:
 
 
 def initial_weights(case: CaseContent, first: Sample) -> dict[str, Any]:
-    """Return channel -> change x -> u of an interpolated start with its reading, and its noise.
+    """Return channel -> (derivative of the initial state in its reading, noise of the reading).
 
-    The noise is NaN where it is that of the sensor. Empty where readings are taken as exact.
+    The derivative is a function of x; NaN means the noise of the sensor. Empty without uncertainty.
     """
     if not _made_of_readings(case):
         return {}
     readings, given, found = _initial_readings(case, first), by_name(first.z, ()), {}
     for number, one in enumerate(readings):
-        # Interpolation is linear: its derivative by a reading is that of 1 there and 0 elsewhere.
+        # The derivative in a reading interpolates 1 for this reading and 0 for the others.
         unit = [other._replace(value=float(n == number)) for n, other in enumerate(readings)]
         weight = partial(_interpolated, *_level(unit))
         found[one.channel] = (weight, given.get(noise_channel(one.channel), np.nan))
@@ -396,20 +396,20 @@ def interpolates(case: CaseContent) -> bool:
 
 
 def profile_sensors(case: CaseContent) -> list[str]:
-    """Return the sensors that an initial state is interpolated from."""
+    """Return the sensors from which the initial state is interpolated."""
     known = case.roles("sensor") if interpolates(case) else {}
     return [name for name, one in known.items() if one.at is not None and not one.is_flux]
 
 
 def _made_of_readings(case: CaseContent) -> bool:
-    """Return whether the initial state is made of readings that are uncertain."""
+    """Return whether the initial state is interpolated from readings with uncertainty."""
     initial = case.spec.initial
     exact = isinstance(initial, schema.InitialSpec) and initial.start == EXACT
     return interpolates(case) and not exact and len(case.mesh.p) == 1
 
 
 def initial_errors(case: CaseContent, first: Sample) -> tuple[Any, ...]:
-    """Return the errors of the initial state itself, each a function of x: see `random_field`."""
+    """Return the error modes of the initial state, functions of x from `random_field`."""
     initial = case.spec.initial
     if initial is None or isinstance(initial, dict):
         return ()
@@ -425,7 +425,7 @@ def initial_errors(case: CaseContent, first: Sample) -> tuple[Any, ...]:
 
 
 def check_initial(case: CaseContent) -> None:
-    """Raise an error for an uncertainty of the initial state that the run could not use."""
+    """Refuse an uncertainty of the initial state that the run could not use."""
     initial = case.spec.initial
     if initial is None or isinstance(initial, dict) or (initial.std, initial.length) == (None,) * 2:
         return
@@ -445,7 +445,7 @@ def _interpolated(at: Sequence[float], values: Sequence[float], x: Any) -> Any:
 
 
 class _Reading(NamedTuple):
-    """A reading that the initial state is interpolated from."""
+    """A reading from which the initial state is interpolated."""
 
     at: float
     value: float
@@ -453,13 +453,13 @@ class _Reading(NamedTuple):
 
 
 def _level(readings: Sequence[_Reading]) -> tuple[list[float], list[float]]:
-    """Return the places of readings, in order, and the mean of those at each place."""
+    """Return the sorted positions of readings, and the mean reading at each position."""
     places = sorted({one.at for one in readings})
     return places, [fmean(one.value for one in readings if one.at == place) for place in places]
 
 
 def _initial_readings(case: CaseContent, first: Sample) -> list[_Reading]:
-    """Return the readings that the initial state is interpolated from."""
+    """Return the readings of sensors and end values in the first sample that are not missing."""
     ends = {"left": float(case.mesh.p.min()), "right": float(case.mesh.p.max())}
     values, sensors = by_name(first.z, ()), profile_sensors(case)
     found = []
@@ -478,7 +478,7 @@ def _initial_readings(case: CaseContent, first: Sample) -> list[_Reading]:
 
 
 def expanded(case: CaseContent) -> CaseContent:
-    """Return the case with every family of channels, `each` or `positions`, as single ones."""
+    """Return the case with each family (`each` or `positions`) expanded to single channels."""
     channels: dict[str, schema.ChannelSpec] = {}
     families: dict[str, str] = {}
     for name, channel in case.spec.channels.items():
@@ -502,9 +502,9 @@ def expanded(case: CaseContent) -> CaseContent:
 def split_families(
     document: Mapping[str, Any], names: Collection[str], content: Callable[[], CaseContent]
 ) -> None:
-    """Write the families of which `names` has a member as single channels in a case's document.
+    """Replace in a document each family with a member in `names` by single channels.
 
-    `content`: returns the content of the document, with the families it has.
+    `content` returns the content of the document, with its families.
     """
     channels = document.get("channels")
     if not isinstance(channels, dict) or set(names) <= channels.keys():
@@ -526,7 +526,7 @@ def split_families(
 def _evenly(
     case: CaseContent, name: str, channel: schema.ChannelSpec
 ) -> dict[str, tuple[Any, str]]:
-    """Return place and column of each sensor of a row with even distances."""
+    """Return position and column of each sensor of an evenly spaced family."""
     start, stop, count = channel.each or (0.0, 0.0, 0)
     unit, key = case.equation.length_unit, f"channels.{name}.each"
     if count > MEMBERS:
@@ -541,7 +541,7 @@ def _evenly(
 def _listed(
     case: CaseContent, name: str, channel: schema.ChannelSpec
 ) -> dict[str, tuple[Any, str]]:
-    """Return place and column of each sensor of a table of positions."""
+    """Return position and column of each sensor of a table of positions."""
     key, file = f"channels.{name}.positions", case.path.parent / str(channel.positions)
     found: dict[str, tuple[Any, str]] = {}
     # Row 1 of the file is its header.
@@ -556,8 +556,8 @@ def _listed(
 
 
 def _positions_table(case: CaseContent, key: str, file: Path) -> Iterable[Sequence[str]]:
-    """Return name, x (and y, z) of each row of a table, as text; empty where a cell is."""
-    import pandas as pd  # slow to load, and most cases have no such table
+    """Return name, x (and y, z) of each row of a table as text; empty cells are empty text."""
+    import pandas as pd  # slow to import, and most cases do not need it
 
     try:
         table = pd.read_csv(file, dtype=str, nrows=MEMBERS + 1, skipinitialspace=True).fillna("")
@@ -591,16 +591,16 @@ def _coordinate(case: CaseContent, cell: str, where: str) -> float:
 
 
 def unknowns_of(case: CaseContent) -> dict[str, fem.Unknown]:
-    """Return the unknowns of the sensors: offset, gain, position, ...: numbers for each."""
+    """Return the unknowns of the sensors by kind (offset, gain, ...), one number per sensor."""
     state = case.equation.state.unit
     found: dict[str, fem.Unknown] = {}
-    # Differences of a temperature are in K.
+    # Temperature differences are in K.
     unit = "K" if state == "degC" else state
     if offsets := _stated(case, "offset", "sensor"):
         own = _one_unit(case, offsets)
         prior = fem.Normal(0.0, _common(case, offsets, "offset"))
         found["offset"] = fem.Scalars(tuple(offsets), prior, unit=unit if own == state else own)
-    # A gain is a factor without a unit, 1 for an exact sensor.
+    # A gain is a dimensionless factor, 1 for an exact sensor.
     if gains := _stated(case, "gain", "sensor"):
         found["gain"] = fem.Scalars(tuple(gains), fem.Normal(1.0, _common(case, gains, "gain")))
     if stds := _stated(case, "at_std", "sensor"):
@@ -621,7 +621,7 @@ def unknowns_of(case: CaseContent) -> dict[str, fem.Unknown]:
 
 
 def _one_unit(case: CaseContent, offsets: Iterable[str]) -> str:
-    """Return the unit of sensors with offsets, which share one prior."""
+    """Return the common unit of sensors with offsets; raises `CaseError` if units differ."""
     first, *others = offsets
     for name in others:
         if case.unit(name) != case.unit(first):
@@ -631,7 +631,7 @@ def _one_unit(case: CaseContent, offsets: Iterable[str]) -> str:
 
 
 def _correlated(case: CaseContent) -> dict[str, tuple[float, float]]:
-    """Return standard deviation and correlation time of the errors of sensors that fade."""
+    """Return standard deviation and correlation time of the correlated errors of sensors."""
     found = {}
     for name, item in case.roles("sensor").items():
         if (fading := item.correlated) is not None:
@@ -642,7 +642,7 @@ def _correlated(case: CaseContent) -> dict[str, tuple[float, float]]:
 
 
 def _unknown_constants(case: CaseContent) -> dict[str, float | fem.Prior]:
-    """Return the prior of each time constant that is unknown."""
+    """Return the prior of each unknown time constant."""
     return {
         name: _constant(case, {name: item})
         for name, item in case.roles("sensor").items()
@@ -651,7 +651,7 @@ def _unknown_constants(case: CaseContent) -> dict[str, float | fem.Prior]:
 
 
 def _stated(case: CaseContent, key: str, *roles: str) -> dict[str, float]:
-    """Return a number > 0 of each channel that states one, in the unit of the key or channel."""
+    """Return the numbers > 0 that channels state for a key, in the unit of the key or channel."""
     units = {"gain": "", "at_std": case.equation.length_unit}
     return {
         name: case.positive(value, units.get(key, case.unit(name)), f"channels.{name}.{key}")
@@ -661,7 +661,7 @@ def _stated(case: CaseContent, key: str, *roles: str) -> dict[str, float]:
 
 
 def _common(case: CaseContent, given: Mapping[str, Any], key: str) -> Any:
-    """Return the common value of all sensors: they share a prior."""
+    """Return the common value of all sensors, which share a prior; values must not differ."""
     (first, value), *others = given.items()
     for name, other in others:
         if other != value:
@@ -673,7 +673,7 @@ def _common(case: CaseContent, given: Mapping[str, Any], key: str) -> Any:
 def _calibrated(
     case: CaseContent, base: observation.Observation, names: Sequence[str], **options: Any
 ) -> observation.Observation:
-    """Return the readings: gain * (reading of the base) + offset + correlated."""
+    """Return the observation gain * (reading of the base) + offset + correlated error."""
     channels = [case.spec.channels[name] for name in names]
     gains = [(k, n) for k, n in enumerate(names) if channels[k].gain is not None]
     added = {

@@ -1,4 +1,4 @@
-"""Content of a case: specification, equation (also of own code), units, mesh, options."""
+"""Content of a case: specification, equation (predefined or user code), units, mesh, options."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from livepde.models import EQUATIONS, Equation, Fluxes, Option, Variable
 from livepde.streams.table import no_file
 from livepde.units import LARGEST, SMALLEST, UnitError, conversion, convert
 
-CELLS = 2_000_000  # of a mesh that a case describes itself
+CELLS = 2_000_000  # largest number of cells of a mesh without a mesh file
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,18 +35,18 @@ class CaseContent:
     path: Path
     spec: CaseSpec
     equation: Equation
-    reader: Callable[..., Any] | None  # of its data, if it names one
+    reader: Callable[..., Any] | None  # user function that reads the data, if any
     families: Mapping[str, str] = field(default_factory=dict, kw_only=True)  # sensor -> its family
 
     @property
     def name(self) -> str:
-        """Name of the case: that of its file, or of its folder if the file is 'case.toml'."""
+        """Name of the file without extension, or of its folder if the file is 'case.toml'."""
         path = self.path.absolute()
         return path.stem if path.stem != "case" else path.parent.name or "case"
 
     @property
     def with_intervals(self) -> tuple[str, ...]:
-        """Settings of a law that has intervals; empty if the law of the case has them."""
+        """Settings that switch to a law with intervals; empty if the case already uses one."""
         law = self.spec.law
         if law.kind == "sensitivity":
             return ()
@@ -55,7 +55,7 @@ class CaseContent:
 
     @property
     def constants(self) -> dict[str, float]:
-        """The inputs of the equation that are constants, in its units."""
+        """Constant inputs of the equation: name -> value in the equation's unit."""
         known, given = self.equation.inputs, self.spec.inputs
         self.only(given, known, "inputs")
         for name in given:
@@ -68,7 +68,7 @@ class CaseContent:
 
     @cached_property
     def mesh(self) -> Any:
-        """The mesh: from a file, or a line or rectangle of nodes or cells."""
+        """The mesh: read from a file, or an interval or rectangle given by nodes or cells."""
         spec, unit = self.spec.mesh, self.equation.length_unit
         if spec.file is not None:
             scale = conversion(spec.unit or unit, unit, self.where("mesh.unit")).factor
@@ -84,7 +84,7 @@ class CaseContent:
 
     @cached_property
     def options(self) -> dict[str, Any]:
-        """Options of the equation: numbers in its units, text and booleans."""
+        """Options of the equation, including defaults: numbers in its units, text and booleans."""
         known, given = self.equation.options, self.spec.options
         self.only(given, known, "options")
         values: dict[str, Any] = {}
@@ -105,16 +105,16 @@ class CaseContent:
         return values
 
     def error(self, key: str, text: str) -> CaseError:
-        """Return an error that names file and key."""
+        """Return an error whose message begins with file and key."""
         return CaseError(f"{self.path}: {key}: {text}")
 
     def missing(self, key: str, text: str) -> CaseError:
-        """Return an error about a key that is missing."""
+        """Return an error about a missing key."""
         return CaseError(f"{self.path}: {key} is missing: {text}")
 
     @contextmanager
     def located(self, key: str, kind: type[Exception]) -> Iterator[None]:
-        """Raise errors of one kind within the block as errors that name file and key."""
+        """Convert exceptions of one kind within the block to `CaseError` with file and key."""
         try:
             yield
         except kind as error:
@@ -141,7 +141,7 @@ class CaseContent:
             raise UnitError(f"{error} {text}") from None
 
     def positive(self, value: Any, unit: str, key: str, default: float = np.nan) -> float:
-        """Return a difference or duration in the model's unit, > 0; a default if there is none."""
+        """Return a difference or duration > 0 in the model's unit; `default` if it is None."""
         if value is None:
             return default
         number = self.convert(value, unit, key, difference=True)
@@ -160,18 +160,18 @@ class CaseContent:
         return low, high
 
     def only(self, given: Iterable[str], known: Iterable[str], key: str) -> None:
-        """Raise unless every name given is known to the equation."""
+        """Raise `CaseError` unless every given name is known to the equation."""
         for name in given:
             text = f"the equation '{self.equation.name}' has no '{name}' here"
             self.require(name, known, key, text)
 
     def require(self, name: str, known: Iterable[str], key: str, text: str) -> None:
-        """Raise an error that begins with `text` unless a name is one of `known`."""
+        """Raise a `CaseError` whose text begins with `text` unless a name is one of `known`."""
         if name not in known:
             raise self.error(key, f"{text}; {did_you_mean(name, known)}")
 
     def roles(self, *roles: str) -> dict[str, ChannelSpec]:
-        """Return the channels of some roles."""
+        """Return the channels with one of the given roles, by name."""
         return {name: item for name, item in self.spec.channels.items() if item.role in roles}
 
     def unit(self, channel: str) -> str:
@@ -187,7 +187,7 @@ class CaseContent:
 
 
 def _rectangle(case: CaseContent, x: Iterable[float | str], y: Iterable[float | str]) -> Any:
-    """Return a rectangle: of the nodes on two sides, or of their ends and numbers of cells."""
+    """Return a rectangle, given by the nodes or by the ends and numbers of cells of two sides."""
     spec, unit = case.spec.mesh, case.equation.length_unit
     given = (("mesh.x", x), ("mesh.y", y))
     sides = [[case.convert(node, unit, key) for node in nodes] for key, nodes in given]
@@ -211,7 +211,7 @@ def _rectangle(case: CaseContent, x: Iterable[float | str], y: Iterable[float | 
 
 
 def _interval(case: CaseContent) -> Any:
-    """Return an interval of cells, with nodes at the ends of layers."""
+    """Return an interval given by ends and number of cells, with nodes at the ends of layers."""
     spec, unit = case.spec.mesh, case.equation.length_unit
     cells: Any = spec.cells  # the schema allows only a number here
     _check_cells(cells, case.where("mesh.cells"))
@@ -225,9 +225,9 @@ def _interval(case: CaseContent) -> Any:
 
 
 def _spaced(ends: Sequence[float], cells: int, geometric: bool, edges: Sequence[float]) -> Any:
-    """Return an interval of cells with nodes at the edges of layers."""
-    # The nodes nearest to ends of layers move there, because a jump of an unknown inside of a cell
-    # would be blurred. If two ends share a nearest node, the second becomes a node of its own.
+    """Return an interval given by ends and number of cells, with nodes at the edges of layers."""
+    # The nodes nearest to the edges move there, since a jump of an unknown inside a cell would be
+    # blurred. If two edges have the same nearest node, the second edge becomes an additional node.
     start, stop = ends
     plain = fem.interval(start, stop, cells, geometric=geometric)
     through = _fitted(plain.p[0], edges)
@@ -243,7 +243,7 @@ def _is_graded(case: CaseContent, spacing: Any, start: float) -> bool:
 
 
 def _boxes(case: CaseContent) -> list[tuple[str, str, tuple[Any, ...]]]:
-    """Return the layers and boxes of unknowns and sources: name, key, and sides."""
+    """Return name, key and sides of all layers and boxes of unknowns and sources."""
     given: list[tuple[str, str, Any]] = [
         (f"layer '{layer}' of {name}", f"unknowns.{name}.regions.{layer}", item.over)
         for name, unknown in case.spec.unknowns.items()
@@ -257,7 +257,7 @@ def _boxes(case: CaseContent) -> list[tuple[str, str, tuple[Any, ...]]]:
 
 
 def _layer_edges(case: CaseContent) -> list[tuple[str, int, float]]:
-    """Return the ends of layers and boxes of unknowns and sources: name, coordinate and place."""
+    """Return the ends of layers and boxes as (name, axis, coordinate along this axis)."""
     unit = case.equation.length_unit
     return [
         (what, k // 2, edge)
@@ -268,8 +268,8 @@ def _layer_edges(case: CaseContent) -> list[tuple[str, int, float]]:
 
 
 def _fitted(nodes: Array, edges: Iterable[float]) -> list[float]:
-    """Return the edges inside a mesh that its nodes can move to, at most one for each node."""
-    # The ends of the mesh stay where they are.
+    """Return the edges inside a mesh to which nodes can move, at most one for each node."""
+    # The end nodes of the mesh do not move.
     inner = nodes[1:-1]
     found: dict[int, float] = {}
     for edge in edges:
@@ -279,14 +279,14 @@ def _fitted(nodes: Array, edges: Iterable[float]) -> list[float]:
 
 
 def _inside(nodes: Array, edge: float) -> bool:
-    """Return whether an edge lies between the ends of a mesh, and not on them."""
-    # Conversion of units rounds, so that an end of the mesh may seem to lie just inside of it.
+    """Return whether an edge lies strictly between the ends of a mesh."""
+    # Unit conversion rounds: an edge at an end of the mesh may appear to lie just inside.
     slack = 1e-6 * float(np.ptp(nodes))
     return bool(nodes.min() + slack < edge < nodes.max() - slack)
 
 
 def _check_cells(number: float, where: str) -> None:
-    """Refuse a mesh that is too large to be built here."""
+    """Refuse a mesh without a mesh file that has too many cells."""
     if number > CELLS:
         raise CaseError(
             f"{where}: got {number:.3g} cells; a mesh of a case has at most {CELLS}: take a file "
@@ -304,7 +304,7 @@ def off_nodes(case: CaseContent) -> list[str]:
     found: dict[str, None] = {}
     for what, axis, edge in _layer_edges(case):
         if axis >= len(mesh.p):
-            continue  # such a box is refused later
+            continue  # a later check refuses such a box
         nodes = mesh.p[axis]
         if _inside(nodes, edge) and np.abs(nodes - edge).min() > 1e-6 * np.ptp(nodes):
             found[what] = None
@@ -312,7 +312,7 @@ def off_nodes(case: CaseContent) -> list[str]:
 
 
 def subdomain(case: CaseContent, mesh: Any, name: str, key: str) -> str:
-    """Return the name of a subdomain, which the mesh has to have."""
+    """Return the name of a subdomain; raises `CaseError` if the mesh does not have it."""
     text = f"the mesh has no subdomain '{name}'"
     if not mesh.subdomains:
         remedy = "it has none: name them in its file, or give the sides of this one."
@@ -324,7 +324,7 @@ def subdomain(case: CaseContent, mesh: Any, name: str, key: str) -> str:
 def inside(
     case: CaseContent, given: Any, dimension: int, key: str, *, closed: bool = False
 ) -> Callable[[Any], Any]:
-    """Return whether points x lie in a layer or box; with its upper sides if `closed`."""
+    """Return the indicator function of a layer or box, including its upper sides if `closed`."""
     sides, below = sides_of(case, given, dimension, key), np.less_equal if closed else np.less
     return lambda x: np.logical_and.reduce(
         [(x[k] >= low) & below(x[k], high) for k, (low, high) in enumerate(sides)]
@@ -332,7 +332,7 @@ def inside(
 
 
 def sides_of(case: CaseContent, given: Any, dimension: int, key: str) -> list[tuple[float, float]]:
-    """Return (low, high) for each coordinate."""
+    """Return (low, high) of a layer or box for each coordinate, in the model's unit."""
     if len(given) != 2 * dimension:
         known = {1: "[from, to]", 2: "[x0, x1, y0, y1]"}
         expected = known.get(dimension, "the name of a subdomain")
@@ -353,10 +353,10 @@ def _option_value(case: CaseContent, option: Option, value: Any, key: str) -> An
 
 
 def resolve(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Equation:
-    """Return the equation of a case: a predefined one, or the user's own, 'file.py:name'.
+    """Return the equation of a case: a predefined equation, or user code 'file.py:name'.
 
-    The latter is an `Equation`, or a function that returns a `Model`; then all numbers of the case
-    are used as they are.
+    User code is an `Equation` or a function that returns a `Model`. With a function, numbers are
+    used in the units of the case file.
     """
     name = spec.equation
     if ":" not in name:
@@ -374,7 +374,7 @@ def resolve(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Equat
 
 
 def _plain(name: str, function: Any, spec: CaseSpec, where: str) -> Equation:
-    """Return a bare function as an equation whose units are those the case writes."""
+    """Return an equation for a user's function, with the units that the case file states."""
     channels = spec.channels
     units = (item.unit for item in channels.values() if item.role == "sensor" and item.unit)
     inputs = {key: item.unit for key, item in channels.items() if item.role == "input"}
@@ -397,7 +397,7 @@ def _variables(units: Mapping[str, str | None]) -> dict[str, Variable]:
 
 
 def _checked(name: str, function: Any, where: str) -> Callable[..., Model]:
-    """Return a user's function, which has to return a model; its failures become `CaseError`."""
+    """Wrap a user's function: exceptions, and results that are no `Model`, raise `CaseError`."""
 
     def build(
         mesh: Any, unknowns: Mapping[str, Any], dirichlet: Mapping[str, Any], **options: Any
@@ -414,7 +414,7 @@ def _checked(name: str, function: Any, where: str) -> Callable[..., Model]:
 
 
 def _option(value: Any) -> Option:
-    """Return the option of a bare function: text without a number in front is text."""
+    """Return the option of a user's function: text that does not begin with a number is text."""
     if isinstance(value, str) and value[:1].strip("+-.0123456789 "):
         return Option("", "", value)
     return Option("", "", value if isinstance(value, bool) else None)
@@ -422,7 +422,7 @@ def _option(value: Any) -> Option:
 
 @contextmanager
 def own_code(what: str) -> Iterator[None]:
-    """Raise what fails in code of the user as a `CaseError`; errors of livepde stay as they are."""
+    """Convert exceptions in user code to `CaseError`, except for the errors of livepde."""
     try:
         yield
     except LivepdeError:
@@ -432,9 +432,9 @@ def own_code(what: str) -> Iterator[None]:
 
 
 def load_code(name: str, folder: Path, where: str, expected: str, allowed: bool) -> Any:
-    """Import the object that a case names: 'module:name', or 'file.py:name' in its folder.
+    """Import the object 'module:name', or 'file.py:name' with a file relative to `folder`.
 
-    `where` and `expected` are for messages: file and key, and the signature of the function.
+    `where` (file and key) and `expected` (signature of the function) are used in messages.
     """
     source, colon, attribute = name.rpartition(":")
     if not colon:
@@ -451,7 +451,7 @@ def load_code(name: str, folder: Path, where: str, expected: str, allowed: bool)
 
 
 def check_options(function: Any, given: Iterable[str], where: str) -> None:
-    """Refuse an option that a function does not have; the first argument is not an option."""
+    """Refuse options that are not parameters of a function after its first."""
     _, *known = inspect.signature(function).parameters.values()
     if any(item.kind is inspect.Parameter.VAR_KEYWORD for item in known):
         return
@@ -473,7 +473,7 @@ def _module(source: str, folder: Path, where: str) -> Any:
                 there = beside(Path(source), folder).as_posix()
                 text = f"there is no file '{path}', next to the case; did you mean '{there}'?"
             raise CaseError(f"{where}: {text}")
-        # A file beside the case belongs to no package, so it is loaded by its path.
+        # A file next to the case is not part of a package: it is loaded by its path.
         loader = importlib.util.spec_from_file_location(path.stem, path)
         if loader is None or loader.loader is None:
             raise ImportError(f"{path} is not a Python file")
