@@ -1,4 +1,4 @@
-"""Data of a case: files, times, live sources, and destinations of estimates."""
+"""Data of a case: files, clock, live sources, and destinations of estimates."""
 
 from __future__ import annotations
 
@@ -51,35 +51,35 @@ UNSET = (
     f"{VARIABLE} is not set; set the environment variable LIVEPDE_DATA to the folder that contains "
     "the measurements."
 )
-PASSWORDS = "LIVEPDE_"  # how variables begin that a case may use as passwords
-TOKEN = "LIVEPDE_TOKEN"  # which opens the page and /health, and is no password of a server
+PASSWORDS = "LIVEPDE_"  # prefix of environment variables that a case may use as passwords
+TOKEN = "LIVEPDE_TOKEN"  # grants access to the page and /health; never sent to a server
 LOG = logging.getLogger("livepde.run")
-FAR = 3.0  # ranges of the other values of a row: a value beyond has to be confirmed
-START = "start"  # kind of remark on values of the first rows
-BEGIN = "begin"  # that on rows before the first value of an input
+FAR = 3.0  # gap to the other values of a row, in their ranges, above which a value is suspect
+START = "start"  # kind of remark on outliers in the first rows
+BEGIN = "begin"  # kind of remark on rows before the first value of an input
 LATE = (
     "late requires complete data. For a live source, delay the other channels at the source, or "
     "correct the clock."
 )
-SAME = 1e-9  # of the length of a record: times that differ by less are one moment
+SAME = 1e-9  # tolerance for equal times, as a share of the length of a record
 MOMENT = 1e-6  # seconds, to which dates are rounded
-LEAP = "30 d"  # after a longer pause a second row has to confirm the time
-Data: TypeAlias = str | Iterable[str] | RowSource | None  # a file, lines of JSON, or the case's own
+LEAP = "30 d"  # default pause after which a second row has to confirm the time
+Data: TypeAlias = str | Iterable[str] | RowSource | None  # None: the source in the case file
 
 
 def zone_named(name: str, where: str) -> tzinfo:
-    """Return the time zone of dates that name none; raises `CaseError`."""
+    """Return the time zone with a name; raises `CaseError` if it does not exist."""
     if name == "UTC":
         return UTC
     try:
         return ZoneInfo(name)
-    except (KeyError, OSError, ValueError):  # not found, a folder, not a name at all
+    except (KeyError, OSError, ValueError):  # unknown name, folder, invalid name
         text = f"there is no time zone '{name}'; expected a name such as Europe/Berlin."
         raise CaseError(f"{where}: {text}") from None
 
 
 def missing_in(given: Any, where: str) -> tuple[float | str, ...]:
-    """Return the numbers and texts that mean a missing value; raises `CaseError`."""
+    """Return the checked numbers and texts that mark missing values; raises `CaseError`."""
     try:
         return TypeAdapter(tuple[MissingValue, ...]).validate_python(given or ())
     except ValidationError:
@@ -88,7 +88,7 @@ def missing_in(given: Any, where: str) -> tuple[float | str, ...]:
 
 
 def since_when(unit: str, where: str) -> tuple[str, datetime | None]:
-    """Return a unit of times, and the date since which it counts; raises `CaseError`.
+    """Return a time unit, and its reference date or None; raises `CaseError`.
 
     >>> since_when("d since 1899-12-30", "data.time_unit")
     ('d', datetime.datetime(1899, 12, 30, 0, 0))
@@ -96,7 +96,7 @@ def since_when(unit: str, where: str) -> tuple[str, datetime | None]:
     ('hours', datetime.datetime(1990, 1, 1, 0, 0, tzinfo=datetime.timezone.utc))
     """
     unit, since, origin = unit.partition(" since ")
-    # The CF conventions also allow single digits, and the name of the zone.
+    # The CF conventions also allow single digits and the name of the zone.
     padded = re.sub(r"(?<![\d.])\d(?!\d)", "0\\g<0>", origin.strip())
     date = re.sub(r"\s*(UTC|GMT|Z)$", "+00:00" if ":" in padded else "", padded)
     try:
@@ -107,7 +107,7 @@ def since_when(unit: str, where: str) -> tuple[str, datetime | None]:
 
 
 def clock_of(case: CaseContent, data: DataSpec | None = None) -> Clock:
-    """Return how times are read, by default those of `[data]`."""
+    """Return the clock that reads times according to `data`, by default the table `[data]`."""
     data, unit = data or case.spec.data, case.equation.time_unit
     where = case.where("data.time_unit")
     second = conversion("s", unit, case.where("data.time")).factor if unit else 1.0
@@ -133,14 +133,14 @@ def clock_of(case: CaseContent, data: DataSpec | None = None) -> Clock:
 
 
 def _instant(case: CaseContent, value: Any, key: str) -> Any:
-    """Return a date as it is, a quantity in the model's unit."""
+    """Return dates unchanged, and quantities in the model's unit."""
     if isinstance(value, str) and not DATE.match(value):
         return case.convert(value, case.equation.time_unit, f"data.{key}")
     return value
 
 
 def read_data(case: CaseContent, source: str | Iterable[str] | None) -> DataTable | JsonLines:
-    """Return the data: of the case's file, another file, or lines of JSON as they come."""
+    """Return the data of the case, of another file, or of a stream of JSON lines."""
     spec, columns, clock = case.spec.data, columns_of(case), clock_of(case)
     if not isinstance(source, str | None):
         check_hours(case, clock, source)
@@ -153,8 +153,8 @@ def read_data(case: CaseContent, source: str | Iterable[str] | None) -> DataTabl
 
     needed = [name for name, column in columns.items() if column.needed]
     between = {name: column.between for name, column in columns.items()}
-    # An initial profile needs a reading of each sensor. Readings that are late in their table come
-    # before its start once they are corrected: a stated state is not that of their time.
+    # An initial profile needs a reading of each sensor. Corrected times of late readings precede
+    # the start of their table, where a stated initial state is not valid.
     together = interpolates(case) or bool(delays(case))
     sensors, where = case.roles(*SENSORS), case.where("data.file")
     joined = join_tables(
@@ -173,7 +173,7 @@ def read_data(case: CaseContent, source: str | Iterable[str] | None) -> DataTabl
 def _tables(
     case: CaseContent, source: str | None, columns: Mapping[str, Column], clock: Clock
 ) -> list[DataTable]:
-    """Return the tables of a given file, of the case's reader, or of the files that it names."""
+    """Return the tables of a given file, of the case's reader, or of the case's files."""
     spec = case.spec.data
     if source is None and isinstance(spec.file, tuple):
         return _of_files(case, spec.file, columns)
@@ -193,7 +193,7 @@ def _of_sensors(
     clock: Clock,
     long: tuple[str, str],
 ) -> list[DataTable]:
-    """Return a file with a row for each reading as tables, one for each channel."""
+    """Read a long file, with a row for each reading, into one table for each channel."""
     spec = case.spec.data
     if path.suffix in (".parquet", *JSON_LINES):
         text = f"{path} is not a CSV file; only CSV files can have a row for each reading."
@@ -203,7 +203,7 @@ def _of_sensors(
             key, owner = ("noise_column", column.noise_of) if column.noise_of else ("columns", name)
             text = "requires a table with a column for each sensor: leave it out."
             raise case.error(f"channels.{owner}.{key}", text)
-    # Which rows are needed is decided once they are joined.
+    # Required channels are only checked after the tables are joined.
     columns = {name: replace(column, needed=False) for name, column in columns.items()}
     written: dict[str, Any] = {"separator": spec.separator, "encoding": spec.encoding}
     rows: dict[str, Any] = {"every": spec.every, "missing": spec.missing, "skip": spec.skip}
@@ -211,7 +211,7 @@ def _of_sensors(
 
 
 def _until_stop(case: CaseContent, clock: Clock, table: DataTable) -> DataTable:
-    """Return the rows of a table until stop, once the times of its channels are corrected."""
+    """Return the rows of a table up to `stop`, for a table with corrected times."""
     if not clock.margin:
         return table
     dates, first = table.origin is not None, 0.0
@@ -226,13 +226,13 @@ def _until_stop(case: CaseContent, clock: Clock, table: DataTable) -> DataTable:
 def _on_time(
     case: CaseContent, columns: Mapping[str, Column], tables: list[DataTable]
 ) -> list[DataTable]:
-    """Return tables, those with late channels as several with the times that these should have."""
+    """Return tables with corrected times; each late channel becomes a separate table."""
     late = delays(case)
     if not late:
         return tables
     from livepde.streams.join import not_late
 
-    # The noise of a reading has its time.
+    # The noise of a reading has the same delay as the reading.
     late |= {name: late[of] for name, one in columns.items() if (of := one.noise_of) in late}
     may_lack = {*case.roles(*SENSORS), *(late.keys() - case.spec.channels.keys())}
     each = (
@@ -243,7 +243,7 @@ def _on_time(
 
 
 def delays(case: CaseContent) -> dict[str, float]:
-    """Return channel -> how late its times are, of those that state it."""
+    """Return channel -> delay of its times in the model's unit, for channels that state one."""
     unit, channels = case.equation.time_unit, case.spec.channels
     return {
         name: case.convert(channel.late, unit, f"channels.{name}.late")
@@ -253,13 +253,13 @@ def delays(case: CaseContent) -> dict[str, float]:
 
 
 def refuse_late(case: CaseContent) -> None:
-    """Refuse late channels of a live source."""
+    """Refuse channels with a delay, for live sources."""
     for name in delays(case):
         raise case.error(f"channels.{name}.late", LATE)
 
 
 def check_hours(case: CaseContent, clock: Clock, source: Any) -> None:
-    """Refuse times in two columns of a source that is not a CSV file."""
+    """Refuse times in two columns unless the source is a CSV file."""
     ending = Path(source).suffix if isinstance(source, str) else ""
     if clock.hour and ending in ("", ".parquet", *JSON_LINES):
         text = "times in two columns are read from CSV files only: join them in one column."
@@ -267,7 +267,7 @@ def check_hours(case: CaseContent, clock: Clock, source: Any) -> None:
 
 
 def _read(path: Path, columns: Mapping[str, Column], clock: Clock, spec: DataSpec) -> DataTable:
-    """Return the data of a file; its extension gives the format."""
+    """Return the data of a file, whose extension determines the format."""
     rows: dict[str, Any] = {"every": spec.every, "missing": spec.missing}
     if path.suffix in JSON_LINES:
         return read_json_lines(path, columns, clock, **rows)
@@ -280,7 +280,7 @@ def _read(path: Path, columns: Mapping[str, Column], clock: Clock, spec: DataSpe
 def _of_files(
     case: CaseContent, files: Sequence[FileSpec], columns: Mapping[str, Column]
 ) -> list[DataTable]:
-    """Return several files as tables; each channel comes from one of them."""
+    """Read several files into tables; exactly one file has the column of each channel."""
     specs = [case.spec.data.of(file) for file in files]
     found = []
     for spec in specs:
@@ -292,7 +292,7 @@ def _of_files(
     owners = {name: _owner(case, name, one, found) for name, one in columns.items()}
     tables = []
     for k, (spec, (path, _)) in enumerate(zip(specs, found, strict=True)):
-        # Which rows are needed is decided once they are joined.
+        # Required channels are only checked after the tables are joined.
         own = {
             name: replace(column, decimal=spec.decimal, needed=False)
             for name, column in columns.items()
@@ -307,7 +307,7 @@ def _of_files(
 def _owner(
     case: CaseContent, name: str, column: Column, files: Sequence[tuple[Path, list[str]]]
 ) -> int:
-    """Return the number of the one file, of path and header, that has a column."""
+    """Return the index of the only file (path, header) with a column; raises `CaseError`."""
     places = [k for k, (_, header) in enumerate(files) if set(column.names) <= set(header)]
     if len(places) == 1:
         return places[0]
@@ -321,9 +321,9 @@ def _owner(
 
 
 def without_wild_start(case: CaseContent, table: DataTable) -> DataTable:
-    """Return a record without wild first values, from which no initial state must be made.
+    """Return a record without outliers in its first rows, which would spoil the initial state.
 
-    Rows at the start in which an input lacks its value for that are left out.
+    The record then begins after the last row with an outlier of an input.
     """
     wild = wild_first_rows(table.t, table.values, _comparable(case, table.names))
     if not wild.any():
@@ -340,7 +340,7 @@ def without_wild_start(case: CaseContent, table: DataTable) -> DataTable:
 def wild_start(
     case: CaseContent, rows: Sequence[tuple[float, Mapping[str, float]]]
 ) -> list[tuple[int, str]]:
-    """Return the wild values of the first rows of a live source: row and channel of each."""
+    """Return row and channel of each outlier in the first rows of a live source."""
     names = list(case.spec.channels)
     values = np.array([[row.get(name, math.nan) for name in names] for _, row in rows])
     wild = wild_first_rows(np.array([t for t, _ in rows]), values, _comparable(case, names))
@@ -348,7 +348,7 @@ def wild_start(
 
 
 def suspect_start(case: CaseContent, row: Mapping[str, float]) -> bool:
-    """Return whether a value of the first row lies far from all others of the same quantity."""
+    """Return whether a value of the first row is far from all others of the same quantity."""
     names = list(case.spec.channels)
     for group in _comparable(case, names):
         values = np.sort([x for k in group if math.isfinite(x := row.get(names[k], math.nan))])
@@ -361,11 +361,11 @@ def suspect_start(case: CaseContent, row: Mapping[str, float]) -> bool:
 
 
 def _comparable(case: CaseContent, names: Sequence[str]) -> list[list[int]]:
-    """Return the channels that measure the same component of the state."""
+    """Return groups of channels, as indices of `names`, that measure the same component."""
     groups: dict[str | None, list[int]] = {}
     for k, name in enumerate(names):
         channel = case.spec.channels.get(name)
-        # A channel that is held may leap at any time.
+        # A channel that is constant between readings may jump at any time.
         if channel is None or channel.between != "line" or channel.is_flux:
             continue
         if channel.role in ("boundary", *SENSORS):
@@ -374,11 +374,11 @@ def _comparable(case: CaseContent, names: Sequence[str]) -> list[list[int]]:
 
 
 def _from_first_inputs(case: CaseContent, table: DataTable) -> DataTable:
-    """Return a record from the first row on where all inputs have had a value."""
+    """Return a record from the first row at or before which every input has a value."""
     known, begin, remarks = np.isfinite(table.values), 0, dict(table.remarks)
     for k, name in enumerate(table.names):
         channel = case.spec.channels.get(name)
-        # A mean since the last row is needed at the next one; rows to skip are skipped anyway.
+        # A mean over the last interval is first needed in the second row.
         if not (channel and channel.drives) or channel.between == "next" or channel.gaps == "skip":
             continue
         if not known[:, k].any():
@@ -392,7 +392,7 @@ def _from_first_inputs(case: CaseContent, table: DataTable) -> DataTable:
 
 
 def _from_row(case: CaseContent, table: DataTable, begin: int) -> DataTable:
-    """Return a record from a row on, with the values of held inputs in the rows before it."""
+    """Return a record from a row on; held inputs start with their last value up to that row."""
     values, channels = table.values[begin:].copy(), case.spec.channels
     for k, name in enumerate(table.names if begin else ()):
         stated = table.values[: begin + 1, k]
@@ -403,9 +403,9 @@ def _from_row(case: CaseContent, table: DataTable, begin: int) -> DataTable:
 
 
 def without_gaps(case: CaseContent, table: DataTable) -> DataTable:
-    """Return a finished record without gaps and spikes of the channels that drive the model."""
+    """Return a complete record without gaps and spikes in the channels that drive the model."""
     table, channels = without_wild_start(case, table), case.spec.channels
-    # Of an input without which rows are left out, only rows that state another input remain.
+    # Rows without a value of an input with gaps = "skip" only remain if they state another input.
     filled = [n for n, item in channels.items() if item.drives and item.gaps != "hold"]
     means = [name for name in filled if channels[name].between == "next"]
     screened = [name for name, item in channels.items() if item.screened]
@@ -413,7 +413,7 @@ def without_gaps(case: CaseContent, table: DataTable) -> DataTable:
 
 
 def reader_of(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Any:
-    """Return the function that reads the data; None if a file holds them."""
+    """Return the user function that reads the data; None if the case has no reader."""
     if spec.data.reader is None:
         return None
     expected = "(folder, **options) -> times, {column: values}"
@@ -426,7 +426,7 @@ def reader_of(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Any
 def _from_reader(
     case: CaseContent, reader: Callable[..., Any], columns: Mapping[str, Column], clock: Clock
 ) -> DataTable:
-    """Return the data of the user's function: times, and a mapping from column to values."""
+    """Return the data that a user function returns as times and a mapping column -> values."""
     spec, where = case.spec.data, case.where(f"data.reader: {case.spec.data.reader}")
     folder = _measurements(case)
     with own_code(where):
@@ -445,7 +445,7 @@ def _from_reader(
 
 
 def data_file(case: CaseContent) -> Path:
-    """Return the data file; relative names start at the case file."""
+    """Return the path of the only data file; relative names start at the folder of the case."""
     given = case.spec.data.file
     if given is None:
         raise case.missing("data.file", "name one, or add --data to the command.")
@@ -456,7 +456,7 @@ def data_file(case: CaseContent) -> Path:
 
 
 def _found(case: CaseContent, given: str) -> Path:
-    """Return where a file of the case is; relative names start at the case file."""
+    """Return the path of a data file; relative names start at the folder of the case."""
     if VARIABLE in given:
         if (folder := _measurements(case)) is None:
             raise case.error("data.file", UNSET)
@@ -468,7 +468,7 @@ def _found(case: CaseContent, given: str) -> Path:
 
 
 def _measurements(case: CaseContent) -> Path | None:
-    """Return the folder of measurements that several cases share, if there is one."""
+    """Return the folder of measurements shared by several cases; None if there is none."""
     named = os.environ.get("LIVEPDE_DATA")
     if named:
         return Path(named).absolute()
@@ -482,7 +482,7 @@ def _measurements(case: CaseContent) -> Path | None:
 def time_of(
     case: CaseContent, key: Literal["assimilate_from", "t0"], origin: datetime | None
 ) -> float | None:
-    """Return the model time that a key of `[data]` states; None if it states none."""
+    """Return the model time that a key of `[data]` states; None if the key is missing."""
     value = _instant(case, getattr(case.spec.data, key), key)
     if value is None or isinstance(value, float | int):
         return value
@@ -500,7 +500,7 @@ def time_of(
 def source_of(
     case: CaseContent, data: Data, position: str, passwords: Mapping[str, str] | None = None
 ) -> RowSource:
-    """Return the source of the rows of a case, from a position on: its own if there are no data."""
+    """Return the source of rows, from a position on; `data` None means the case's source."""
     spec, passwords = case.spec.data, passwords or {}
     if isinstance(data, str):
         return _file_source(case, Path(data), position)
@@ -534,7 +534,7 @@ def _file_source(case: CaseContent, path: Path, position: str) -> Follow:
 
 
 def publishers_of(case: CaseContent, passwords: Mapping[str, str]) -> list[Sink]:
-    """Return the sinks that a case names."""
+    """Return the destinations of estimates that the case defines."""
     sinks: list[Sink] = []
     if (spec := case.spec.output.mqtt) is not None:
         broker = _broker(case, spec, "output.mqtt", passwords)
@@ -586,10 +586,10 @@ def _server(
 
 
 def passwords_of(case: CaseContent, own: bool, allowed: Iterable[str]) -> dict[str, str]:
-    """Return the passwords of a case by the key of their connection, before any is opened.
+    """Return key of a connection -> its password, checked before any connection is opened.
 
-    `own`: whether the case's own source is used. `allowed`: environment variables that may be sent,
-    besides those whose names begin with LIVEPDE_.
+    `own`: whether the source in the case file is used. `allowed`: environment variables that may be
+    sent, in addition to those whose names begin with LIVEPDE_.
     """
     spec, allowed, found = case.spec, set(allowed), {}
     sources = {"data.mqtt": spec.data.mqtt, "data.opcua": spec.data.opcua} if own else {}
@@ -598,7 +598,7 @@ def passwords_of(case: CaseContent, own: bool, allowed: Iterable[str]) -> dict[s
         if one is None or one.password_env is None:
             continue
         name, where = one.password_env, f"{key}.password_env"
-        # A case of somebody else must not send any secret of this machine to a server it names.
+        # A case from another author must not send secrets of this machine to its servers.
         if name not in allowed and (name == TOKEN or not name.startswith(PASSWORDS)):
             text = f"the environment variable {name} would be sent to a server that the case names;"
             text += f" if you trust it, add --allow-env {name}, or let the name begin with "
@@ -610,9 +610,9 @@ def passwords_of(case: CaseContent, own: bool, allowed: Iterable[str]) -> dict[s
 
 
 def limits_of(case: CaseContent) -> tuple[Backlog, Retention, float | None]:
-    """Return limits of backlog and retention, and the stated seconds until a source is silent."""
+    """Return limits of backlog and retention, and after how many seconds a source is silent."""
     intake, output = case.spec.intake, case.spec.output
-    # Without this key all estimates are kept.
+    # By default all estimates are kept.
     span = case.positive(output.retain, case.equation.time_unit, "output.retain", math.inf)
     silence = None
     if intake.silence is not None:
@@ -632,7 +632,7 @@ def policy_of(case: CaseContent) -> Policy:
         wait = duration(channel.wait or 0.0, f"channels.{name}.wait")
         filled = channel.gaps == "interpolate"
         habits[name] = Habit(wait, channel.repeated, filled, channel.screened, channel.between)
-    # Without a unit of time 30 days cannot be converted: then any pause is accepted.
+    # If the model has no time unit, 30 days cannot be converted, and any pause is accepted.
     leap = case.convert(LEAP, unit, "intake.leap") if unit else math.inf
     leap = case.positive(spec.leap, unit, "intake.leap", leap)
     return Policy(

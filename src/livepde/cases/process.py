@@ -1,4 +1,4 @@
-"""Process of a case: equation with conditions and sources, unknowns, inputs, model."""
+"""Process of a case: model from equation, boundary conditions, sources, unknowns and inputs."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from livepde.observation.functionals import in_cells
 from livepde.runs.summary import LAYERS, SURFACES
 from livepde.units import conversion
 
-HELD = 1e4  # transfer coefficient at a boundary that is held, over D and the size of a cell
+HELD = 1e4  # transfer coefficient h of a boundary value with an offset, in units of D / cell size
 
 
 def model_of(case: CaseContent) -> Model:
-    """Return the model of a case; raises `CaseError` on missing or superfluous parts."""
+    """Return the model of a case; raises `CaseError` if parts are missing or superfluous."""
     inputs = case.roles("input")
     case.only(inputs, case.equation.inputs, "channels (role input)")
     constants = case.constants
@@ -55,8 +55,8 @@ def model_of(case: CaseContent) -> Model:
 
 
 def _built(case: CaseContent, unknowns: Mapping[str, Any]) -> Model:
-    """Return the model of the equation with some unknowns, before constants and own unknowns."""
-    # An optional input switches on the term that reads it.
+    """Return the equation's model, without constant inputs and the unknowns of the sensors."""
+    # An optional input enables the term that reads it.
     switched = case.equation.options.keys() & {*case.roles("input"), *case.constants}
     options = {**case.options, **dict.fromkeys(switched, True)}
     return case.equation.build(case.mesh, unknowns, _dirichlet(case), **options)
@@ -65,28 +65,28 @@ def _built(case: CaseContent, unknowns: Mapping[str, Any]) -> Model:
 def _check_inputs(
     case: CaseContent, model: Model, given: set[str], constants: Iterable[str]
 ) -> None:
-    """Refuse inputs that the model reads and the case lacks, and inputs that nothing reads."""
-    # Only the built model knows which optional inputs it reads with these unknowns.
+    """Refuse missing inputs that the model reads, and inputs that it does not read."""
+    # Which optional inputs are read depends on the unknowns: only the built model knows.
     for name in model.inputs:
         if name not in given:
             known = case.equation.inputs.get(name)
             what = f"the {known.text}" if known else "the equation reads it"
             raise _without_input(case, name, what)
-    # What nothing reads is refused, since a user may believe that it acts.
+    # Inputs that are not read are refused, since a user may believe that they have an effect.
     for key in _unread(case, model, constants):
         text = "the equation does not read it with these unknowns; leave it out."
         raise case.error(key, text)
 
 
 def _unread(case: CaseContent, model: Model, constants: Iterable[str]) -> list[str]:
-    """Return the keys of the inputs that a model does not read."""
+    """Return the keys of the case's inputs that a model does not read."""
     given = [(f"channels.{toml_key(name)}", name) for name in case.roles("input")]
     given += [(f"inputs.{toml_key(name)}", name) for name in constants]
     return [key for key, name in given if name not in model.inputs]
 
 
 def unread_without(case: CaseContent, unknown: str) -> list[str]:
-    """Return the keys of the inputs that the equation reads for an unknown alone."""
+    """Return the keys of the inputs that the equation does not read without an unknown."""
     unknowns = {name: one for name, one in _unknowns(case).items() if name != unknown}
     return _unread(case, _built(case, unknowns), case.constants)
 
@@ -97,7 +97,7 @@ def _without_input(case: CaseContent, name: str, what: str) -> CaseError:
 
 
 def _dirichlet(case: CaseContent) -> dict[str, Any]:
-    # "boundary" is all of it, also of a mesh without named boundaries.
+    # "boundary" is the whole boundary, even if the mesh has no named boundaries.
     known = [*(case.mesh.boundaries or {}), "boundary"]
     values: dict[str, Any] = {}
     for name, given in case.spec.boundary.items():
@@ -105,7 +105,7 @@ def _dirichlet(case: CaseContent) -> dict[str, Any]:
             values[name] = case.convert(given.value, case.equation.state.unit, f"boundary.{name}")
             case.require(name, known, "boundary", f"no boundary '{name}'")
     for name, channel in case.roles("boundary").items():
-        if channel.offset is not None:  # an exchange, see `_near`
+        if channel.offset is not None:  # imposed by an exchange, see `_near`
             continue
         key, at = f"channels.{name}.at", str(channel.at)
         case.require(at, known, key, f"no boundary '{at}'")
@@ -126,7 +126,7 @@ def _unknowns(case: CaseContent) -> dict[str, Any]:
 
 
 def _unknown(case: CaseContent, name: str, spec: UnknownSpec) -> Any:
-    """Return an unknown with its prior in the model's unit; plain numbers are in `spec.unit`."""
+    """Return an unknown in the model's unit; numbers without a unit are in `spec.unit`."""
     key, unit = f"unknowns.{name}", case.equation.unknowns[name].unit
     with case.located(key, SpaceError):
         options = _options_of(case, spec, unit, key)
@@ -136,7 +136,7 @@ def _unknown(case: CaseContent, name: str, spec: UnknownSpec) -> Any:
             return fem.Scalar(**options, corrects=name in map(_offset_label, _shifted(case)))
         places = {region: item.over for region, item in spec.regions.items()}
         regions = _regions(case, places, f"{key}.regions")
-        # A region may state a prior of its own; the others share that of the unknown.
+        # A region may state its own prior; the others use the prior of the unknown.
         own = {}
         for region, item in spec.regions.items():
             if (there := spec.at(item)) is not None:
@@ -147,7 +147,7 @@ def _unknown(case: CaseContent, name: str, spec: UnknownSpec) -> Any:
 
 
 def _options_of(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> dict[str, Any]:
-    """Return prior, evolution and within in the model's unit, and that unit."""
+    """Return prior, unit, within and evolution of an unknown, in the model's unit."""
     prior = _prior(case, spec, unit, key)
     options: dict[str, Any] = {"prior": prior, "unit": unit, "within": spec.within}
     if spec.evolution is not None:
@@ -156,12 +156,12 @@ def _options_of(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> di
 
 
 def prior_of(case: CaseContent, name: str) -> float:
-    """Return the value of an unknown before the data, in the model's unit."""
+    """Return the prior value of an unknown in the model's unit."""
     return value_of(case, name, case.spec.unknowns[name].prior, f"unknowns.{name}.prior")
 
 
 def value_of(case: CaseContent, name: str, value: float | str, key: str) -> float:
-    """Return a value of an unknown in the model's unit; a number is in the unit that it states."""
+    """Return a value of an unknown in the model's unit; numbers are in the unknown's `unit`."""
     unit = case.equation.unknowns[name].unit
     if isinstance(value, str):
         return case.convert(value, unit, key)
@@ -170,12 +170,12 @@ def value_of(case: CaseContent, name: str, value: float | str, key: str) -> floa
 
 
 def _prior(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> fem.Prior:
-    """Return the prior in the model's unit."""
+    """Return the prior of an unknown in the model's unit."""
     rule = conversion(spec.unit or unit, unit, case.where(f"{key}.unit"))
 
     def value(given: float | str, item: str) -> float:
         if isinstance(given, str):
-            # An equation of the user's own may declare no unit, and then text cannot be converted.
+            # A user's equation may define no unit, and then text cannot be converted.
             if not unit and ":" in case.spec.equation:
                 text = f"got '{given}'; '{case.spec.equation}' defines no units: "
                 text += f"add `{key}.unit`, or write numbers."
@@ -184,7 +184,7 @@ def _prior(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> fem.Pri
         return rule.factor * given + rule.offset
 
     prior = value(spec.prior, "prior")
-    # A standard deviation is a difference, so the offset of a unit as degC does not apply.
+    # A standard deviation is a difference: the offset of a unit such as degC does not apply.
     given = spec.std if isinstance(spec.std, str) else rule.factor * spec.std
     std = case.positive(given, unit, f"{key}.std")
     low, high = -np.inf, np.inf
@@ -209,7 +209,7 @@ def _transformed(
     bounds: tuple[float, float],
     key: str,
 ) -> fem.Prior:
-    """Return the prior of an unknown with a transform; errors name the keys of the case."""
+    """Return the prior of an unknown with a transform; raises `CaseError`."""
     low, high = bounds
     if transform == "log":
         if np.isfinite(high):
@@ -227,10 +227,10 @@ def _transformed(
 def _evolution(
     case: CaseContent, unknown: UnknownSpec, spec: EvolutionSpec, unit: str, key: str
 ) -> fem.Evolution:
-    """Return the evolution of an unknown; a rate is a standard deviation after one unit of time."""
+    """Return the evolution of an unknown; the rate is its std after one unit of time."""
     time = case.equation.time_unit
     if spec.rate is not None:
-        # A rate is a difference, of the logarithm under a transform; "degC" cannot be divided.
+        # A rate is a difference (under a transform, of the latent value); "degC" has no quotients.
         moving = "1" if unknown.transform or not unit else unit.replace("degC", "K")
         per = f"({moving})/({time})**0.5" if time else moving.removeprefix("1")
         rate = case.positive(spec.rate, per, f"{key}.rate")
@@ -248,19 +248,19 @@ def _field(case: CaseContent, spec: UnknownSpec, name: str, given: Mapping[str, 
     third, key = float(np.ptp(mesh.p[0])) / 3, f"unknowns.{name}.length"
     length = case.positive(spec.length, case.equation.length_unit, key, third)
 
-    # In one dimension the covariance is std^2 exp(-|x - y|/length) inside. In two and three the
-    # pointwise variance of H^1 would be infinite, so that it takes H^2.
+    # In one dimension the covariance in the interior is std^2 exp(-|x - y|/length). In two and
+    # three dimensions the pointwise variance for H^1 would be infinite: H^2 is used.
     dimension = len(mesh.p)
     inner = fem.Sobolev(1 if dimension == 1 else 2, length).pointwise(dimension)
-    # A transform acts on each coefficient, which in linear elements is the value at a node.
+    # A transform acts on coefficients, which are the values at nodes for linear elements.
     element = fem.linear(mesh) if spec.transform else case.equation.element(mesh)
     return fem.Field(mesh, element, inner=inner, **given)
 
 
 def _regions(case: CaseContent, regions: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """Return subdomains of the mesh by name, and predicates of layers and boxes."""
+    """Return name -> subdomain of the mesh, or indicator function of a layer or box."""
     mesh, unit = case.mesh, case.equation.length_unit
-    # Midpoints of cells decide, since a vertex on an interface would belong to two regions.
+    # Midpoints of cells are tested, since a vertex on an interface would be in two regions.
     middle = mesh.p[:, mesh.t].mean(axis=1)
     count = np.zeros(middle.shape[1])
     found: dict[str, Any] = {}
@@ -291,7 +291,7 @@ def _regions(case: CaseContent, regions: Mapping[str, Any], key: str) -> dict[st
 
 
 def _wall_layers(case: CaseContent, model: Model) -> dict[str, float]:
-    """Return label of a conductivity that is a number -> thickness; empty if there is no wall."""
+    """Return label of a scalar conductivity -> thickness of its layer; empty without a wall."""
     name, space = case.equation.conductivity, model.parameter_space
     unit = case.equation.unknowns[name].unit if name else ""
     if unit != "W/(m K)" or len(case.mesh.p) != 1:
@@ -302,7 +302,7 @@ def _wall_layers(case: CaseContent, model: Model) -> dict[str, float]:
 
 
 def wall_attributes(case: CaseContent, model: Model) -> dict[str, Any]:
-    """Return the attributes of a dataset by which the resistance of a wall, if any, is reported."""
+    """Return the dataset attributes from which a wall's thermal resistance is computed, if any."""
     layers, given = _wall_layers(case, model), case.spec.output.surface_resistances
     if given is None:
         return {LAYERS: json.dumps(layers)} if layers else {}
@@ -335,7 +335,7 @@ def process_notes(case: CaseContent, model: Model) -> Iterator[str]:
 
 
 def _off_nodes_remedy(spec: MeshSpec) -> str:
-    """Return how the ends of layers and sources become borders of cells."""
+    """Return the remedy for ends of layers and sources inside cells."""
     if spec.file is not None:
         return "Name a subdomain of the mesh file in `over`, or use smaller cells"
     if spec.cells is not None:
@@ -346,17 +346,17 @@ def _off_nodes_remedy(spec: MeshSpec) -> str:
 def _undriven(case: CaseContent, model: Model) -> bool:
     """Return whether only the initial state drives the process.
 
-    Without values on boundaries and without inputs, a state that is the same everywhere neither
-    changes nor depends on the unknowns if A'(q), B and F vanish there. Left out are periodic
-    states, which carry waves, and own equations, which need not be defined for any state.
+    Without boundary values and inputs, a constant state neither changes nor depends on the unknowns
+    if A'(q), B and F vanish at it. Periodic states, which carry waves, and user equations, which
+    may not be defined for every state, are not tested.
     """
     blocks = model.state_space.fields.values()
     held = any(block.field.boundary_values or block.field.periodic for block in blocks)
     own = ":" in case.spec.equation
     if own or held or model.channels or model.form_initial is not None:
         return False
-    # Terms at a constant state are compared with those at an uneven one, which give their size:
-    # rounding leaves no exact zeros.
+    # Rounding leaves no exact zeros: terms at a constant state are compared with their size at a
+    # nonuniform state.
     level = model.state_space.interpolate(1.0)
     uneven = level * (1.0 + np.arange(len(level)) % 3)
     flat, steep = (abs(model.A(u).matrix).max(axis=0).toarray() for u in (level, uneven))
@@ -365,7 +365,7 @@ def _undriven(case: CaseContent, model: Model) -> bool:
 
 
 def conditioned(case: CaseContent) -> CaseContent:
-    """Return the case whose equation has the fluxes and sources of the case, and their names."""
+    """Return the case with its fluxes, sources and offsets of boundary values in the equation."""
     case = _with_offsets(case)
     spec, equation = case.spec, case.equation
     given = {name: item for name, item in spec.boundary.items() if item.passes}
@@ -393,10 +393,10 @@ def conditioned(case: CaseContent) -> CaseContent:
 
 @dataclass(frozen=True, eq=False)
 class _Conditioned:
-    """The model of a case's equation with its fluxes and sources."""
+    """Builder of a model with the fluxes and sources of a case, for `Equation.build`."""
 
-    case: CaseContent  # before its equation has them
-    unknowns: Mapping[str, Variable]  # that they name
+    case: CaseContent  # with the equation before fluxes and sources are added
+    unknowns: Mapping[str, Variable]  # unknowns of fluxes and sources
     boundary: Mapping[str, list[Flux | Exchange]]
     sources: Mapping[str, tuple[Amount, Any]]
     per: str | None
@@ -405,7 +405,7 @@ class _Conditioned:
         self, mesh: Any, unknowns: Mapping[str, Any], dirichlet: Mapping[str, Any], **options: Any
     ) -> Model:
         case = self.case
-        # The equation gets its own unknowns; those of fluxes and sources are added afterwards.
+        # The unknowns of fluxes and sources are added after the model of the equation is built.
         more = {name: item for name, item in unknowns.items() if name in self.unknowns}
         own = {name: item for name, item in unknowns.items() if name not in more}
         for name in self.boundary:
@@ -422,7 +422,7 @@ class _Conditioned:
 def _boundary(
     names: _ConditionNames, units: Fluxes, given: Mapping[str, BoundarySpec]
 ) -> dict[str, list[Flux | Exchange]]:
-    """Return the conditions of boundaries with a flux, or with an unknown offset of the value."""
+    """Return boundary -> its conditions, for a flux or an unknown offset of its value."""
     case = names.case
     found = {name: _passing(names, units, name, item) for name, item in given.items()}
     for name, channel in _shifted(case).items():
@@ -436,7 +436,7 @@ def _boundary(
 def _without_conditions(
     case: CaseContent, given: Iterable[str], shifted: Iterable[str]
 ) -> CaseError:
-    """Return an error about conditions of a case whose equation takes none."""
+    """Return the error for conditions and sources that the equation does not support."""
     name = case.equation.name
     keys = [*(f"boundary.{n}" for n in given), *(f"sources.{n}" for n in case.spec.sources)]
     if not keys:
@@ -449,7 +449,7 @@ def _without_conditions(
 
 
 def _shifted(case: CaseContent) -> dict[str, ChannelSpec]:
-    """Return the boundary values with an unknown offset."""
+    """Return the boundary channels with an unknown offset."""
     return {n: one for n, one in case.roles("boundary").items() if one.offset is not None}
 
 
@@ -458,7 +458,7 @@ def _offset_label(name: str) -> str:
 
 
 def _with_offsets(case: CaseContent) -> CaseContent:
-    """Return the case with an unknown for each offset of a boundary value."""
+    """Return the case with an additional unknown for each offset of a boundary value."""
     added: dict[str, UnknownSpec] = {}
     for name, channel in _shifted(case).items():
         label, key = _offset_label(name), f"channels.{name}.offset"
@@ -473,10 +473,10 @@ def _with_offsets(case: CaseContent) -> CaseContent:
 
 
 def _near(names: _ConditionNames, name: str) -> list[Flux | Exchange]:
-    """Return the conditions of a boundary that is held at a channel less its unknown offset.
+    """Return the conditions that impose u = channel - offset, with an unknown offset.
 
-    They are D u_n = h (channel - offset - u), with an h so large that u differs from the value by
-    1e-4 of its change over a cell.
+    They are D u_n = h (channel - offset - u), with h so large that u differs from the imposed value
+    by 1e-4 of its change over a cell.
     """
     case, label = names.case, _offset_label(name)
     state = case.equation.state.unit
@@ -489,9 +489,9 @@ def _near(names: _ConditionNames, name: str) -> list[Flux | Exchange]:
 
 
 def _check_drive(case: CaseContent, storage: str) -> None:
-    """Refuse an unknown heat capacity where no flux, exchange or source is known.
+    """Refuse an unknown heat capacity if no flux, exchange or source is known.
 
-    The equation and all its unknowns can be multiplied by a number then.
+    The equation and all its unknowns could then be multiplied by an arbitrary factor.
     """
     spec = case.spec
     amounts = [amount for item in spec.boundary.values() for amount in (item.flux, item.transfer)]
@@ -510,7 +510,7 @@ def _check_drive(case: CaseContent, storage: str) -> None:
 def _passing(
     names: _ConditionNames, units: Fluxes, name: str, given: BoundarySpec
 ) -> list[Flux | Exchange]:
-    """Return the flux through a boundary."""
+    """Return the flux and exchange conditions of a boundary."""
     found: list[Flux | Exchange] = []
     key = f"boundary.{name}"
     if given.flux is not None:
@@ -525,14 +525,14 @@ def _passing(
 
 @dataclass
 class _ConditionNames:
-    """Unknowns and channels that the conditions of a case name, with their units."""
+    """Collector of the unknowns and inputs in the conditions of a case, with their units."""
 
     case: CaseContent
     unknowns: dict[str, Variable] = field(default_factory=dict)
     inputs: dict[str, Variable] = field(default_factory=dict)
 
     def amount(self, value: float | str, unit: str, key: str) -> Amount:
-        """Return a number in the model's unit, a channel, or the name of an unknown."""
+        """Return an amount: a number in the model's unit, a channel, or the name of an unknown."""
         spec = self.case.spec
         if isinstance(value, str) and value in spec.unknowns:
             self._named("unknowns", value, unit, key)
@@ -542,7 +542,7 @@ class _ConditionNames:
                 raise self.case.error(key, f"the channel '{value}' has to be of role 'input'.")
             self._named("inputs", value, unit, key)
             return fem.Channel(value)
-        # Text without a digit is no quantity: a name was meant.
+        # Text without a digit is a misspelt name, not a quantity.
         if isinstance(value, str) and not any(letter.isdigit() for letter in value):
             text = f"there is no unknown and no channel '{value}'; "
             text += did_you_mean(value, [*spec.unknowns, *spec.channels])
@@ -550,9 +550,9 @@ class _ConditionNames:
         return self.case.convert(value, unit, key)
 
     def _named(self, what: str, name: str, unit: str, key: str) -> None:
-        """Note an unknown or an input that a condition names."""
+        """Register an unknown or an input of a condition; raises `CaseError` on a conflict."""
         found, taken = getattr(self, what), getattr(self.case.equation, what)
-        # Several conditions may share a name, if it has the same unit in all of them.
+        # Several conditions may share a name if it has the same unit in all of them.
         before, clash = found.get(name) or taken.get(name), what == "unknowns" and name in taken
         if before is not None and (clash or before.unit != unit):
             text = f"'{name}' is the {before.text} [{before.unit}] already; take another name."
@@ -561,7 +561,7 @@ class _ConditionNames:
 
 
 def _place(case: CaseContent, mesh: Any, over: Any, name: str) -> Any:
-    """Return the region of a source: the name of a subdomain, or a predicate on x."""
+    """Return the region of a source: the name of a subdomain, or an indicator function of x."""
     key = f"sources.{name}.over"
     if isinstance(over, str):
         return subdomain(case, mesh, over, key)
