@@ -1,4 +1,4 @@
-"""Schema of the tables of a case file that say where rows come from, as pydantic models."""
+"""Schema of the tables of a case file that describe sources of rows, as pydantic models."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class MqttSpec(BrokerSpec):
         return self
 
 
-# Policy, mode, certificate and key, and perhaps the certificate of the server.
+# Policy, mode, certificate and key, and optionally the certificate of the server.
 SECURITY = (
     "^(Basic256Sha256|Aes128Sha256RsaOaep|Aes256Sha256RsaPss),(Sign|SignAndEncrypt)(,[^,:]+){2,3}$"
 )
@@ -146,22 +146,22 @@ class DataSpec(Spec):
 
     @property
     def long(self) -> tuple[str, str] | None:
-        """The columns of sensors and of values of a table with a row for each reading."""
+        """The columns of sensors and values, if the table has a row for each reading."""
         return None if self.sensor is None or self.value is None else (self.sensor, self.value)
 
     def of(self, file: FileSpec) -> DataSpec:
-        """Return the table of one of several files."""
+        """Return `[data]` with the overrides of one of several files."""
         own = {key: getattr(file, key) for key in file.model_fields_set}
         return self.model_copy(update=own)
 
     @property
     def times(self) -> tuple[str, ...]:
-        """The columns of times: one, or days and times of day."""
+        """The time column, or the columns of days and times of day."""
         return (self.time,) if isinstance(self.time, str) else self.time
 
     @property
     def is_of_file(self) -> bool:
-        """Whether keys state what only a complete file has, such as titles or columns of times."""
+        """Whether a key requires a complete file: skipped lines, two time columns, long table."""
         return bool(self.long) or (not self.follow and (self.skip > 0 or len(self.times) > 1))
 
     @property

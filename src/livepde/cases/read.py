@@ -1,4 +1,4 @@
-"""Reader of case files: TOML, with settings from outside, to a checked specification."""
+"""Reader of case files: from TOML text and settings to a checked specification."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from livepde.cases.schema import CaseSpec
 from livepde.errors import CaseError
 from livepde.units import LARGEST
 
-BLANK = "?"  # how a value begins that is still to be filled in
-LONGEST = 1_000_000  # bytes of a case file
-DATA = (".csv", ".txt", ".jsonl", ".parquet", ".xlsx")  # endings of what is no case
-SHOWN = 60  # characters of a line that is shown
-LONGEST_SHOWN = 200  # characters of a value that is shown
+BLANK = "?"  # prefix of a value that is still to be filled in
+LONGEST = 1_000_000  # largest size of a case file in bytes
+DATA = (".csv", ".txt", ".jsonl", ".parquet", ".xlsx")  # extensions of data files
+SHOWN = 60  # characters of a line in a message
+LONGEST_SHOWN = 200  # characters of a value in a message
 
-NAMED = ("unknowns", "channels")  # tables whose members are the case's own
-DEPTH = 32  # tables, lists and parts of a key within one another
-COUNTS = {  # keys that say how much is kept or tried -> the most
+NAMED = ("unknowns", "channels")  # tables whose keys are names that the case chooses
+DEPTH = 32  # largest depth of nested tables and lists, and number of parts of a key
+COUNTS = {  # keys that determine memory or computing time -> largest number
     "every": 1_000_000,
     "fields_every": 1_000_000_000,
     "harmonics": 100,
@@ -42,15 +42,15 @@ COUNTS = {  # keys that say how much is kept or tried -> the most
     "thin": 1_000_000_000,
     "window": 100_000,
 }
-OTHER = 1_000_000_000  # of any other whole number
-FREE = ("data.missing",)  # keys whose numbers only stand for something
-NAMES = 10_000  # of a table
-LONG_KEY = 200  # characters of a name
+OTHER = 1_000_000_000  # largest whole number of other keys
+FREE = ("data.missing",)  # keys whose numbers are only markers and have no limit
+NAMES = 10_000  # largest number of keys in a table
+LONG_KEY = 200  # largest number of characters of a name
 NAME = re.compile(r"[\w\"'-]+")
 DOTTED = re.compile(r"(?:a\s?\.\s?){" + str(DEPTH) + "}")
 DIGITS = re.compile(r"[0-9_]{400}")
 
-# Type of pydantic's error -> what the message expects.
+# Type of pydantic's error -> expected value in the message.
 EXPECTED = {
     "int_type": "a whole number",
     "int_parsing": "a whole number",
@@ -69,12 +69,12 @@ EXPECTED = {
     "too_short": "at least one entry",
     "string_too_short": "a name",
 }
-CLASS = re.compile(r"[A-Z][a-z]\w*: ")  # how a message of options begins
-UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")  # of a model, of a dataclass
+CLASS = re.compile(r"[A-Z][a-z]\w*: ")  # prefix of a message about options of a law
+UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")  # for models, for dataclasses
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a case file."""
+    """Return the text of a case file; raises `CaseError`."""
     if path.suffix in DATA:
         raise CaseError(
             f"{path}: is data, not a case. 'livepde init DIR --data {path}' begins one."
@@ -99,7 +99,7 @@ def read_text(path: Path) -> str:
 
 
 def _nearest(folder: Path, name: str) -> str:
-    """Return where a case of this name may be: in a folder, or one below."""
+    """Return a hint to a case file with a similar name in a folder or its subfolders."""
     known = [*folder.glob("*.toml"), *folder.glob("*/*.toml")]
     names = difflib.get_close_matches(name, [item.name for item in known], n=1, cutoff=0.75)
     near = [item for item in known if item.name in names] or known[: len(known) == 1]
@@ -108,14 +108,14 @@ def _nearest(folder: Path, name: str) -> str:
 
 def read_toml(text: str, where: str) -> dict[str, Any]:
     """Return the document of a case file; raises `CaseError`."""
-    # A document that would take long to read is refused before it is read.
+    # Documents that would take long to parse are refused before parsing.
     if DOTTED.search(NAME.sub("a", text)):
         raise CaseError(f"{where}: a key has more than {DEPTH} parts; a case needs few.")
     if DIGITS.search(text):
         raise CaseError(f"{where}: a number has 400 digits or more; write it shorter, as 2.5e9.")
     try:
         document = tomllib.loads(text)
-    except (RecursionError, ValueError) as error:  # or a number or a date that Python cannot hold
+    except (RecursionError, ValueError) as error:  # also numbers and dates beyond Python's range
         line = _line(text, str(error)) if isinstance(error, tomllib.TOMLDecodeError) else ""
         raise CaseError(f"{where}: is not valid TOML: {error}{line}.") from None
     _check_document(document, where)
@@ -123,7 +123,7 @@ def read_toml(text: str, where: str) -> dict[str, Any]:
 
 
 def _line(text: str, reason: str) -> str:
-    """Return the line of a TOML file that an error message names, with the usual causes."""
+    """Return the line to which an error message of TOML refers, with the usual causes."""
     number = re.search(r"at line (\d+)", reason)
     line = re.split(r"\s+#", text.splitlines()[int(number[1]) - 1])[0].strip() if number else ""
     if not line:
@@ -144,7 +144,7 @@ def read_spec(raw: Mapping[str, Any], where: str) -> CaseSpec:
 
 
 def spec_of(raw: Mapping[str, Any], where: str) -> CaseSpec:
-    """Return the checked content of a document that may still have blanks."""
+    """Return the checked content of a document that may contain blanks; raises `CaseError`."""
     try:
         return CaseSpec.model_validate(raw)
     except ValidationError as error:
@@ -152,14 +152,14 @@ def spec_of(raw: Mapping[str, Any], where: str) -> CaseSpec:
 
 
 def is_blank(value: Any) -> bool:
-    """Return whether a value is still to be filled in: '?', '? m', or a list that holds one."""
+    """Return whether a value is still to be filled in: '?', '? m', or a list with such a value."""
     if isinstance(value, list):
         return any(map(is_blank, value))
     return isinstance(value, str) and value.split(" ")[0] == BLANK
 
 
 def blanks_in(document: Mapping[str, Any], table: str = "") -> dict[str, Any]:
-    """Return key -> value of what `livepde init --data` has left open: '?', '? m'."""
+    """Return key -> value of all blanks, such as '? m', that `livepde init --data` has written."""
     found: dict[str, Any] = {}
     for name, value in document.items():
         key = f"{table}.{name}" if table else name
@@ -171,8 +171,8 @@ def blanks_in(document: Mapping[str, Any], table: str = "") -> dict[str, Any]:
 
 
 def beside(path: Path, folder: Path) -> Path:
-    """Return where a file is, seen from a folder; whole where it is on another drive."""
-    try:  # '..' of a link leads away from what it links to
+    """Return the path of a file relative to a folder; absolute if it is on another drive."""
+    try:  # links are resolved, since '..' of a link is not the parent of its target
         return Path(os.path.relpath(path.parent.resolve() / path.name, folder.resolve()))
     except ValueError:
         return path.absolute()
@@ -188,8 +188,8 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
-    # A misspelt key makes two errors, one extra and one missing: the extra one says it better. And
-    # where true, false, a list or a table may stand, a table is not wrong for being another.
+    # A misspelt key causes two errors, an unknown and a missing key: the first is more useful. If
+    # booleans, lists and tables are allowed, a table is not wrong because it is not a boolean.
     def rank(item: Any) -> tuple[bool, bool]:
         table = item["type"] in ("bool_type", "tuple_type") and isinstance(item["input"], dict)
         return item["type"] not in UNKNOWN_KEY, table
@@ -211,7 +211,7 @@ def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
     if kind == "literal_error":
         return f"{key}: got {_short(got)}; {did_you_mean(str(got), _choices(context['expected']))}"
     if kind == "value_error":
-        # Options of a law refuse a value themselves: "Guards: reach must be a positive number."
+        # Options of a law check their values: "Guards: reach must be a positive number."
         message = CLASS.sub("", str(context["error"]), count=1).removesuffix(".")
         shown = "" if isinstance(got, dict) else f"got {_short(got)}; "
         return f"{key}: {shown}{message}."
@@ -223,18 +223,18 @@ def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
 
 
 def _choices(expected: str) -> list[str]:
-    """Return the words that a message of pydantic quotes."""
+    """Return the quoted words in a message of pydantic."""
     return re.findall(r"'([^']*)'", expected)
 
 
 def _short(value: Any) -> str:
-    """Return a value as it is shown in a sentence."""
+    """Return a value as text for a message, shortened if it is long."""
     text = repr(value)
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
 
 
 def _path(loc: tuple[int | str, ...], raw: Any, missing: bool) -> list[str]:
-    """Return the keys of an error as the file has them, without pydantic's own tags."""
+    """Return the location of an error as keys of the file, without the tags of pydantic."""
     path: list[str] = []
     here = raw
     for k, part in enumerate(loc):
@@ -250,15 +250,15 @@ def _path(loc: tuple[int | str, ...], raw: Any, missing: bool) -> list[str]:
 
 
 def _keys(path: Iterable[str], raw: Mapping[str, Any]) -> list[str]:
-    """Return the keys that a table may have."""
+    """Return the valid keys of the table at a path."""
     here: Any = raw
     kinds: list[Any] = [CaseSpec]
     for part in path:
-        key, _, number = part.partition("[")  # variants[0] is one of the variants
+        key, _, number = part.partition("[")  # variants[0]: entry 0 of a list
         here = here[key][int(number[:-1])] if number else here[key]
         below = [get_args(one)[1] if _is_named(one) else _fields(one).get(key) for one in kinds]
         kinds = [inner for one in below for inner in _tables(one)]
-    # Of several laws it is the one that the table names.
+    # If several laws are possible, `kind` of the table selects one.
     tables = map(_fields, kinds)
     kind = here.get("kind", "sensitivity")
     fits = (known for known in tables if kind in get_args(known.get("kind", Literal[kind])))
@@ -266,7 +266,7 @@ def _keys(path: Iterable[str], raw: Mapping[str, Any]) -> list[str]:
 
 
 def _tables(kind: Any) -> Iterator[Any]:
-    """Yield the tables among the types that a value may have, and mappings from names."""
+    """Yield the tables and the mappings from names among the types of a value."""
     if _is_named(kind) or _fields(kind):
         yield kind
     else:
@@ -279,14 +279,14 @@ def _is_named(kind: Any) -> bool:
 
 
 def _fields(kind: Any) -> dict[str, Any]:
-    """Return key -> type of a table; empty for another type."""
+    """Return key -> type of a table; empty if the type is not a table."""
     if isinstance(kind, type) and issubclass(kind, BaseModel):
         return {item.alias or name: item.annotation for name, item in kind.model_fields.items()}
     return get_type_hints(kind) if isinstance(kind, type) and is_dataclass(kind) else {}
 
 
 def parse(assignments: Iterable[str]) -> dict[str, Any]:
-    """Return key -> value of texts such as 'law.noise=2 K'; values are TOML, or else text.
+    """Return key -> value for texts such as 'law.noise=2 K'; values are TOML or plain text.
 
     >>> parse(["law.noise=2 K", "data.every=2", "expect="])
     {'law.noise': '2 K', 'data.every': 2, 'expect': None}
@@ -307,11 +307,10 @@ def parse(assignments: Iterable[str]) -> dict[str, Any]:
 
 
 def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return a case's document with other values.
+    """Return a copy of a case's document with settings applied; raises `CaseError`.
 
-    `settings`: key as in the file, 'law.noise' or 'unknowns.k.regions."0-1"' -> value. A table sets
-    the keys in it and leaves the others; None removes the key. A table for a new unknown or channel
-    adds it.
+    `settings`: key as in the file, 'law.noise' or 'unknowns.k.regions."0-1"' -> value. A table only
+    changes its own keys; None removes the key. A table for a new unknown or channel adds it.
     """
     changed = copy.deepcopy(dict(document))
     for key, given in settings.items():
@@ -331,7 +330,7 @@ def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) 
 def _table_of(
     document: dict[str, Any], path: tuple[str, ...], where: str, *, adds: bool
 ) -> dict[str, Any]:
-    """Return the table of a key in a document, made where it is missing."""
+    """Return the table of a key in a document; missing tables are added."""
     if path[0] == "initial" and not isinstance(document.get("initial", {}), dict):
         # initial = "interpolate" is short for initial.from = "interpolate".
         document["initial"] = {"from": document["initial"]}
@@ -360,7 +359,7 @@ def settings_in(text: str) -> tuple[str, ...]:
 
 
 def key_path(key: str, where: str) -> tuple[str, ...]:
-    """Return the keys of 'law.noise' as `--set` takes them; raises `CaseError`."""
+    """Return the parts of a dotted key such as 'law.noise'; raises `CaseError`."""
     try:
         here: Any = tomllib.loads(f"{key} = 0")
     except tomllib.TOMLDecodeError:
@@ -391,12 +390,12 @@ def toml_line(key: str, value: Any) -> str:
 
 
 def toml_key(name: str) -> str:
-    """Return a key as TOML has it, in quotes where they are needed."""
+    """Return a key in TOML notation, with quotes if necessary."""
     return tomlkit.key(name).as_string()
 
 
 def toml_value(value: Any) -> str:
-    """Return a value on one line, with blanks inside the braces of an inline table."""
+    """Return a value in TOML notation on one line, with spaces inside the braces of tables."""
     if isinstance(value, Mapping):
         items = ", ".join(toml_line(key, item) for key, item in value.items())
         return f"{{ {items} }}" if items else "{}"
@@ -407,7 +406,7 @@ def toml_value(value: Any) -> str:
 
 
 def _check_document(document: Mapping[str, Any], where: str) -> None:
-    """Refuse numbers and depths that no case needs."""
+    """Refuse numbers, names and nesting depths beyond the limits of this module."""
     for key, value, depth in _values(document, where):
         if depth > DEPTH:
             text = f"more than {DEPTH} tables or lists within one another"
@@ -426,7 +425,7 @@ def _check_document(document: Mapping[str, Any], where: str) -> None:
 
 
 def _values(value: Any, where: str) -> Iterator[tuple[str, Any, int]]:
-    """Iterate over all values with their keys and depths; deeper levels are not entered."""
+    """Iterate over all values with keys and depths; levels deeper than `DEPTH` are not entered."""
     stack: list[tuple[str, Any, int]] = [("", value, 0)]
     while stack:
         key, value, depth = stack.pop()
@@ -442,11 +441,11 @@ def _values(value: Any, where: str) -> Iterator[tuple[str, Any, int]]:
 
 
 def filled(text: str, settings: Mapping[str, Any], where: str) -> str:
-    """Return the text of a case with settings applied as by `apply`, and its comments."""
+    """Return the text of a case with settings applied as by `apply`, preserving comments."""
     for key, value in settings.items():
         expected = apply(read_toml(text, where), {key: value}, where)
         text = _with(text, key_path(key, where), value)
-        # Empty tables consist of a head only.
+        # Empty tables are ignored: they consist of a header only.
         found, wanted = (
             {name: item for name, item in document.items() if item != {}}
             for document in (read_toml(text, where), expected)
@@ -459,13 +458,13 @@ def filled(text: str, settings: Mapping[str, Any], where: str) -> str:
 
 
 def _with(text: str, path: Sequence[str], value: Any) -> str:
-    """Return a case with another value of a key, whose comment stays; None takes the key away."""
+    """Return a case with a changed value of a key, preserving comments; None removes the key."""
     document = tomlkit.parse(text)
     here: Any = document
     *tables, name = path
     for k, part in enumerate(tables):
         inner = here.get(part, {})
-        # Written as a whole, evenly spaced; a plain value is short for a table.
+        # An inline table is rewritten as a whole. A plain value is a short form of a table.
         if isinstance(inner, InlineTable) or not isinstance(inner, Mapping):
             whole: Any = apply(document.unwrap(), {".".join(map(toml_key, path)): value}, "")
             for table in tables[: k + 1]:
@@ -478,6 +477,6 @@ def _with(text: str, path: Sequence[str], value: Any) -> str:
     if value is None:
         here.pop(name, None)
     else:
-        # With the end of its line: a key that is new among dotted ones has none otherwise.
+        # Parsed with a line end: otherwise a new key among dotted keys would have none.
         here[name] = tomlkit.parse(f"{toml_line('x', value)}\n")["x"]
     return tomlkit.dumps(document)

@@ -43,7 +43,7 @@ from livepde.observation import Discrepancy
 from livepde.runs.backlog import Retention
 from livepde.stepping import Between
 
-SENSORS = ("sensor", "validation", "ignored")  # roles of channels that measure the state
+SENSORS = ("sensor", "validation", "ignored")  # roles of channels that are measurements
 
 
 Spacing = Literal["uniform", "geometric"]
@@ -64,7 +64,7 @@ class MeshSpec(Spec):
 
     @model_validator(mode="after")
     def _one_kind(self) -> MeshSpec:
-        # Keys that the file states, without defaults.
+        # Keys in the file, without defaults.
         given = self.model_fields_set - {"spacing", "unit"}
         if given in ({"nodes"}, {"file"}, {"x", "y"}):
             if "spacing" in self.model_fields_set:
@@ -151,7 +151,7 @@ class UnknownSpec(PriorSpec):
         return self
 
     def at(self, region: RegionSpec) -> UnknownSpec | None:
-        """Return the prior of the unknown in a region; None if the region has no prior."""
+        """Return the unknown with the prior keys of a region; None if it overrides no key."""
         own = {key: getattr(region, key) for key in region.model_fields_set - {"over"}}
         return self.model_copy(update=own) if own else None
 
@@ -170,7 +170,7 @@ class TimeConstantSpec(Spec):
     std: Quantity
 
 
-FLUX = "flux"  # quantity of a sensor that measures a flux
+FLUX = "flux"  # value of `quantity` for a sensor that measures a flux
 
 
 class ChannelSpec(Spec):
@@ -207,23 +207,23 @@ class ChannelSpec(Spec):
 
     @property
     def is_point(self) -> bool:
-        """Whether the channel has a position, or is a family of channels with one each."""
+        """Whether the channel has a position, or is a family of channels with positions."""
         return (self.at, self.each, self.positions) != (None, None, None)
 
     @property
     def is_fixed(self) -> bool:
-        """Whether the channel measures a scalar state at a position that is certain."""
+        """Whether the channel measures a scalar state at an exactly known position."""
         own = (self.at_std, self.component, self.quantity)
         return self.at is not None and own == (None, None, None)
 
     @property
     def is_flux(self) -> bool:
-        """Whether the channel measures a flux, and not the state."""
+        """Whether the channel measures a flux instead of the state."""
         return self.quantity == FLUX
 
     @property
     def is_calibrated(self) -> bool:
-        """Whether an error of the channel is an unknown."""
+        """Whether an offset, gain or correlated error of the channel is an unknown."""
         return (self.offset, self.gain, self.correlated) != (None, None, None)
 
     @property
@@ -233,13 +233,13 @@ class ChannelSpec(Spec):
 
     @property
     def gaps(self) -> Literal["interpolate", "hold", "skip"]:
-        """Treatment of gaps."""
+        """Treatment of missing values: `missing`, or its default."""
         bridged = self.drives and self.between != "hold"
         return self.missing or ("interpolate" if bridged else "hold")
 
     @property
     def screened(self) -> bool:
-        """Whether spikes are refused."""
+        """Whether spikes are removed."""
         return self.drives and self.between == "line" and self.spikes != "keep"
 
     @model_validator(mode="after")
@@ -299,7 +299,7 @@ class ChannelSpec(Spec):
     @model_validator(mode="after")
     def _options_of_sensors(self) -> ChannelSpec:
         own = {"offset", "gain", "correlated", "at_std"} & self.model_fields_set
-        # A sensor that is ignored for a while keeps its keys.
+        # A sensor that is temporarily ignored keeps its keys.
         if self.role == "boundary":
             own -= {"offset"}
         if own and self.role not in ("sensor", "ignored"):
@@ -345,7 +345,7 @@ class ChannelSpec(Spec):
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Columns of the data file."""
+        """Columns of the data file that are averaged; usually one."""
         return self.columns or (str(self.column),)
 
 
@@ -444,7 +444,7 @@ class VariantSpec(Spec):
 
 
 def _kind(value: Any) -> Any:
-    """Complete a table that names no law as one of the sensitivity law."""
+    """Set `kind` to the sensitivity law if the table does not specify it."""
     return {"kind": "sensitivity", **value} if isinstance(value, Mapping) else value
 
 
@@ -463,7 +463,7 @@ class BoundarySpec(Spec):
 
     @property
     def passes(self) -> bool:
-        """Whether something passes through the boundary."""
+        """Whether the boundary has a flux or an exchange instead of a value."""
         return self.flux is not None or self.transfer is not None
 
     @model_validator(mode="after")
@@ -494,7 +494,7 @@ class InitialSpec(Spec):
 
 
 def _has_from(value: Any) -> str:
-    """Return which table an initial state is: a table without `from` has components."""
+    """Return the tag of an initial state: a table without `from` lists components."""
     whole = not isinstance(value, Mapping) or "from" in value
     return "whole" if whole else "components"
 

@@ -1,4 +1,4 @@
-"""Types of tables and values in a case file, as pydantic reads them and a JSON schema has them."""
+"""Types of tables and values in a case file, for validation by pydantic and for JSON schema."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _quantity(value: Any) -> Any:
 
 
 class Also:
-    """JSON schemas of short forms that a validator accepts as well."""
+    """Additional JSON schemas of short forms that a validator accepts."""
 
     def __init__(self, *schemas: dict[str, Any]) -> None:
         self.schemas = schemas
@@ -47,7 +47,7 @@ class Also:
     def __get_pydantic_json_schema__(
         self, core_schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        """Return what pydantic asks annotations for."""
+        """Return the JSON schema, extended by the short forms (a hook of pydantic)."""
         return {"anyOf": [handler(core_schema), *self.schemas]}
 
 
@@ -57,25 +57,25 @@ BOUNDS: dict[str, Any] = {
     "anyOf": [
         {"type": "array", "items": NUMBER, "minItems": 2, "maxItems": 2},
         {"type": "string", "pattern": r"^\s*(<=|>=)\s*[-+0-9.eE]+\s*$"},
-        {"type": "object"},  # TOML reads alpha.error = ... as a table
+        {"type": "object"},  # TOML parses alpha.error = ... as a table
     ]
 }
 
 
 def short(key: str) -> BeforeValidator:
-    """Return the reading of a value that is not a table as a table with this key only."""
+    """Return a validator that converts a value that is not a table to a table {key: value}."""
     return BeforeValidator(lambda given: given if isinstance(given, Mapping) else {key: given})
 
 
 def _number(value: Any) -> Any:
-    """Refuse true and false, which pydantic takes for 1 and 0."""
+    """Refuse true and false, which pydantic would convert to 1 and 0."""
     if isinstance(value, bool):
         raise ValueError("expected a number")  # noqa: TRY004 (pydantic collects ValueErrors only)
     return value
 
 
 def _missing(value: Any) -> Any:
-    """Return a number that is written as text as the number that it is in a table."""
+    """Convert text that a data file would read as a number to this number."""
     text = value.strip() if isinstance(value, str) else ""
     number = number_of(value)
     if not text and number is None:
@@ -84,7 +84,7 @@ def _missing(value: Any) -> Any:
 
 
 def options_of(kind: type) -> BeforeValidator:
-    """Return a check that options of a law have numbers for numbers, true or false for switches."""
+    """Return a validator that requires numbers for numeric options, booleans for switches."""
 
     def checked(value: Any) -> Any:
         for key, given in value.items() if isinstance(value, Mapping) else ():
@@ -99,7 +99,7 @@ def options_of(kind: type) -> BeforeValidator:
 
 
 def _limits(value: Any) -> Any:
-    """[low, high], "<= number" or ">= number" -> (sense, bound)."""
+    """Convert [low, high], "<= number" or ">= number" to (sense, bound)."""
     if isinstance(value, list) and len(value) == 2:
         low, high = value
         if all(isinstance(v, int | float) and not isinstance(v, bool) for v in value):
@@ -124,8 +124,8 @@ def _time_format(value: str) -> str:
     if value in ELAPSED:
         return value
     moment = datetime(2001, 2, 3, 4)
-    with suppress(ValueError, re.error):  # the latter of a part that stands twice
-        # A complete format returns the date that was written with it.
+    with suppress(ValueError, re.error):  # re.error: a directive occurs twice
+        # A complete format parses the date that it has formatted.
         if datetime.strptime(moment.strftime(value), value).date() == moment.date():
             return value
     known = f"or of an elapsed time: {', '.join(ELAPSED)}"
@@ -133,7 +133,7 @@ def _time_format(value: str) -> str:
 
 
 def _flat(value: Any) -> Any:
-    """{"k": {"error": x}} -> {"k.error": x}: TOML reads k.error = x as a table."""
+    """Convert {"k": {"error": x}} to {"k.error": x}, since TOML parses k.error = x as a table."""
     if not isinstance(value, dict):
         return value
     found: dict[str, Any] = {}
