@@ -1,4 +1,4 @@
-"""Files that `livepde init` writes: a case with made-up data, or one for a table."""
+"""Files that `livepde init` writes: a case with synthetic data, or a case for a table."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ from livepde.units import (
     unit_in,
 )
 
-SCHEMA_FILE = "livepde.schema.json"  # beside a case that `livepde init` writes
+SCHEMA_FILE = "livepde.schema.json"  # next to a case that `livepde init` writes
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 MEANINGS: dict[str, dict[str, str]] = tomllib.loads(
     Path(__file__).with_name("keys.toml").read_text(encoding="utf-8")
 )
-"""Class of a table -> key -> meaning, with the unit of a number."""
+"""Class of a table -> key -> meaning, with the units of numbers."""
 
 
 def case_schema() -> dict[str, Any]:
@@ -61,7 +61,7 @@ def case_schema() -> dict[str, Any]:
 
 @cache
 def schema_text() -> str:
-    """Return the file of the JSON schema."""
+    """Return the content of the JSON schema file."""
     return json.dumps(case_schema(), indent=1, ensure_ascii=False) + "\n"
 
 
@@ -73,17 +73,17 @@ def documented(text: str) -> tuple[str, dict[str, str]]:
     return summary, {name: " ".join(meaning.split()) for name, meaning in items}
 
 
-# T_5cm, depth 0.05 m; not m3/h, nor -0.5 m, whose sign may be a hyphen
+# T_5cm, depth 0.05 m; but not m3/h, nor -0.5 m, since the sign may be a hyphen.
 PLACE = re.compile(r"(?<![\d.,-])(\d+(?:[.,]\d+)?)[ _]?(mm|cm|m|ft)(?![A-Za-z\d/^²³])")
 FRACTION = re.compile(r"\d+\.\d+")  # T_0.05
 # Q_W, T_5cm degF, T_1 degF
 SUFFIX = re.compile(r"(?:(?<=\w)_|(?<=[^\W\d]) |(?<=\d) (?=deg))(?P<unit>[A-Za-z]\w*)$")
 LAST = re.compile(r"_(?P<unit>[A-Za-z][A-Za-z0-9]*)$")  # T_air_degF
-NO_UNITS = {*string.ascii_letters, "in"}  # at the end of a sensor's name: T_K, T_in
+NO_UNITS = {*string.ascii_letters, "in"}  # ambiguous at the end of a sensor's name: T_K, T_in
 NUMBERED = re.compile(r"(.*?)(\d+)")  # u_17
-PLACES = "places.csv"  # the table of positions that is written beside the case
+PLACES = "places.csv"  # table of positions that is written next to the case
 NOISE = "standard deviation of a single reading"
-FAMILY = 8  # so many numbered columns become one line of [channels]
+FAMILY = 8  # smallest number of numbered columns that become one line of [channels]
 HEAD = """\
 #:schema ./livepde.schema.json
 # A case of livepde: equation, unknowns, and the role of each channel.
@@ -100,31 +100,31 @@ ENDS = {
     1: '# Measured value at an end: role = "boundary", at = "left" or "right"; others are closed.',
     2: '# Measured value at a boundary: role = "boundary", at = its name; others are closed.',
 }  # dimension -> where a case has values of the state
-ROD = Path(__file__).with_name("rod.toml")  # the case of the made-up data beside it
+ROD = Path(__file__).with_name("rod.toml")  # case for the synthetic data in rod.csv
 
 
 @dataclass(frozen=True)
 class FoundChannel:
-    """A channel of the case, as the table suggests it."""
+    """A channel that is proposed for a table, or an input that the table lacks."""
 
     name: str
-    given: Mapping[str, Any]  # its keys and values
-    columns: tuple[str, ...]  # of the table; none for an input that the table lacks
-    told: str  # a comment
+    given: Mapping[str, Any]  # keys and values of the channel
+    columns: tuple[str, ...]  # columns of the table; empty if the table lacks the input
+    told: str  # comment in the case file
 
     @property
     def is_sensor(self) -> bool:
-        """Whether it is a sensor."""
+        """Whether the channel is a sensor."""
         return bool(self.given["role"] == "sensor")
 
 
 def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
-    """Return the text of a case in `folder`, from equation and table; the rest is open."""
+    """Return the text of a case in `folder` for a table; unknown values are blanks."""
     found = channels_in(table, equation)
     given = {item.name for item in found if item.columns and not item.is_sensor}
-    # Noise is a standard deviation, a difference of temperatures: in K.
+    # Noise is a standard deviation: for a temperature, a difference in K.
     noise = _open(equation.state.unit.replace("degC", "K"))
-    # Without a flux among the sensors, one noise is that of all.
+    # If no sensor measures a flux, one noise is valid for all sensors.
     mixed = any(item.given.get("quantity") == FLUX for item in found)
     found = [_with_noise(equation, item, noise) for item in found] if mixed else found
     lines = [
@@ -153,7 +153,7 @@ def _data_lines(
         told.append("missing: far outside the other values; check them")
     if table.counted:
         told.append("time_unit: found from the numbers; check the dates above")
-    # Times that are numbers count from an event, which is at rest before the first row.
+    # Times that are numbers begin at an event: the process is at rest before the first row.
     first = min(one.samples.t[0] for one in table.tables)
     if equation.spacing == "geometric" and table.samples.origin is None and first > 0.0:
         data["t0"] = _open(table.time_unit)
@@ -162,14 +162,14 @@ def _data_lines(
 
 
 def _with_states(equation: Equation, channels: list[FoundChannel]) -> set[str]:
-    """Return the columns of inputs that may be constant, as a power that is off."""
+    """Return the columns of inputs that may be constant, such as a power that is off."""
     inputs = (item for item in channels if not item.is_sensor)
-    some = (item for item in inputs if has_states(equation.inputs[item.name].unit))
-    return {column for item in some for column in item.columns}
+    switched = (item for item in inputs if has_states(equation.inputs[item.name].unit))
+    return {column for item in switched for column in item.columns}
 
 
 def _with_noise(equation: Equation, item: FoundChannel, noise: str) -> FoundChannel:
-    """Return a channel; if it is a sensor, with its own noise."""
+    """Return a channel with a blank for its own noise if it is a sensor."""
     if not item.is_sensor:
         return item
     if equation.fluxes and item.given.get("quantity") == FLUX:
@@ -178,12 +178,12 @@ def _with_noise(equation: Equation, item: FoundChannel, noise: str) -> FoundChan
 
 
 def _open(unit: str, number: str = BLANK) -> str:
-    """Return a quantity with its unit, by default the blank that is to be filled in."""
+    """Return a quantity with its unit; by default a blank that is to be filled in."""
     return f"{number} {unit}".rstrip()
 
 
 def _inline(key: str, given: Mapping[str, Any], told: str = "") -> Iterator[str]:
-    """Yield the line of a table, with dots in its key; none of an empty table."""
+    """Yield the line of an inline table with a comment; no line if the table is empty."""
     if given:
         shown = toml_line("x", given).partition(" = ")[2]
         yield _told(f"{key} = {shown}", told)
@@ -195,7 +195,7 @@ def _told(line: str, text: str) -> str:
 
 
 def _top(table: Measured, equation: Equation, inputs: set[str]) -> Iterator[str]:
-    """Yield the lines of title, equation, the options that it needs, and the initial state."""
+    """Yield the lines of title, equation, required options, and initial state."""
     yield toml_line("title", table.path.stem)
     yield _told(toml_line("equation", equation.name), equation.formula)
     yield f"# 'livepde equations {equation.name}' lists its keys, 'livepde equations' all equations"
@@ -218,7 +218,7 @@ def _top(table: Measured, equation: Equation, inputs: set[str]) -> Iterator[str]
 
 
 def _mesh(equation: Equation) -> dict[str, Any]:
-    """Return the mesh."""
+    """Return the keys of [mesh], with blanks for the sides."""
     side = _open(equation.length_unit)
     if equation.dimension > 1:
         return {"x": [side, side], "y": [side, side], "cells": [20, 20]}
@@ -229,9 +229,9 @@ def _mesh(equation: Equation) -> dict[str, Any]:
 def _data(table: Measured, folder: Path, states: set[str]) -> dict[str, Any]:
     """Return the format of the files as keys of [data], without defaults.
 
-    Columns in `states` are inputs that may be constant.
+    `states`: columns of inputs that may be constant.
     """
-    # Format keys of the first file hold for all; others state only what differs.
+    # Format keys of the first file are valid for all files; the others only state differences.
     first, *others = (_written(one, folder) for one in table.tables)
     usual = {key: field.default for key, field in DataSpec.model_fields.items() if key != "time"}
     found = _unlike(first, usual)
@@ -244,12 +244,12 @@ def _data(table: Measured, folder: Path, states: set[str]) -> dict[str, Any]:
 
 
 def _unlike(given: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keys whose values are not the usual ones."""
+    """Return the items whose values differ from the usual values."""
     return {key: value for key, value in given.items() if value != usual.get(key)}
 
 
 def _missing(table: Measured, states: set[str]) -> list[float]:
-    """Return the values that are placeholders in some column, and usual in no other."""
+    """Return the values that are placeholders in a column and not measurements in another."""
     columns = table.columns.items()
     found = {n: {one.value for one in sentinels(x, n not in states)} for n, x in columns}
 
@@ -284,7 +284,7 @@ def _contents(table: Measured) -> Iterator[str]:
 
 
 def _steps(table: Measured, equation: Equation) -> Iterator[str]:
-    """Yield the line of time steps, where intervals between samples are uneven."""
+    """Yield the line of time steps if the intervals between samples are uneven."""
     steps = table.steps
     # Intervals of more than one and a half times the median count as uneven.
     if len(steps) and steps.max() > 1.5 * np.median(steps):
@@ -296,14 +296,14 @@ def _steps(table: Measured, equation: Equation) -> Iterator[str]:
 
 
 def _alternative(equation: Equation, inputs: set[str]) -> str:
-    """Return the initial choice among alternative unknowns of an equation."""
+    """Return the default choice among alternative unknowns of an equation; empty if none."""
     fits = [name for name, belongs in equation.alternatives.items() if inputs & set(belongs)]
-    # If the table has no input of any, it is the last one, which needs the least.
+    # The last alternative requires the fewest inputs: it is used if the table has none of them.
     return fits[0] if fits else next(reversed(list(equation.alternatives)), "")
 
 
 def _unknowns(equation: Equation, inputs: set[str]) -> Iterator[str]:
-    """Yield the lines of the unknowns that have to be there."""
+    """Yield the lines of the required unknowns, with comments."""
     yield "# prior: best guess before seeing data; std: its standard deviation"
     yield '# transform = "log" keeps an unknown positive; remove it if negative values are possible'
     chosen = _alternative(equation, inputs)
@@ -316,7 +316,7 @@ def _unknowns(equation: Equation, inputs: set[str]) -> Iterator[str]:
 
 
 def _open_prior(variable: Variable) -> dict[str, Any]:
-    """Return the keys of an unknown whose prior is open."""
+    """Return the keys of an unknown, with blanks for its prior."""
     prior = _open(variable.unit)
     given: dict[str, Any] = {"prior": prior, "std": prior}
     if variable.transform == "logit":
@@ -387,7 +387,7 @@ def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
 def _by_unit(
     table: Measured, item: FoundChannel, others: list[FoundChannel], inputs: Mapping[str, Variable]
 ) -> FoundChannel:
-    """Return a column as the input that it may be: the only one, and only it, of this unit."""
+    """Return a channel as an input if their units match, and match no other input or channel."""
 
     def fits(one: FoundChannel, variable: Variable) -> bool:
         unit = str(one.given.get("unit", ""))
@@ -402,14 +402,14 @@ def _by_unit(
 
 
 def _labels(columns: Iterable[str]) -> list[str]:
-    """Return names of columns without units; where two would be the same, the full names."""
+    """Return the names of columns without units; the full names if these are not unique."""
     keys = {name: re.sub(r"\W+", "_", IN_BRACKETS.sub("", name)).strip("_") for name in columns}
-    all_keys = ["", "", *keys.values()]  # an empty key is never the only one
+    all_keys = ["", "", *keys.values()]  # an empty key is never unique
     return [key if all_keys.count(key) == 1 else name for name, key in keys.items()]
 
 
 def _input(table: Measured, entry: str, name: str, model_unit: str) -> FoundChannel:
-    """Return an input with the unit that the name of its column states."""
+    """Return an input with the unit in the name of its column."""
     unit, values = _stated(table.titled(name), model_unit), table.columns[name]
     given = {"role": "input", "column": name, **({"unit": unit} if unit else {})}
     comment = _range(values)
@@ -421,7 +421,7 @@ def _input(table: Measured, entry: str, name: str, model_unit: str) -> FoundChan
 
 
 def _input_of(column: str, inputs: Mapping[str, Variable]) -> str:
-    """Return the input that a column is named after: Q, Q [W], Q_W; empty if there is none."""
+    """Return the input in the name of a column, such as Q, Q [W], Q_W; empty if there is none."""
     plain = IN_BRACKETS.sub("", column).strip()
     suffix = SUFFIX.search(plain)
     for name, variable in inputs.items():
@@ -433,18 +433,18 @@ def _input_of(column: str, inputs: Mapping[str, Variable]) -> str:
 
 
 def _stated(name: str, unit: str) -> str:
-    """Return the unit that the name of a column states; empty if it is the model's, or none."""
+    """Return the unit in the name of a column; empty without a unit or for the model's unit."""
     found = unit_in(name, unit, IN_BRACKETS, AFTER_SLASH) or unit_in(
         IN_BRACKETS.sub("", name), unit, SUFFIX
     )
     stated = IN_BRACKETS.search(name)
-    if not found and stated and unit:  # without a unit of the model all numbers are as they are
+    if not found and stated and unit:  # without a unit of the model, numbers are not converted
         found = f"{BLANK} {stated[1]}"
     return "" if found == unit else found
 
 
 def _sensor(equation: Equation, key: str, column: str, name: str, values: Array) -> FoundChannel:
-    """Return a sensor with the place and the unit that the name of its column states."""
+    """Return a sensor with the position and unit in the name of its column."""
     at, remark = _place(equation, name)
     told = [_range(values), *filter(None, [remark])]
     given: dict[str, Any] = {"role": "sensor", "column": column, "at": at}
@@ -463,11 +463,11 @@ def _sensor(equation: Equation, key: str, column: str, name: str, values: Array)
 
 
 def _place(equation: Equation, name: str) -> tuple[Any, str]:
-    """Return the place of a sensor as the name of its column states it, or open; and a remark."""
+    """Return the position in the name of a sensor's column, or a blank, and a remark."""
     place, fraction = PLACE.search(name), FRACTION.search(name)
     at = _open(equation.length_unit)
     if equation.dimension > 1:
-        # A name states one coordinate at most, so that the place stays open.
+        # A name contains at most one coordinate, so the position remains a blank.
         return [at] * equation.dimension, ""
     if place is not None and equation.length_unit:
         return f"{place[1].replace(',', '.')} {place[2]}", "position from the name"
@@ -475,7 +475,7 @@ def _place(equation: Equation, name: str) -> tuple[Any, str]:
 
 
 def _unit_of_sensor(name: str, unit: str) -> str:
-    """Return the unit that the name of a sensor's column states; empty if it states none."""
+    """Return the unit in the name of a sensor's column; empty if there is none."""
     bracket, slash = IN_BRACKETS.search(name), AFTER_SLASH.search(name)
     placed = bracket and PLACE.fullmatch(bracket[1].strip())
     if bracket and not placed:
@@ -489,17 +489,17 @@ def _unit_of_sensor(name: str, unit: str) -> str:
 
 
 def _unit_at_end(name: str, unit: str) -> str:
-    """Return the unit in which the name of a column ends, as T_degC; empty if in none."""
+    """Return the unit at the end of the name of a column, as in T_degC; empty if none."""
     suffixes = ((pattern, pattern.search(name)) for pattern in (SUFFIX, LAST))
     named = (one for one, suffix in suffixes if suffix and suffix["unit"] not in NO_UNITS)
     return next(filter(None, (unit_in(name, unit, pattern) for pattern in named)), "")
 
 
 def _in_families(equation: Equation, found: list[FoundChannel]) -> list[FoundChannel]:
-    """Return the channels with numbered sensors whose places are open, u_0 to u_37, as one."""
+    """Return the channels, with numbered sensors of unknown position (u_0, u_1, ...) combined."""
 
     def stem_of(item: FoundChannel) -> tuple[str, bool]:
-        # The column of a numbered sensor without its number; else the name, and False.
+        # The column of a numbered sensor without its number, and True; else the name, and False.
         numbered = NUMBERED.fullmatch(item.columns[0])
         open_ = item.is_sensor and BLANK in str(item.given["at"]) and "unit" not in item.given
         return (numbered[1], True) if numbered and open_ else (item.name, False)
@@ -513,7 +513,7 @@ def _in_families(equation: Equation, found: list[FoundChannel]) -> list[FoundCha
 
 
 def _family(equation: Equation, stem: str, members: list[FoundChannel]) -> FoundChannel:
-    """Return numbered sensors as one channel: `each` where they may be evenly spaced."""
+    """Return numbered sensors as a family, with `each` if they may be evenly spaced."""
     columns = tuple(item.columns[0] for item in members)
     count, first = len(members), members[0].given
     given = {key: value for key, value in first.items() if key not in ("column", "at")}
@@ -528,7 +528,7 @@ def _family(equation: Equation, stem: str, members: list[FoundChannel]) -> Found
 
 
 def _range(values: Array) -> str:
-    """Return the range of a column, and its number of missing values, as text."""
+    """Return the range of a column and its number of missing values as text."""
     present = values[np.isfinite(values)]
     missing = len(values) - len(present)
     if not len(present):
@@ -542,7 +542,7 @@ def write_template(
 ) -> tuple[Path, Path]:
     """Write a commented case into a folder, and return the paths of case and data.
 
-    The case is for a table of measurements, or else for made-up data that are written beside it.
+    The case is for a table of measurements, or for synthetic data that are written next to it.
     """
     if table is None:
         text = HEAD.format(case=folder / "case.toml") + ROD.read_text(encoding="utf-8")
@@ -560,7 +560,7 @@ def files_for(table: Measured, folder: Path, equation: Equation) -> dict[str, st
     files = {"case.toml": _case_for(table, folder, equation)}
     named = [one for one in channels_in(table, equation) if one.given.get("positions") == PLACES]
     columns = [column for one in named for column in one.columns]
-    if columns:  # a table of positions that is to be filled in
+    if columns:  # table of positions to be filled in
         axes = "xyz"[: equation.dimension]
         rows = [["name", *axes], *([column, *BLANK * len(axes)] for column in columns)]
         files[PLACES] = "".join(f"{','.join(row)}\n" for row in rows)
@@ -568,7 +568,7 @@ def files_for(table: Measured, folder: Path, equation: Equation) -> dict[str, st
 
 
 def check_free(folder: Path, names: Iterable[str]) -> None:
-    """Refuse a folder that is a file or holds one of these files: `RunError`."""
+    """Raise `RunError` if a folder is a file or contains one of these files."""
     if folder.is_file():
         raise RunError(f"{folder} is a file: 'livepde init DIR --data {folder}' takes a table.")
     for path in (folder / name for name in names):
@@ -577,7 +577,7 @@ def check_free(folder: Path, names: Iterable[str]) -> None:
 
 
 def write_files(folder: Path, files: Mapping[str, str]) -> None:
-    """Write files that are not there yet, or none; and the schema of cases, which they name."""
+    """Write files and the schema of cases into a folder; raises `RunError` if a file exists."""
     check_free(folder, files)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Preview of a case: identifiability, discretisation and sensor errors, one more sensor."""
+"""Preview of a case: identifiability, discretisation errors, position of an additional sensor."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from livepde.verdict import FLAT, REFINE, Shifts, discretised
 
 MOST_SAMPLES = 500
 
-MOST_CANDIDATES = 400  # positions that are compared
-SHORT_LIST = 5  # of those, tried in a preview of their own where unknowns move
+MOST_CANDIDATES = 400  # about the largest number of candidate positions
+SHORT_LIST = 5  # best candidates with a separate preview, if unknowns vary in time
 NEW = "one more sensor"
 NOTHING = "advice on sensors: the data contain no measurement."
 
 
 @dataclass(frozen=True)
 class Identified:
-    """One unknown in the preview: its standard deviations before and after the samples."""
+    """Standard deviations of an unknown in the preview, before and after the samples."""
 
-    name: str  # label of a number; of a field its name, with the vertices known best and worst
+    name: str  # label of a number; name and vertex of a field
     prior: float
     posterior: float
     unit: str
@@ -48,7 +48,7 @@ class Identified:
 
     @property
     def not_identifiable(self) -> bool:
-        """True if the sensors do not identify it."""
+        """Whether the sensors do not identify the unknown."""
         return self.left > FLAT
 
 
@@ -57,13 +57,13 @@ class Preview:
     """Information on the unknowns in the first samples of a case."""
 
     unknowns: tuple[Identified, ...] = ()  # one item for each number, two for each field
-    samples: int = 0  # with a measurement
+    samples: int = 0  # number of samples with a measurement
     sentences: tuple[str, ...] = ()
-    last: tuple[Identified, ...] = ()  # by as many last samples instead; empty without more
+    last: tuple[Identified, ...] = ()  # by the last `MOST_SAMPLES`, if the data have more samples
 
 
 class StatedNoise(SensitivityLaw):
-    """The sensitivity law as if model and noise were right, linear about the prior."""
+    """The sensitivity law for an exact model and noise as stated, linear about the prior."""
 
     relinearises = False
 
@@ -72,7 +72,7 @@ class StatedNoise(SensitivityLaw):
 
 
 def linearised(law: AnyLaw) -> SensitivityLaw | None:
-    """Return the law as a filter linearised at the prior; None for a law without covariance."""
+    """Return a filter linearised at the prior; None for a law without covariance."""
     if not isinstance(law, SensitivityLaw):
         return None
     return StatedNoise(
@@ -87,15 +87,16 @@ def linearised(law: AnyLaw) -> SensitivityLaw | None:
 
 
 def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
-    """Return the identifiability by the first samples, linearised at the prior.
+    """Return the identifiability from the first samples, linearised at the prior.
 
-    The covariance then does not depend on measured values, only on their times and on inputs. It is
-    a best case: noise as stated, a model without error. A law without covariance has no preview.
+    The covariance then depends on the times of measurements and on inputs, but not on measured
+    values. It is a best case, for an exact model and noise as stated. Laws without covariance have
+    an empty preview.
     """
     linear = linearised(prepared.case.law)
     if linear is None or (linear.noise is None and prepared.identifier.observed.noise is None):
-        return Preview()  # in the second case the law estimates the noise from the samples
-    # Samples may come from a stream, so they are iterated once, for both previews.
+        return Preview()  # in the second case, the law estimates the noise from the samples
+    # Samples may come from a stream, so both previews share one iteration.
     begun, all_of = tee(samples)
     found = _told(prepared, replace(linear, shadows=Shadows()), begun)
     end = deque(enumerate(all_of, 1), maxlen=MOST_SAMPLES)
@@ -107,7 +108,7 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
 
 
 def predicted(prepared: Prepared, samples: Iterable[Sample]) -> tuple[Array, Array]:
-    """Return the first readings, and their predictions by the prior, shapes (samples, sensors)."""
+    """Return the first readings and their prior predictions, both of shape (samples, sensors)."""
     law = SensitivityLaw(
         modes=1, noise=1.0, refit=None, guards=None, shadows=None, gate=np.inf, verdict=False
     )
@@ -122,7 +123,7 @@ def predicted(prepared: Prepared, samples: Iterable[Sample]) -> tuple[Array, Arr
 
 
 def _told(prepared: Prepared, linear: SensitivityLaw, samples: Iterable[Sample]) -> Preview:
-    """Return the posterior after the first of some samples, linearised at the prior."""
+    """Return the preview from the first `MOST_SAMPLES` of given samples."""
     identifier, model = prepared.identifier_with(linear), prepared.case.model
     count, estimate = 0, None
     for sample in samples:
@@ -136,23 +137,23 @@ def _told(prepared: Prepared, linear: SensitivityLaw, samples: Iterable[Sample])
     if not count or estimate is None or prior is None or posterior is None:
         return Preview()
     latent = model.latent
-    # Factors are in latent coefficients; the tangent at the prior makes them physical.
+    # Factors are in latent coefficients; the tangent at the prior maps them to physical units.
     rest = None if belief.rest is None else latent.deviation(latent.prior, belief.rest)
     before, after = (
         replace(belief, q_factor=latent.tangent(latent.prior, factor), rest=rest)
         for factor in (prior, posterior)
     )
-    told = tuple(_compare(prepared, before, after))
+    compared = tuple(_compare(prepared, before, after))
     sentences = (
         *information_gains(model, belief).sentences,
-        *_shifted(estimate.diagnostics.shifts, {item.name: item.posterior for item in told}),
+        *_shifted(estimate.diagnostics.shifts, {item.name: item.posterior for item in compared}),
         *estimate.verdict.unseen,
     )
-    return Preview(told, count, sentences)
+    return Preview(compared, count, sentences)
 
 
 def _shifted(shifts: Shifts[float], std: Mapping[str, float]) -> list[str]:
-    """Return the shifts of numbers by the discretisation, in posterior standard deviations."""
+    """Return sentences on shifts by the discretisation, in units of posterior std."""
     known = {
         (label, kind): shift
         for (label, kind), shift in shifts.unknowns.items()
@@ -168,7 +169,7 @@ def _shifted(shifts: Shifts[float], std: Mapping[str, float]) -> list[str]:
 
 
 def _compare(prepared: Prepared, before: Belief, after: Belief) -> list[Identified]:
-    """Return the standard deviations of all unknowns before and after the samples."""
+    """Return the standard deviations of all unknowns, for fields at the best and worst vertex."""
     space = prepared.case.model.parameter_space
     units = {name: unknown.unit for name, unknown in space.unknowns.items()}
     prior, posterior = (np.asarray(belief.q_std) for belief in (before, after))
@@ -181,7 +182,7 @@ def _compare(prepared: Prepared, before: Belief, after: Belief) -> list[Identifi
         prior, posterior = (
             np.asarray(belief.deviation(block.at_vertices, part)) for belief in (before, after)
         )
-        # A vertex without prior variance has no share that could remain.
+        # The remaining share is undefined at vertices without prior variance.
         inside = np.flatnonzero(prior > 1e-12 * prior.max())
         left = posterior[inside] / prior[inside]
         for what, k in (("best", inside[left.argmin()]), ("worst", inside[left.argmax()])):
@@ -193,33 +194,33 @@ def _compare(prepared: Prepared, before: Belief, after: Belief) -> list[Identifi
 
 @dataclass(frozen=True, eq=False)
 class Advice:
-    """The best of all candidate positions for one more sensor."""
+    """The best candidate position for an additional sensor."""
 
     position: Array  # coordinates, shape (d,)
-    # Remaining share of the prior standard deviation of each unknown without it, and with it.
+    # Unknown -> remaining share of its prior standard deviation, without and with the sensor.
     now: Mapping[str, float]
     then: Mapping[str, float]
     candidates: int  # number of compared positions
 
 
 def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
-    """Return where one more point sensor would reduce the posterior most.
+    """Return the position where an additional point sensor would reduce the posterior most.
 
-    The criterion is the posterior variance over the prior variance, averaged over the unknowns (of
-    a field its mean over the domain). The candidates are vertices of the mesh. The new sensor has
-    the median noise of the others, and measures whenever one of them does.
+    The criterion is the mean over the unknowns of posterior over prior variance; for a field, both
+    are means over the domain. The candidates are vertices of the mesh. The new sensor has the
+    median noise of the others, and measures whenever at least one of them does.
 
-    Linearised at the prior, the information of sensors adds up: with Y the sensitivity of a reading
-    to the reduced coordinates a ~ N(0, I), over its noise, the posterior covariance of a is
-    (I + sum of Y^T Y)^-1. So one run that assimilates nothing gives the sums of all candidates.
+    Linearised at the prior, the information of sensors is additive. Let Y be the sensitivity of a
+    reading, over its noise, to the reduced coordinates a ~ N(0, I). The posterior covariance of a
+    is (I + sum of Y^T Y)^-1. One run without assimilation gives the sums for all candidates.
     """
     case, law = prepared.case, linearised(prepared.case.law)
     if law is None:
         text = "advice on sensors needs a law with a covariance: kind = 'sensitivity'."
         raise ConfigurationError(text)
-    if law.drift or case.model.latent.random:  # an unknown moves
+    if law.drift or case.model.latent.random:  # an unknown varies in time
         return _advise_moving(prepared, law, list(samples))
-    # Information on a, prior included, and the information of each candidate.
+    # Information on a, including the prior, and information from each candidate.
     here, each = np.zeros((0, 0)), np.zeros((0, 0, 0))
     factor: Array | None = None
     for Y, new, q_factor in islice(_sensitivities(prepared, law, samples), MOST_SAMPLES):
@@ -247,9 +248,9 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
 def _sensitivities(
     prepared: Prepared, law: SensitivityLaw, samples: Iterable[Sample]
 ) -> Iterator[tuple[Array, Array, Array]]:
-    """Yield the sensitivities of present readings to a, of candidates, and the factor of q.
+    """Yield, for each measurement, sensitivities to a of readings and candidates, and q's factor.
 
-    Sensitivities are over the noise, shapes (readings, k) and (candidates, k), at each measurement.
+    Sensitivities are divided by the noise, with shapes (readings, k) and (candidates, k).
     """
     silent = replace(prepared, assimilate_from=np.inf)
     identifier = silent.identifier_with(SensitivityLaw(law.modes, law.noise, shadows=None))
@@ -265,7 +266,7 @@ def _sensitivities(
             continue
         if belief.u_factor is None or belief.q_factor is None:
             return
-        # Readings depend on the unknowns through the state, and where H_q is given directly.
+        # Readings depend on the unknowns through the state and, if H_q exists, directly.
         H_u, H_q = identifier.observed.jacobian(
             estimate.u, estimate.q, Moment(sample.t, Inputs(known))
         )
@@ -277,7 +278,7 @@ def _sensitivities(
 
 
 def _candidates(prepared: Prepared) -> tuple[Any, Array, Any]:
-    """Return the readout matrix at candidates, positions (d, candidates), and part of the state."""
+    """Return the evaluation matrix of candidates, positions (d, candidates), and state part."""
     case = prepared.case
     block, part = case.model.state_space.component(case.observation.of)
     if block.vector:
@@ -291,19 +292,19 @@ def _candidates(prepared: Prepared) -> tuple[Any, Array, Any]:
 
 
 def _noise(identifier: Identifier, law: SensitivityLaw) -> Array:
-    """Return the noise of each sensor: that of the law, or of the observation."""
+    """Return the noise of each sensor, from the law or the observation, shape (sensors,)."""
     found = identifier.observed.noise if isinstance(law.noise, str | None) else law.noise
     return np.broadcast_to(np.asarray(found, dtype=float), identifier.observed.size)
 
 
 def _advise_moving(prepared: Prepared, law: SensitivityLaw, samples: Sequence[Sample]) -> Advice:
-    """Return the advice where unknowns move, so that the information of old samples fades.
+    """Return the advice for unknowns that vary, so that the information in old samples decays.
 
-    The candidates are ranked by the variance reduction of one more reading at each sample of the
-    preview. Each of the best few gets its own preview.
+    The candidates are ranked by the variance reduction of an additional reading, summed over the
+    samples of the preview. Each of the best candidates gets a separate preview.
     """
     values, positions, part = _candidates(prepared)
-    model, told = prepared.case.model, np.zeros(positions.shape[1])
+    model, reductions = prepared.case.model, np.zeros(positions.shape[1])
     identifier = prepared.identifier
     noise = float(np.median(_noise(identifier, law)))
     weights: dict[str, Array] = {}
@@ -314,15 +315,15 @@ def _advise_moving(prepared: Prepared, law: SensitivityLaw, samples: Sequence[Sa
         if belief.u_factor is None:
             continue
         Y = (values @ belief.u_factor[part]) / noise
-        # One more reading y changes C C^T by C y y^T C^T / (1 + y^T y).
+        # An additional reading with row y reduces C C^T by C y y^T C^T / (1 + y^T y).
         gain = np.einsum("cr,rs,cs->c", Y, C.T @ sum(weights.values()) @ C, Y)
-        told += gain / (1.0 + (Y**2).sum(axis=1))
+        reductions += gain / (1.0 + (Y**2).sum(axis=1))
     if not weights:
         raise ConfigurationError(NOTHING)
     now = _left(weights, C)
-    # The ranking counts single readings; a preview of the best few counts all of them.
+    # The ranking considers readings one by one, the previews consider all of them jointly.
     tried = []
-    for best in np.argsort(-told)[:SHORT_LIST]:
+    for best in np.argsort(-reductions)[:SHORT_LIST]:
         at: Any = positions[:, best].tolist()
         own, x = prepared.case.observation, at if len(at) > 1 else at[0]
         sensors = Combined([own, Points({NEW: x}, noise=noise, of=own.of)])
@@ -331,20 +332,20 @@ def _advise_moving(prepared: Prepared, law: SensitivityLaw, samples: Sequence[Sa
         then = _left(weights, C)
         tried.append((sum(share**2 for share in then.values()), int(best), then))
     _, place, then = min(tried, key=lambda item: item[0])
-    return Advice(positions[:, place], now, then, len(told))
+    return Advice(positions[:, place], now, then, len(reductions))
 
 
 def _previewed(
     prepared: Prepared, law: SensitivityLaw, samples: Iterable[Sample], sensors: Observation
 ) -> Iterator[Belief]:
-    """Yield the belief of a filter linearised at the prior, after each measurement."""
+    """Yield the belief of a filter linearised at the prior after each measurement."""
     identifier = prepared.identifier_with(law, sensors)
     own = [name for name in identifier.observed.names if name != NEW]
     count = 0
     for sample in samples:
         given: Mapping[str, float] = sample.z  # type: ignore[assignment]
         seen = any(np.isfinite(given.get(name, np.nan)) for name in own)
-        # The covariance does not depend on the value of a reading, only on its presence.
+        # The covariance depends on the presence of a reading, not on its value.
         z = {**given, **({NEW: 0.0} if seen and NEW in identifier.observed.names else {})}
         identifier.step(sample.t, z, sample.inputs)
         if seen and sample.t >= prepared.assimilate_from:
@@ -368,11 +369,11 @@ def _left(weights: Mapping[str, Array], C: Array) -> dict[str, float]:
 
 
 def _weights(model: Model, factor: Array) -> dict[str, Array]:
-    """Return unknown -> W with trace(W P) its mean variance over that of the prior, P = I."""
+    """Return unknown -> W, where trace(W P) is its mean variance over the prior's, P = I."""
     space = model.parameter_space
     found = {label: np.outer(factor[k], factor[k]) for label, k in space.labels.items()}
     # The mass matrix integrates the variance of a field over the domain. Division by the trace
-    # makes the share of the prior, P = I, equal to one.
+    # scales trace(W P) to 1 for the prior.
     for name in space.fields:
         part = space.part(name)
         found[name] = factor[part].T @ (model.parameter_mass[part, part] @ factor[part])

@@ -1,4 +1,4 @@
-"""Variants of a case that the program proposes: likely causes first, then common errors."""
+"""Proposed variants of a case: likely causes of a misfit first, then common errors."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from livepde.streams import DataTable
 from livepde.verdict import Cause, channel_setting
 
 MOST_LAYERS = 8
-MOST = 14  # variants that the program chooses
-SAMPLES = 64  # in which a source moves the state by the usual error
+MOST = 14  # default number of proposed variants
+SAMPLES = 64  # samples in which a source changes the state by the usual error
 NAMES = {  # kind of cause -> name of the variant
     "offset": "offset of {}",
     "gain": "gain of {}",
@@ -52,11 +52,11 @@ NAMES = {  # kind of cause -> name of the variant
 
 
 def proposed(prepared: Prepared, base: VariantRun, most: int = MOST) -> list[Variant]:
-    """Return variants of a case, the likely causes of the verdict of its run first, each once."""
+    """Return up to `most` distinct variants, the likely causes in the verdict `base` first."""
     found: dict[frozenset[str], Variant] = {}
     for variant in _candidates(prepared, base):
         if variant.settings:
-            # The same keys with another prior are no other variant, other layers are.
+            # The same keys with another prior are the same variant, unless layers differ.
             keys = (setting.partition("=")[0] for setting in variant.settings)
             layers = [setting for setting in variant.settings if ".regions=" in setting]
             found.setdefault(frozenset((*keys, *layers)), variant)
@@ -66,11 +66,11 @@ def proposed(prepared: Prepared, base: VariantRun, most: int = MOST) -> list[Var
 def _candidates(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     """Iterate over likely causes, then over common errors of a case."""
     case = prepared.case
-    # A start that the first readings miss looks like many other errors.
+    # An initial state that differs from the first readings resembles many other errors.
     if first_miss(prepared) > _usual_error(base):
         yield Variant(NAMES["initial"], freed(prepared, Cause("initial", "", "")))
     for name in switching(case, prepared.raw) if isinstance(prepared.raw, DataTable) else ():
-        # Lines between the rows of a switch look like many other errors, too.
+        # Linear interpolation of an input that switches also resembles many other errors.
         yield Variant(f"{name} held", (channel_setting(name, "between", '"hold"'),))
     for cause in base.causes:
         if setting := held(prepared, cause):
@@ -94,7 +94,7 @@ def _candidates(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
 
 
 def _without_worst(base: VariantRun) -> Iterator[Variant]:
-    """Iterate over the case without the sensor that misfits most."""
+    """Iterate over at most one variant: without the sensor with the largest misfit."""
     known = {name: size for name, size in base.misfits.items() if math.isfinite(size)}
     if len(known) > 2:
         worst = max(known, key=lambda name: known[name])
@@ -102,13 +102,13 @@ def _without_worst(base: VariantRun) -> Iterator[Variant]:
 
 
 def _usual_error(base: VariantRun) -> float:
-    """Return the median error of the assimilated sensors."""
+    """Return the median prediction error of the assimilated sensors; NaN if unknown."""
     known = [size for size in base.errors.values() if math.isfinite(size)]
     return float(np.median(known)) if known else math.nan
 
 
 def _process(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
-    """Iterate over terms that the process may lack."""
+    """Iterate over variants with terms that may be missing in the process."""
     error, table = _usual_error(base), prepared.raw
     if not (isinstance(table, DataTable) and len(table) > 1 and error > 0.0):
         return
@@ -122,12 +122,12 @@ def _process(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
 
 
 def _sources(prepared: Prepared, size: float, time: float) -> Iterator[Variant]:
-    """Iterate over sources of a size: constant, one that jumps, and one that changes in a time."""
+    """Iterate over variants with a source: constant, with jumps, or changing within `time`."""
     source, law = freed(prepared, Cause("source", "", "", size=size)), prepared.case.spec.law
     if not source:
         return
     yield Variant("source", source)
-    if law.kind != "sensitivity":  # changes are found by a covariance
+    if law.kind != "sensitivity":  # estimating changes requires a covariance
         return
     if not law.jumps:
         yield Variant("source that jumps", (*source, 'law.jumps=["source"]'))
@@ -135,14 +135,14 @@ def _sources(prepared: Prepared, size: float, time: float) -> Iterator[Variant]:
 
 
 def _at_boundaries(prepared: Prepared, terms: Mapping[str, float]) -> Iterator[Variant]:
-    """Iterate over terms of some sizes that each boundary may lack."""
+    """Iterate over variants with a missing term at a boundary; `terms`: kind -> size."""
     for name, (kind, size) in product(map(str, prepared.case.mesh.boundaries or {}), terms.items()):
         settings = freed(prepared, Cause(kind, name, "", size=size))
         yield Variant(NAMES[kind].format(name), settings)
 
 
 def _walking(name: str, added: str, time: float) -> str:
-    """Return the setting of a random walk that changes by its standard deviation within a time.
+    """Return the setting of a random walk that changes by the prior std of the unknown in `time`.
 
     `added`: the setting that adds the unknown.
     """
@@ -152,11 +152,11 @@ def _walking(name: str, added: str, time: float) -> str:
 
 
 def _sensors(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
-    """Iterate over errors that all sensors may have."""
-    # All positions share one prior, which is plausible for each of them.
+    """Iterate over variants with an unknown error of every sensor."""
+    # All positions share one prior, which has to be plausible for each of them.
     shifts = [usual_shift(prepared, name) for name in prepared.case.sensors]
     for kind, size in (("offset", _usual_error(base)), ("position", min(shifts, default=math.nan))):
-        # Errors of the state say nothing about plates, which measure a flux.
+        # Sensors of a flux are left out: `size` is an error of the state.
         sensors = [n for n, one in prepared.case.roles("sensor").items() if not one.is_flux]
         causes = [Cause(kind, name, "", size=size) for name in sensors]
         settings = [setting for cause in causes for setting in freed(prepared, cause)]
@@ -165,7 +165,7 @@ def _sensors(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
 
 
 def _fewer(case: Case) -> Iterator[Variant]:
-    """Iterate over the case with fewer unknowns."""
+    """Iterate over variants with fewer unknowns."""
     words = {"offset": "offsets", "gain": "gains", "at_std": "uncertain positions"}
     for key, word in {**words, "time_constant": "time constants"}.items():
         stated = [n for n, one in case.roles("sensor").items() if getattr(one, key) is not None]
@@ -177,19 +177,19 @@ def _fewer(case: Case) -> Iterator[Variant]:
         if unknown.regions:
             yield Variant(f"one {name} everywhere", (f"{key}.regions=", *gone))
         if name in optional:
-            with suppress(ModelError):  # the equation needs it, or another one
+            with suppress(ModelError):  # the equation requires it or an alternative to it
                 unread = [f"{own}=" for own in unread_without(case, name)]
                 yield Variant(f"no {name}", (f"{key}=", *unread, *gone))
 
 
 def _references(case: Case, name: str) -> list[str]:
-    """Return the settings that remove the references of an unknown with other numbers."""
+    """Return the settings that remove the references of an unknown."""
     known = [label for label in case.spec.reference if base_name(label) == name]
     return [f"reference.{toml_key(label)}=" for label in known]
 
 
 def _optional(case: Case) -> set[str]:
-    """Return the unknowns that the equation does not need, and no condition or source names."""
+    """Return the optional unknowns of the equation that no condition or source uses."""
     optional = {name for name, known in case.equation.unknowns.items() if known.optional}
     for item in (*case.spec.boundary.values(), *case.spec.sources.values()):
         optional -= {value for value in vars(item).values() if isinstance(value, str)}
@@ -197,7 +197,7 @@ def _optional(case: Case) -> set[str]:
 
 
 def _layers(case: Case) -> Iterator[Variant]:
-    """Iterate over the first unknown with two layers, and with one for each sensor."""
+    """Iterate over variants of the first unknown with two layers, or one for each sensor."""
     name = next(iter(case.equation.unknowns), "")
     unknown = case.spec.unknowns.get(name)
     if unknown is None or unknown.regions or unknown.field:
@@ -208,7 +208,7 @@ def _layers(case: Case) -> Iterator[Variant]:
 
 
 def _divisions(case: Case) -> dict[str, dict[str, list[float]]]:
-    """Return divisions of the mesh into layers, with borders halfway between sensors."""
+    """Return divisions of the mesh into two layers, and into one layer for each sensor."""
     nodes = np.sort(case.mesh.p[0])[1:-1]
     if len(case.mesh.p) != 1 or not len(nodes):
         return {}
