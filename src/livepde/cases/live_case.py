@@ -1,4 +1,4 @@
-"""A case connected to a running process."""
+"""Connection of a case to a running process."""
 
 from __future__ import annotations
 
@@ -56,36 +56,36 @@ class LiveCase:
     case
         The case.
     data
-        Replacement of the case's own source: a file, an iterable of JSON lines, or a `Source`.
+        Replacement of the case's source: a file, an iterable of JSON lines, or a `RowSource`.
     path
-        Journal of the run. An existing one is continued; None: in memory.
+        Journal of the run. An existing journal is continued; None: in memory.
     pace
-        Speed of the replay of a finished file, relative to real time; infinity: as fast as
-        possible.
+        Speed of a replay relative to real time; infinity: as fast as possible.
     allow_env
-        Environment variables that the case may use as passwords, besides those whose names begin
-        with LIVEPDE_.
+        Environment variables that the case may use as passwords, in addition to those whose names
+        begin with LIVEPDE_.
 
     Attributes
     ----------
     prepared
-        The case with its first sample; None before that.
+        The case with its first sample; None before the first sample.
     running
-        The run, also while it takes samples again; None before.
+        The run, including the time in which samples of the journal are processed again; None
+        before.
     silent
         Whether the source has been silent for too long while waiting for the first sample.
     why
-        Reason why the run cannot begin yet, in one sentence: the source is silent, or its samples
-        are refused; empty if there is none.
+        Reason why the run cannot begin yet: the source is silent, or its samples are refused. Empty
+        if there is no reason.
 
     Raises
     ------
     CaseError, DataError
-        No source, one that cannot be reached, a policy that makes no sense.
+        The source is missing or cannot be reached, or the policy is invalid.
     ConfigurationError
-        A pace that is not positive.
+        The pace is not positive.
     RunError
-        The journal cannot be gone on with.
+        The journal cannot be continued.
     """
 
     def __init__(
@@ -104,9 +104,9 @@ class LiveCase:
         self.running: Live | None = None
         self.silent = False
         self.why = ""
-        self._reason = "no sample arrived"  # why the run has not begun
-        self._heard = 0.0  # when something came from the source last
-        # An invalid case is refused here, before anything is connected.
+        self._reason = "no sample arrived"  # reason why the run has not begun
+        self._heard = 0.0  # monotonic time at which data last arrived from the source
+        # Raises errors about an invalid case before connections are opened.
         self._policy, self._limits = policy_of(case), limits_of(case)
         self._passwords = passwords_of(case, data is None, allow_env)
         self._path = path
@@ -135,15 +135,15 @@ class LiveCase:
     def live(
         self, sinks: Iterable[Sink] = (), stopping: threading.Event | None = None
     ) -> Live | None:
-        """Wait for the first sample with all initial values, and return the run, ready to go on.
+        """Wait for the first sample with all initial values, and return the run, ready to continue.
 
         Parameters
         ----------
         sinks
-            Destinations of estimates in addition to the journal and to those of the case; closed
-            with this object.
+            Destinations of estimates in addition to the journal and the sinks of the case. They are
+            closed with this object.
         stopping
-            Event that ends the waiting, and the run.
+            Event that stops the waiting and the run.
 
         Returns
         -------
@@ -197,25 +197,25 @@ class LiveCase:
         return live
 
     def _prepared(self, first: Sample) -> Prepared:
-        """Return the case with its first sample; rows that were all read at once are not live."""
+        """Return the case with its first sample; live if rows arrive through an intake."""
         origin = self._origin if self._intake is None else self._intake.start
         return self.case.begin(first, origin, live=self._intake is not None)
 
     def _begun(
         self, stopping: threading.Event, irregular: dict[tuple[str, str], Remark]
     ) -> tuple[Prepared, Sequence[Ready]] | None:
-        """Return the case with its first sample and the samples from it on; None if stopped."""
+        """Return the case with its first sample, and the samples so far; None if stopped."""
         LOG.info("waiting for the first sample")
         self._heard = time.monotonic()
         found: list[Ready] = []
-        held: dict[str, float] = {}  # what holds from samples in which the run cannot begin
+        held: dict[str, float] = {}  # last values of held channels in samples that were dropped
         while not stopping.is_set() and (found or not self._feed.done):
             news = self._polled(found, irregular)
             while found and self._is_sure(found):
                 prepared = self._started(found, held)
                 if prepared is not None:
                     return prepared, found
-            # The remarks of the poll in which the run begins are left to the run.
+            # If the run begins in this poll, the run itself reports the remarks.
             for remark in news:
                 LOG.warning("%s: %s", remark.kind, remark.message)
         if stopping.is_set():
@@ -225,7 +225,7 @@ class LiveCase:
         raise DataError(f"{self.case.path}: {self._reason}{wrong}.")
 
     def _polled(self, found: list[Ready], irregular: dict[tuple[str, str], Remark]) -> list[Remark]:
-        """Add samples and remarks of the source, and return remarks of kinds that are new."""
+        """Poll the source for samples and remarks, and return the remarks of new kinds."""
         new = list(self._feed.poll(LOOK))
         self._listen()
         remarks, known = self._feed.remarks(new), set(irregular)
@@ -235,14 +235,14 @@ class LiveCase:
         return [remark for remark in remarks if (remark.kind, remark.channel) not in known]
 
     def _is_sure(self, found: list[Ready]) -> bool:
-        """Return whether no more rows have to show whether the first one is wild."""
+        """Return whether outliers in the first row can be detected without further rows."""
         many = self._feed.done or len(found) > FEWEST_FOLLOWING
         return many or not suspect_start(self.case, found[0].values)
 
     def _started(self, found: list[Ready], held: dict[str, float]) -> Prepared | None:
-        """Return the case with the first sample; if it cannot begin with it, drop that and log why.
+        """Return the case with the first sample; drop a sample with which it cannot begin.
 
-        `held`: the last values of channels that hold until the next reading.
+        `held`: the last values of channels that are constant until the next reading.
         """
         values = dict.fromkeys(self.case.columns, math.nan) | found[0].values
         for name, channel in self.case.spec.channels.items():
@@ -260,7 +260,7 @@ class LiveCase:
         return None
 
     def _without_wild(self, found: list[Ready]) -> list[Remark]:
-        """Blank wild values of the first rows, and return remarks on them."""
+        """Replace outliers in the first rows by NaN, and return remarks on them."""
         if len(found) <= FEWEST_FOLLOWING:
             return []
         remarks = []
@@ -272,7 +272,7 @@ class LiveCase:
         return remarks
 
     def _listen(self) -> None:
-        """Note whether the source is silent, and when something came from it last."""
+        """Update whether the source is silent, and when data last arrived from it."""
         silence = math.inf if self._limits[-1] is None else self._limits[-1]
         now = time.monotonic()
         if self._feed.heard():
@@ -285,19 +285,19 @@ class LiveCase:
     def _fed(self, data: Data) -> Feed:
         case, named = self.case, data if isinstance(data, str) else None
         if self._reads_all(data, named):
-            whole = case.read(named)  # its gaps need not wait for the next value
+            whole = case.read(named)  # gaps are filled without waiting for the next value
             self._origin = whole.origin
             if self._journal is not None:
                 return SampleFeed(whole.stream, after=self._journal.last)
             counts = getattr(whole.stream, "remarks", {}).items()
-            told = [Remark(kind, of, f"{n} times in these data", n) for (kind, of), n in counts]
-            return SampleFeed(whole.stream, irregular=told)
+            remarks = [Remark(kind, of, f"{n} times in these data", n) for (kind, of), n in counts]
+            return SampleFeed(whole.stream, irregular=remarks)
         refuse_late(case)
         self._intake, position = self._new_intake()
         return Gathered(source_of(case, data, position, self._passwords), self._intake)
 
     def _reads_all(self, data: Data, named: str | None) -> bool:
-        """Return whether all rows are read at once, not followed one by one."""
+        """Return whether all rows are read at once instead of followed one by one."""
         case, spec = self.case, self.case.spec.data
         file, reader = (spec.file, case.reader) if data is None else (named, None)
         if isinstance(file, tuple):
@@ -311,7 +311,7 @@ class LiveCase:
         return bool(file) and (spec.every > 1 or spec.is_of_file)
 
     def _new_intake(self) -> tuple[Intake, str]:
-        """Return an intake of rows that follow those of the journal, and the source's position."""
+        """Return an intake for rows after the journal, and the position in the source."""
         case, journal = self.case, self._journal
         options: dict[str, Any] = {"missing": case.spec.data.missing}
         position = ""

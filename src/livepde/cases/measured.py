@@ -28,46 +28,46 @@ from livepde.units import OF_TIMES, conversion, counted_since, unit_in
 
 HOUR = re.compile(r"\d+:\d{2}(:\d{2}(\.\d+)?)?( ?[AaPp][Mm])?")
 ROW_NUMBER = re.compile(r"(id|idx|index|n|no|nr|num|number|row|rec|record|sample|#)\.?", re.I)
-# Units of times that count from a date, and their least number: that of the year 2000.
+# Units of times relative to a date, and the smallest plausible number: the year 2000.
 COUNTED = {
     "ms since 1970-01-01T00:00Z": 946684800e3,
     "s since 1970-01-01T00:00Z": 946684800.0,
-    "d since 1899-12-30": 36526.0,  # of Excel
+    "d since 1899-12-30": 36526.0,  # Excel
 }
-LATEST = 2.7  # times the least number: the year 2051, or 2169 of Excel
+LATEST = 2.7  # largest plausible over smallest number: the year 2051, or 2169 for Excel
 DATED = re.compile(r"^t\b|time|date|datum|zeit|temps", re.I)
-VALUED = re.compile(r"val|wert|reading|result|state", re.I)  # column of values of all sensors
-UNITS = re.compile(r"unit|einheit|unité|eenheid", re.I)  # column of their units
-MOSTLY = 0.9  # share of rows whose time and sensor no other row has
-VALUES = {"number", "date", "hour"}  # kinds of cells that a header does not have
+VALUED = re.compile(r"val|wert|reading|result|state", re.I)  # name of the column of values
+UNITS = re.compile(r"unit|einheit|unité|eenheid", re.I)  # name of the column of units
+MOSTLY = 0.9  # smallest share of distinct pairs of time and sensor in a long table
+VALUES = {"number", "date", "hour"}  # kinds of cells that do not occur in a header
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """A table of measurements as it was read."""
+    """A table of measurements, with its detected format."""
 
     path: Path
     written: Written
-    time: tuple[str, ...]  # column of times; or days and times of day, two columns
-    time_format: str  # of its dates; empty: ISO format, or numbers
-    time_unit: str  # of its times; `BLANK` if unknown, empty if the equation's time has none
+    time: tuple[str, ...]  # time column, or the columns of days and times of day
+    time_format: str  # format of dates; empty: ISO format, or numbers
+    time_unit: str  # unit of times; `BLANK` if unknown, empty if the equation has no time unit
     samples: DataTable  # times, and the columns that contain numbers
-    row_numbers: tuple[str, ...]  # columns that are not used
-    texts: tuple[str, ...]  # columns without numbers, not used either
-    missing: tuple[float | str, ...] = ()  # stated to mean a missing value, of the first table
-    counted: str = ""  # unit and date since which times count that are numbers; empty: none
-    more: tuple[Measured, ...] = ()  # tables that are joined to this one by time
+    row_numbers: tuple[str, ...]  # unused columns of row numbers
+    texts: tuple[str, ...]  # unused columns without numbers
+    missing: tuple[float | str, ...] = ()  # stated markers of missing values, for the first table
+    counted: str = ""  # unit and reference date of times, such as "d since 1899-12-30"; or empty
+    more: tuple[Measured, ...] = ()  # tables that are joined to this table by time
     long: tuple[str, str] | None = None  # columns of sensors and values, if each row is a reading
-    units: Mapping[str, str] = field(default_factory=dict)  # of the sensors of such a table
+    units: Mapping[str, str] = field(default_factory=dict)  # sensor -> unit, in a long table
 
     @property
     def tables(self) -> tuple[Measured, ...]:
-        """Tables that are joined: the first is this one."""
+        """All joined tables; the first is this table."""
         return (self, *self.more)
 
     @property
     def columns(self) -> dict[str, Array]:
-        """Values of each column of numbers, of all tables."""
+        """Column of numbers -> values, for all tables."""
         return {
             name: values
             for table in self.tables
@@ -75,7 +75,7 @@ class Measured:
         }
 
     def joined(self, other: Measured) -> Measured:
-        """Return this table with another one that is joined to it by time; raises `DataError`."""
+        """Return this table joined with another table by time; raises `SampleError`."""
         if both := sorted(self.columns.keys() & other.columns.keys()):
             raise SampleError(
                 f"{other.path}: the column '{both[0]}' is in another table, too: rename one."
@@ -88,13 +88,13 @@ class Measured:
         return replace(self, more=(*self.more, other))
 
     def titled(self, name: str) -> str:
-        """Return the name of a column with the unit that another column states for it."""
+        """Return the name of a sensor with its unit in brackets, if a column of units has it."""
         unit = self.units.get(name, "")
         return f"{name} [{unit}]" if unit else name
 
     @property
     def is_of_numbers(self) -> bool:
-        """Whether times are numbers whose unit a case states."""
+        """Whether times are numbers, whose unit a case has to state."""
         return self.samples.origin is None and self.time_format not in ELAPSED
 
     @property
@@ -133,13 +133,13 @@ def measured(
     sensor: str = "",
     value: str = "",
 ) -> Measured:
-    """Read a CSV file of which nothing is known.
+    """Read a CSV file whose format is unknown, apart from the arguments; raises `SampleError`.
 
-    `time_unit`: the unit of time of the equation. `time_format`: of dates; empty: found from the
-    cells. `skip`: lines before the header; None: found from the lines. `zone`: of dates
-    without one. `missing`: numbers and texts that mean a missing value. `stated`: the unit of the
-    times; empty: found from their name and their numbers. `sensor`, `value`: columns of a table
-    with a row for each reading; empty: found from the texts.
+    `time_unit`: time unit of the equation. `time_format`: format of dates; empty: detected from the
+    cells. `skip`: number of lines before the header; None: detected. `zone`: time zone of dates
+    without one. `missing`: markers of missing values. `stated`: unit of times; empty: detected from
+    name and numbers. `sensor`, `value`: columns of a long table, with a row for each reading;
+    empty: detected.
     """
     if table.suffix in (*JSON_LINES, ".parquet"):
         raise SampleError(f"{table}: expected a CSV file with a header.")
@@ -171,12 +171,12 @@ def measured(
 
 @dataclass(frozen=True)
 class _Readings:
-    """Columns of a table with a row for each reading, and the sensors in it."""
+    """Columns and sensors of a long table, with a row for each reading."""
 
     sensor: str
     value: str
     names: tuple[str, ...]
-    units: Mapping[str, str]  # of sensors, if a column states them
+    units: Mapping[str, str]  # sensor -> unit; empty without a column of units
 
 
 def _readings(
@@ -188,9 +188,9 @@ def _readings(
     sensor: str,
     value: str,
 ) -> _Readings | None:
-    """Return how a table has a row for each reading; None if it has a column for each sensor.
+    """Return the layout of a long table; None for a table with a column for each sensor.
 
-    Its times repeat, but not those of each text in some column. `sensor`, `value`: stated columns.
+    In a long table times repeat, but not for the same sensor. `sensor`, `value`: stated columns.
     """
     asked = [sensor] if sensor else list(texts)
     if not asked:
@@ -207,13 +207,13 @@ def _readings(
 
 
 def _naming_sensors(asked: Sequence[str], cells: Mapping[str, list[str]], clock: Clock) -> str:
-    """Return the column that names the sensor of each row, if times repeat; else empty."""
+    """Return the column with the sensor of each row, if times repeat; else an empty text."""
     moments = list(zip(*(cells[name] for name in clock.names), strict=True))
     if len(set(moments)) == len(moments):
         return ""
 
     def names_sensors(names: list[str]) -> bool:
-        # An hour that clocks show twice repeats some moments of a sensor.
+        # When clocks are set back, some times of a sensor occur twice.
         apart = len({*zip(names, moments, strict=True)})
         return len(set(filter(None, names))) > 1 and apart >= MOSTLY * len(moments)
 
@@ -221,7 +221,7 @@ def _naming_sensors(asked: Sequence[str], cells: Mapping[str, list[str]], clock:
 
 
 def _valued(table: Path, sensor: str, numbers: Sequence[str]) -> str:
-    """Return the column of values of a table with a row for each reading."""
+    """Return the column of values of a long table; raises `SampleError` if it is ambiguous."""
     values = [one for one in numbers if VALUED.search(one)]
     values = values or [one for one in numbers if one != sensor]
     if len(values) == 1:
@@ -235,7 +235,7 @@ def _valued(table: Path, sensor: str, numbers: Sequence[str]) -> str:
 def _clock(
     table: Path, written: Written, time: tuple[str, ...], kind: str, form: str, stated: str
 ) -> tuple[Clock, str]:
-    """Return how times are read, and their unit, perhaps with a date; empty if it is unknown."""
+    """Return the clock of a table, and the unit of times with its date, if any, or empty."""
     dated = kind in ("date", "hour")
     form = _format(table, written, time, form) if dated else ""
     unit = "s" if dated else stated or _unit_of_times(written, time[0])
@@ -246,14 +246,14 @@ def _clock(
 
 
 def _without(row: Sequence[str], missing: Missing) -> list[str]:
-    """Return the cells of a row, empty where they mean a missing value."""
+    """Return the cells of a row, with markers of missing values replaced by empty cells."""
     return ["" if is_missing(cell, missing) else cell for cell in row]
 
 
 def _sorted_out(
     kinds: Mapping[str, str], time: tuple[str, ...], written: Written
 ) -> tuple[dict[str, Column], tuple[str, ...], tuple[str, ...]]:
-    """Return the columns of measurements, those of row numbers, and those without numbers."""
+    """Return the columns of measurements, of row numbers, and without numbers."""
     numbers = [name for name, kind in kinds.items() if kind == "number" and name not in time]
     counted = tuple(name for name in numbers if _counts_rows(name, written))
     columns = {n: Column((n,), decimal=written.decimal) for n in numbers if n not in counted}
@@ -261,7 +261,7 @@ def _sorted_out(
 
 
 def _unit_of_times(written: Written, name: str) -> str:
-    """Return the unit of a column of numbers, perhaps with the date since which they count."""
+    """Return the unit of times that are numbers, with its reference date, if any, or empty."""
     if found := counted_since(name) or unit_in(name, "s", *OF_TIMES):
         return found
     values, named = _values(name, written), DATED.search(name)
@@ -272,7 +272,7 @@ def _unit_of_times(written: Written, name: str) -> str:
 
 
 def _kinds(table: Path, written: Written, form: str) -> dict[str, str]:
-    """Return column -> kind of most of its cells: "number", "date", "hour" or "text"."""
+    """Return column -> most frequent kind of its cells: "number", "date", "hour" or "text"."""
     header, rows = written.header, written.rows
     if not rows:
         raise SampleError(f"{table}: has no rows below its header.")
@@ -307,7 +307,7 @@ def _kind(cell: str, decimal: str, form: str) -> str:
 
 
 def _times(table: Path, written: Written, kinds: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the column of times: dates, or numbers that increase; or days and times of day."""
+    """Return the time column (dates or increasing numbers), or columns of days and times."""
     of_kind: defaultdict[str, list[str]] = defaultdict(list)
     for name, kind in kinds.items():
         of_kind[kind].append(name)
@@ -330,22 +330,22 @@ def _times(table: Path, written: Written, kinds: Mapping[str, str]) -> tuple[str
 
 
 def _most_like_times(numbers: Sequence[str], hours: Sequence[str], written: Written) -> list[str]:
-    """Return columns that may be times, those with the surest signs first.
+    """Return columns that may be times, the most certain first.
 
-    `hours`: columns such as 0:10:00, which are times if they are elapsed times. Besides times of
-    day, numbers are times only if their name says so.
+    `hours`: columns such as 0:10:00, which are times if they are elapsed times. If there are any,
+    columns of numbers are times only if their name indicates it.
     """
     timed = [n for n in numbers if counted_since(n) or unit_in(n, "s", *OF_TIMES)]
     rising = [name for name in numbers if _rises(name, written)]
     named = [*filter(rising.__contains__, timed), *filter(CALLED_TIME.match, rising)]
     if hours:
         return [*named, *(name for name in hours if elapsed_formats(_cells(name, written)))]
-    # Row numbers increase, too: they are times only if nothing else is.
+    # Row numbers also increase: they come after other increasing numbers.
     return [*named, *sorted(rising, key=lambda name: _counts_rows(name, written)), *timed]
 
 
 def _format(table: Path, written: Written, time: tuple[str, ...], given: str) -> str:
-    """Return the format of dates; refuses cells whose order of day and month is not unique."""
+    """Return the format of dates or elapsed times; raises `SampleError` if it is ambiguous."""
     if given:
         return given
     cells = [" ".join(parts) for parts in zip(*(_cells(n, written) for n in time), strict=False)]
@@ -380,7 +380,7 @@ def _cells(name: str, written: Written) -> list[str]:
 
 
 def _values(name: str, written: Written) -> Array:
-    """Return the first numbers of a column, NaN where a cell is none."""
+    """Return the numbers in the first cells of a column, NaN for other cells."""
     k = written.header.index(name)
     cells = (number_of(row[k], written.decimal) for row in written.rows if k < len(row))
     return np.array(list(cells), dtype=float)
@@ -392,7 +392,7 @@ def _rises(name: str, written: Written) -> bool:
 
 
 def _counts_rows(name: str, written: Written) -> bool:
-    """Return whether a column numbers the rows, by its name and its values."""
+    """Return whether a column contains row numbers, according to its name and values."""
     values = _values(name, written)
     counts = bool((values[1:] == values[:-1] + 1).all())
     return bool(ROW_NUMBER.fullmatch(name.strip())) and len(values) > 1 and counts

@@ -1,6 +1,6 @@
-"""Members of a fleet that differ only in data and initial state, stepped as blocks.
+"""Blocks of fleet members that differ only in data and initial state, stepped together.
 
-Each member has a journal of its own, with the same records as that of a separate run.
+Each member has its own journal, whose records are equal to the records of a separate run.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from livepde.runs.journal import Event
 from livepde.samples import by_name
 from livepde.streams import DataTable
 
-WAITING = 2**23  # numbers that wait to be written
+WAITING = 2**23  # pending numbers above which the journals are written
 ALONE = "no other one has their settings and sample times"
-# Members may differ in how a channel is read, and in descriptions of a run.
+# Keys of channels (how they are read) and tables of the case in which members may differ.
 READ = {"column", "columns", "noise_column", "unit", "factor", "late", "valid"}
 READ |= {"missing", "spikes", "wait", "repeated"}
 TOLD = {"title", "initial", "data", "intake", "reference", "expect", "variants"}
 
 
 def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str, str]]:
-    """Return blocks of members that can be stepped together, and the reasons why others cannot.
+    """Return blocks of members that can be stepped together, and other member -> reason.
 
-    Their cases differ only in data, initial state and descriptions; their samples have the same
+    Cases in a block differ only in data, initial state and descriptions; samples have the same
     times and channels.
     """
     groups: dict[tuple[Any, ...], dict[str, Prepared]] = {}
@@ -49,13 +49,13 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str
         if why := _refuses(one):
             apart[name] = why
             continue
-        # Members often share one case, whose text takes longer to write than a look-up.
+        # Members often share one case: its settings are only serialised once.
         if one.case not in settings:
             unread = {"channels": {"__all__": READ}}
             settings[one.case] = one.case.spec.model_dump_json(
                 exclude={**dict.fromkeys(TOLD, True), **unread}
             )
-        # Tables of late channels, or with the noise of readings, differ in the order of channels.
+        # Late channels and noise columns change the order of channels in a table.
         table = one.stream
         key = settings[one.case], one.assimilate_from, one.t0, table.t.tobytes(), table.names
         groups.setdefault(key, {})[name] = one
@@ -70,7 +70,7 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str
 
 
 def _refuses(one: Prepared) -> str:
-    """Return the reason why a member cannot join a block; its own run reports the error."""
+    """Return the reason why a member cannot join a block, or ''; its own run reports errors."""
     try:
         _ = one.u0
     except LivepdeError:
@@ -81,7 +81,7 @@ def _refuses(one: Prepared) -> str:
 
 
 class MemberBlock:
-    """Members of one model that are stepped together; their tables have the same times."""
+    """Members with one model and the same sample times, which are stepped together."""
 
     def __init__(self, members: Mapping[str, Prepared]) -> None:
         self.members = dict(members)
@@ -110,10 +110,10 @@ class MemberBlock:
         self._paths: list[Path] = []
         self._kept = FleetRecords(case.model, case.spec.output.fields_every)
         self._events: list[list[Event]] = [[] for _ in self._each]
-        self._taken = self._written = 0  # samples
+        self._taken = self._written = 0  # numbers of samples
 
     def run(self, paths: Sequence[Path]) -> None:
-        """Step through all samples; journals are written at intervals, their ends by `ended`."""
+        """Step through all samples, writing journals at intervals; `ended` completes them."""
         self._paths = list(paths)
         table, stopping = self._tables[0], threading.Event()
         with stopped_by_signals(stopping, lambda: True):
@@ -144,7 +144,7 @@ class MemberBlock:
             self._events[k].append(Event(float(self.fleet.t[k]), status.code, "", str(status)))
 
     def _journal(self, k: int, identifier: Identifier) -> Journal:
-        """Return the journal of a member: all of them at once would be too many open files."""
+        """Open the journal of a member; keeping all journals open would exceed the file limit."""
         path, one = self._paths[k], self._each[k]
         if self._written:
             return Journal.open(path, write=True)
@@ -165,7 +165,7 @@ class MemberBlock:
         if not set(journal.noise).isdisjoint(table.names):
             names += journal.noise
         absent = np.full((len(rows), 1), np.nan)
-        # Column -1 is the appended one of NaN, for channels that this table lacks.
+        # Column -1 is an appended column of NaN, for channels that are not in this table.
         places = [table.names.index(name) if name in table.names else -1 for name in names]
         rows = np.hstack([rows, absent])[:, places]
         for event in self._events[k]:
@@ -175,7 +175,7 @@ class MemberBlock:
 
     @contextmanager
     def ended(self, k: int) -> Iterator[tuple[Identifier, Driven]]:
-        """Complete the journal of a member; yield its identifier and run while it is open."""
+        """Complete the journal of a member, and yield its identifier and run while it is open."""
         fleet, identifier = self.fleet, self.fleet.identifier(k)
         with self._journal(k, identifier) as journal:
             self._write(k, journal, identifier)

@@ -36,7 +36,7 @@ NOTHING = "advice on sensors: the data contain no measurement."
 class Identified:
     """Standard deviations of an unknown in the preview, before and after the samples."""
 
-    name: str  # label of a number; name and vertex of a field
+    name: str  # label of a number, or name of a field with its best or worst determined vertex
     prior: float
     posterior: float
     unit: str
@@ -89,9 +89,8 @@ def linearised(law: AnyLaw) -> SensitivityLaw | None:
 def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
     """Return the identifiability from the first samples, linearised at the prior.
 
-    The covariance then depends on the times of measurements and on inputs, but not on measured
-    values. It is a best case, for an exact model and noise as stated. Laws without covariance have
-    an empty preview.
+    The covariance then depends on times of measurements and on inputs, not on measured values. It
+    is a best case: exact model, noise as stated. A law without covariance has an empty preview.
     """
     linear = linearised(prepared.case.law)
     if linear is None or (linear.noise is None and prepared.identifier.observed.noise is None):

@@ -1,4 +1,4 @@
-"""Likely errors of a sensor that is set aside, from its readings and their predictions."""
+"""Likely errors of a rejected sensor, from its readings and their predictions."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
     from livepde.cases.case import Prepared
 
-FEWEST = 20  # readings
-LONGEST = 0.2  # of the samples, by which a sensor may be late
-SLIGHT = 0.1  # share that is not worth a word
+FEWEST = 20  # readings required for an analysis
+LONGEST = 0.2  # longest lag of a sensor, as a share of its samples
+SLIGHT = 0.1  # explained share up to which an error is not reported
 
 
 class _Sensor(NamedTuple):
@@ -35,31 +35,31 @@ class _Sensor(NamedTuple):
     y: Array
 
     def explained(self, corrected: Array) -> float:
-        """Return the share that corrected readings explain, of the misfit and of the signal."""
+        """Return the smaller share of misfit and signal that corrected readings explain."""
         rest = np.square(corrected - self.y).sum()
         misfit, signal = np.square(self.z - self.y).sum(), np.square(self.y - self.y.mean()).sum()
-        # A constant may be near the predictions, and yet follow none of their changes.
+        # The signal is included since a constant near the predictions follows none of its changes.
         return 1.0 - float(rest / min(misfit, signal)) if min(misfit, signal) > 0.0 else 0.0
 
     def errors(self, unit: str) -> Iterator[tuple[float, Error]]:
-        """Iterate over errors of the sensor, each with the share that its best size explains."""
+        """Iterate over (explained share, error), for each kind of error with its best size."""
         names, z, y = (self.name,), self.z, self.y
         offset = float((z - y).mean())
         yield self.explained(z - offset), Error("offset", names, offset)
         if y.any() and (factor := float(z @ y / (y @ y))) > 0.0:
             yield self.explained(z / factor), Error("gain", names, factor - 1.0)
-        # Sensors are late by whole samples, as readings between two would have less noise.
+        # Only lags of whole samples are tested, since interpolated readings have less noise.
         step, most = float(np.median(np.diff(self.t))), int(LONGEST * len(y))
         lags = [Error("lag", names, k * step) for k in range(-most, most + 1)]
         units = [Error("unit", names, unit=number) for number in units_of(unit, scaled=False)]
         for errors in (lags, units):
             each = [(self.explained(self._corrected(error)), error) for error in errors]
             share, error = max(each, key=itemgetter(0))
-            if abs(error.size) < most * step:  # a lag at the end of the search is none
+            if abs(error.size) < most * step:  # a lag at the limit of the search is not an optimum
                 yield share, error
 
     def _corrected(self, error: Error) -> Array:
-        """Return readings without a lag, or in another unit."""
+        """Return the readings after correction of a lag or a unit."""
         if error.kind == "lag":
             return np.interp(self.t + error.size, self.t, self.z)
         factor, constant = UNITS[error.unit].factor, UNITS[error.unit].constant
@@ -67,7 +67,7 @@ class _Sensor(NamedTuple):
 
 
 def with_errors_of_set_aside(prepared: Prepared, data: xr.Dataset, verdict: Verdict) -> Verdict:
-    """Return a verdict that lists what may be wrong with each sensor that is set aside."""
+    """Return the verdict with the likely causes of the error of each rejected sensor."""
     table, who = prepared.raw, prepared.identifier.observed
     if not isinstance(table, DataTable):
         return verdict
@@ -87,7 +87,7 @@ def with_errors_of_set_aside(prepared: Prepared, data: xr.Dataset, verdict: Verd
             ]
         elsewhere = LIKELY["disagreement"].filled(name=finding.subject).text
         found.append(Cause("position", finding.subject, elsewhere))
-        if found[0].share >= HALF:  # its own remedy is that of a sensor that is broken
+        if found[0].share >= HALF:  # the default remedy assumes a defective sensor
             return replace(finding, causes=(*found, *finding.causes), remedy="")
         return replace(finding, causes=(*finding.causes, *found))
 
@@ -95,7 +95,7 @@ def with_errors_of_set_aside(prepared: Prepared, data: xr.Dataset, verdict: Verd
 
 
 def _readings(table: DataTable, data: xr.Dataset, name: str) -> _Sensor:
-    """Return the readings of a sensor that have a prediction."""
+    """Return the readings of a sensor with their predictions, where both are known."""
     t, misses = data["time"].values, data["innovation"].sel(sensor=name).values
     place = np.searchsorted(table.t, t).clip(max=len(table.t) - 1)
     z = np.where(table.t[place] == t, table.values[place, table.names.index(name)], np.nan)
