@@ -1,4 +1,4 @@
-"""Which variant of a case is recommended, and sentences on it and the others."""
+"""Recommendation of a variant of a case, and sentences that explain it."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from itertools import chain
 
 from livepde.cases.variants import GAINED, VariantRun
 
-WORSE = 0.02  # share by which the error of validation sensors may grow: about its own error
+WORSE = 0.02  # tolerated relative growth of validation errors: about their own uncertainty
 USABLE = ("trusted", "caution")
 
 
 def recommended(base: VariantRun, others: Sequence[VariantRun]) -> VariantRun:
     """Return the variant with the best evidence that predicts the validation sensors no worse.
 
-    Among variants of similar evidence it is the one with the fewest unknowns, and a usable one goes
-    first. It is the case itself if none has strong evidence against it, or if none of those can be
-    used and it can. Variants of similar evidence that exclude its estimates are its rivals: which
-    one is right the data cannot tell, as a scale of one of two sensors. Variants that cannot be
-    used may yet explain the data better: then the recommended one is not trusted, as it lacks
-    something, too.
+    Usable variants are preferred, and the fewest unknowns among variants of similar evidence. The
+    case itself is recommended if no variant has strong evidence against it, or if it is usable and
+    none of those variants is. Variants of similar evidence with disjoint intervals are its rivals:
+    the data cannot decide between them, for example which of two sensors has a gain error. If
+    unusable variants explain the data better, the recommended variant is incomplete and not
+    trusted.
     """
     ahead = _ahead(base, others)
     if not ahead:
@@ -41,14 +41,14 @@ def _usable(runs: Iterable[VariantRun]) -> list[VariantRun]:
 
 
 def _ahead(base: VariantRun, others: Sequence[VariantRun]) -> list[VariantRun]:
-    """Return variants with strong evidence and no worse predictions, the best first."""
+    """Return variants with strong evidence and no worse predictions, by decreasing evidence."""
     strong = (one for one in others if one.gained(base) > GAINED)
-    sound = (one for one in strong if not (_worse_sensors(one, base) or one.failed > base.failed))
-    return sorted(sound, key=lambda one: one.gained(base), reverse=True)
+    valid = (one for one in strong if not (_worse_sensors(one, base) or one.failed > base.failed))
+    return sorted(valid, key=lambda one: one.gained(base), reverse=True)
 
 
 def _worse_sensors(one: VariantRun, base: VariantRun) -> list[str]:
-    """Return both errors of the validation sensors that a run predicts worse, or not at all."""
+    """Return texts with the errors of validation sensors that a run predicts worse than `base`."""
     return [
         f"{name} {own:.3g} instead of {error:.3g}"
         for name, error in base.validation.items()
@@ -58,7 +58,7 @@ def _worse_sensors(one: VariantRun, base: VariantRun) -> list[str]:
 
 
 def conclusions(base: VariantRun, others: Sequence[VariantRun]) -> list[str]:
-    """Return sentences on the recommendation, and on what other variants disagree about."""
+    """Return sentences on the recommendation, and on disagreements between variants."""
     best = recommended(base, others)
     known = [one for one in others if not one.error]
     remarks = chain(_mispredicting(base, known), _remarks(base, best, known))
@@ -113,7 +113,7 @@ def _equals(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
 
 
 def _better(best: VariantRun, base: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
-    """Iterate over the sentence on variants that explain the data better, but cannot be used."""
+    """Iterate over the sentence, if any, on unusable variants that explain the data better."""
     if not best.better:
         return
     names = ", ".join(f"'{name}'" for name in best.better)
@@ -127,7 +127,7 @@ def _better(best: VariantRun, base: VariantRun, others: Sequence[VariantRun]) ->
 
 
 def _remarks(base: VariantRun, best: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
-    """Iterate over sentences on variants that are worse, or cannot be compared."""
+    """Iterate over sentences on variants that are contradicted or cannot be compared."""
     if refuted := _names_of(one for one in others if one.gained(base) < -GAINED):
         yield f"The data contradict {refuted}: lower evidence than the case."
     apart = [one for one in others if math.isnan(one.gained(base))]
@@ -148,12 +148,12 @@ def _mispredicting(base: VariantRun, others: Sequence[VariantRun]) -> Iterator[s
 
 
 def _names_of(runs: Iterable[VariantRun]) -> str:
-    """Return the names of variants in quotes; empty without any."""
+    """Return the names of variants in quotes, separated by commas."""
     return ", ".join(f"'{one.variant.name}'" for one in runs)
 
 
 def _disagreements(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
-    """Iterate over unknowns that differ by more than the intervals between variants."""
+    """Iterate over sentences on unknowns whose intervals in variants do not overlap."""
     found: dict[str, list[str]] = {}
     others = [one for one in others if one.variant != best.variant]
     shared = any(best.estimates.keys() & one.estimates.keys() for one in others)

@@ -1,4 +1,4 @@
-"""Settings of a case that estimate or correct the causes which a verdict names."""
+"""Settings of a case that estimate or correct the causes in a verdict."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from livepde.verdict.sentences import ESTIMATED, FINDINGS, LIKELY, amount_of, cl
 if TYPE_CHECKING:
     from livepde.cases.case import Case, Prepared
 
-WIDE = 2.0  # prior standard deviation of what is freed, over the size that was found
+WIDE = 2.0  # prior standard deviation of an added unknown, over the estimated size of the cause
 KEYS = {kind: key for kind, (_, key) in ESTIMATED.items()}
-"""Kind of error of a sensor -> its key in a case; all sensors share one prior of each."""
-# Errors with a size that a fit could find.
+"""Kind of sensor error -> its key in a case; all sensors share one prior for each kind."""
+# Kinds of causes whose size a fit can estimate.
 SIZED = ("averaging", "boundary", "channel", "drift", "flux", "lag", "loss", "source", "transfer")
-STATED = {"factor", "late"}  # keys of a channel whose stated value a cause does not replace
-MISSED = 5.0  # times the noise that the first readings may miss a stated start
-DOUBTED = ("caution", "do not trust")  # levels of a verdict
+STATED = {"factor", "late"}  # keys of a channel that a setting must not override
+MISSED = 5.0  # largest difference of first readings from a stated initial state, over the noise
+DOUBTED = ("caution", "do not trust")  # levels of a verdict with doubts
 JUMPED = "Jumps are allowed already: check the model and the data for another cause."
 NO_SETTING = "No key of this case does that."
 
 
 def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
-    """Return a verdict whose causes have the settings of the case that estimate or correct them."""
+    """Return the verdict with settings of the case that estimate or correct each cause."""
 
     def named(cause: Cause) -> Cause:
         settings = freed(prepared, cause)
@@ -65,7 +65,7 @@ def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
 
 
 def _also(prepared: Prepared, causes: Sequence[Cause]) -> Iterator[Cause]:
-    """Iterate over causes that look like those named: a slow response like a late clock."""
+    """Iterate over causes with similar effects: a slow response for each late clock."""
     known = {cause.subject for cause in causes if cause.kind == "response"}
     unit = prepared.case.equation.time_unit
     for cause in causes:
@@ -75,15 +75,15 @@ def _also(prepared: Prepared, causes: Sequence[Cause]) -> Iterator[Cause]:
 
 
 def _omitted(prepared: Prepared) -> str:
-    """Return the term that the equation omits at first, and the remedy; empty without one."""
+    """Return a sentence on the effect that the equation omits at first, with a remedy, or ''."""
     text, later = prepared.case.equation.omits, later_start(prepared)
     return f"{text} Or begin later: `{later}`." if text and later else text
 
 
 def later_start(prepared: Prepared) -> str:
-    """Return the setting of a start after which the omitted term has faded.
+    """Return the setting of a start after which the omitted effect is negligible.
 
-    Empty if nothing is left out, or if that takes more than half of the record.
+    Empty if the equation omits nothing, or if more than half of the record would be lost.
     """
     case, table = prepared.case, prepared.raw
     if case.equation.settles is None or not isinstance(table, DataTable):
@@ -93,7 +93,7 @@ def later_start(prepared: Prepared) -> str:
     }
     after = case.equation.settles({**case.options, **priors}, float(case.mesh.p[0].min()))
     begin, end = prepared.t0, float(table.t[-1])
-    # A start that is nearly as late already gains nothing.
+    # If the case already starts almost as late, a later start has no benefit.
     if not 1.2 * prepared.assimilate_from < begin + after < 0.5 * (begin + end):
         return ""
     seconds = conversion(case.equation.time_unit, "s", "a later start").factor * (begin + after)
@@ -102,9 +102,9 @@ def later_start(prepared: Prepared) -> str:
 
 
 def after_gaps(verdict: Verdict, inputs: Iterable[Finding]) -> Verdict:
-    """Return a verdict in which gaps of inputs are to be fixed before refused readings.
+    """Return the verdict, where the remedy of refused readings is to fix gaps of inputs first.
 
-    `inputs`: findings on the inputs; those with a remedy are long gaps.
+    `inputs`: findings on the inputs; a finding with a remedy is a long gap.
     """
     gaps = next((one.remedy for one in inputs if one.remedy), "")
     if not gaps:
@@ -117,7 +117,7 @@ def after_gaps(verdict: Verdict, inputs: Iterable[Finding]) -> Verdict:
 
 
 def start_missed(prepared: Prepared, verdict: Verdict) -> list[Finding]:
-    """Return the finding of a stated start that the first readings miss, in a doubted run."""
+    """Return the finding that the first readings contradict a stated start, in a doubted run."""
     settings, missed = _initial(prepared), first_miss(prepared)
     noise, law = prepared.identifier.observed.noise, prepared.case.law
     if isinstance(law, SensitivityLaw) and isinstance(law.noise, int | float):
@@ -134,7 +134,7 @@ def start_missed(prepared: Prepared, verdict: Verdict) -> list[Finding]:
 
 
 def _with_remedy(prepared: Prepared, cause: Cause, settings: tuple[str, ...]) -> Cause:
-    """Return a cause whose remedy has the setting, for an error of a sensor or of the start."""
+    """Return a cause with a remedy that includes the setting, for errors of sensors and start."""
     case, stated = prepared.case, settings_in(cause.setting)
     if cause.kind == "initial" and settings not in ((), stated):
         return replace(cause, remedy=f"Specify its uncertainty: `{settings[0]}`.")
@@ -150,7 +150,7 @@ def _with_remedy(prepared: Prepared, cause: Cause, settings: tuple[str, ...]) ->
         return cause
     table = case.families.get(cause.subject, cause.subject)  # a family has one table
     if settings == stated and table == cause.subject:
-        return cause  # the remedy has the value, and its unit
+        return cause  # the remedy already includes the value and its unit
     if not settings:
         return replace(cause, remedy=LIKELY[cause.kind].remedy.format(name=cause.subject))
     value = settings[0].partition("=")[2]
@@ -190,7 +190,7 @@ def held(prepared: Prepared, cause: Cause) -> str:
 
 
 def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
-    """Return the settings that make a cause an unknown of the case; empty if none does."""
+    """Return the settings that estimate or correct a cause; empty if there are none."""
     case = prepared.case
     if case.spec.law.kind != "sensitivity":
         return ()
@@ -210,13 +210,13 @@ def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
 
 
 def _adding(name: str, std: float, **keys: float | str) -> str:
-    """Return the setting that adds an unknown about zero, in the unit of the model."""
+    """Return the setting that adds an unknown, by default with prior 0, in the model's unit."""
     known = {"prior": 0.0, "std": float(f"{std:.2g}"), **keys}
     return f"unknowns.{toml_key(name)}={toml_value(known)}"
 
 
 def _of_sensor(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
-    """Return the setting of an error of a sensor, with the prior that other sensors state."""
+    """Return the setting of an unknown sensor error, with the prior of other sensors, if any."""
     case = prepared.case
     key, channels, name = KEYS[cause.kind], case.roles("sensor"), cause.subject
     if name not in channels:
@@ -231,18 +231,18 @@ def _of_sensor(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
 
 
 def _is_settled(channel: ChannelSpec, key: str) -> bool:
-    """Return whether a sensor cannot get an unknown error: it has one, or no position."""
+    """Return whether a sensor already has an unknown error, or has no position that may err."""
     placed = channel.is_point and not channel.is_flux
     return getattr(channel, key) is not None or (key == "at_std" and not placed)
 
 
 def _keyed(name: str, key: str, value: object) -> str:
-    """Return the setting of a key of a channel."""
+    """Return the setting of a key of a channel to a value."""
     return channel_setting(name, key, toml_value(value))
 
 
 def _slow(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
-    """Return the setting of an unknown time constant, with the prior that other sensors state."""
+    """Return the setting of an unknown time constant, with the prior of other sensors, if any."""
     channels = prepared.case.roles("sensor")
     channel = channels.get(cause.subject)
     if channel is None or not cause.size > 0.0:
@@ -258,7 +258,7 @@ def _slow(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
 
 
 def _usual_std(prepared: Prepared, cause: Cause) -> float | str | None:
-    """Return a prior standard deviation for an error of a sensor; None if its size is unknown."""
+    """Return a prior standard deviation for a sensor error; None if its size is unknown."""
     who, key, size = prepared.identifier.observed, KEYS[cause.kind], cause.size
     if key == "at_std" and not math.isfinite(size):
         size = usual_shift(prepared, cause.subject)
@@ -271,7 +271,7 @@ def _usual_std(prepared: Prepared, cause: Cause) -> float | str | None:
 
 
 def usual_shift(prepared: Prepared, name: str) -> float:
-    """Return half of how far a sensor may well be off; NaN if it has no stated place."""
+    """Return half of the typical position error of a sensor; NaN without a stated position."""
     who = prepared.identifier
     at = stated_positions(who.observed)
     if at is None:
@@ -280,9 +280,9 @@ def usual_shift(prepared: Prepared, name: str) -> float:
 
 
 def _stated(case: Case, cause: Cause) -> tuple[str, ...]:
-    """Return the settings of a cause; none that would replace a value of the case.
+    """Return the settings of a cause; empty if they would override a value of the case.
 
-    None either with a unit of another quantity: the law does not know the unit of each input.
+    Also empty for a unit of another quantity, since the law does not know the units of inputs.
     """
     channel, settings = case.spec.channels.get(cause.subject), settings_in(cause.setting)
     keys = {setting.partition("=")[0].rpartition(".")[2] for setting in settings}
@@ -291,14 +291,14 @@ def _stated(case: Case, cause: Cause) -> tuple[str, ...]:
         refused |= not _convertible(case, cause.subject, settings)
     if "along" in keys:
         refused |= channel is None or not channel.is_fixed
-    # A case needs a sensor: the only one cannot be left out.
+    # A case requires a sensor: the only sensor cannot be left out.
     if "role" in keys:
         refused |= list(case.roles("sensor")) == [cause.subject]
     return () if refused else settings
 
 
 def _convertible(case: Case, name: str, settings: Sequence[str]) -> bool:
-    """Return whether a channel can be read in the unit of a setting."""
+    """Return whether the unit in a setting is convertible to the unit of a channel."""
     (channel,) = tomllib.loads("\n".join(settings))["channels"].values()
     try:
         conversion(channel["unit"], case.unit(name), name)
@@ -308,19 +308,19 @@ def _convertible(case: Case, name: str, settings: Sequence[str]) -> bool:
 
 
 def _exchanged(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
-    """Return the settings by which each of two channels reads the column of the other."""
+    """Return the settings that exchange the columns of two channels."""
     case = prepared.case
     names = list(tomllib.loads("\n".join(settings_in(cause.setting))).get("channels", {}))
     channels = [case.spec.channels.get(name) for name in reversed(names)]
     columns = [None if channel is None else channel.column for channel in channels]
-    if None in columns:  # a sensor of a channel that has several, or a mean of columns
+    if None in columns:  # a member of a family, or a mean of columns
         return ()
     pairs = zip(names, columns, strict=True)
     return tuple(_keyed(name, "column", column) for name, column in pairs)
 
 
 def _initial(prepared: Prepared) -> tuple[str, ...]:
-    """Return the setting of a stated start that is as uncertain as the first readings miss it."""
+    """Return the setting of a start with an uncertainty that covers the first readings."""
     case, stated = prepared.case, prepared.case.spec.initial
     missed = first_miss(prepared)
     if stated is None or isinstance(stated, dict) or stated.std is not None or not missed:
@@ -332,9 +332,9 @@ def _initial(prepared: Prepared) -> tuple[str, ...]:
 
 
 def first_miss(prepared: Prepared) -> float:
-    """Return the root mean square of the first readings less the start, 0 if it is no number.
+    """Return the root mean square difference of the first readings from the initial state.
 
-    Readings that come later than the start have moved on from it: 0, too.
+    It is 0 if the initial state is not a number, or earlier than the first readings.
     """
     later = prepared.t0 < prepared.first.t
     if later or prepared.case.equation.components or not isinstance(prepared.u0, float):
@@ -344,7 +344,7 @@ def first_miss(prepared: Prepared) -> float:
 
 
 def _first_readings(prepared: Prepared) -> Array:
-    """Return the readings in the first sample of the assimilated sensors that read the state."""
+    """Return the readings of the state by assimilated sensors in the first sample."""
     given, channels = by_name(prepared.first.z, ()), prepared.case.roles("sensor")
     names = [name for name, item in channels.items() if item.quantity is None and name in given]
     seen: Array = np.array([float(given[name]) for name in names])
@@ -352,7 +352,7 @@ def _first_readings(prepared: Prepared) -> Array:
 
 
 def _capacity(case: Case) -> float:
-    """Return the factor from the rate of the state to a source of the equation."""
+    """Return the factor from a rate of change of the state to a source of the equation."""
     each = (
         prior_of(case, name) if name in case.spec.unknowns else float(case.options[name])
         for name in case.equation.capacity
@@ -361,7 +361,7 @@ def _capacity(case: Case) -> float:
 
 
 def _free(case: Case, name: str) -> bool:
-    """Return whether an unknown of the equation may be added to the case."""
+    """Return whether an optional unknown of the equation can be added to the case."""
     known = case.equation.unknowns.get(name)
     stated = name in case.spec.unknowns or name in case.spec.options
     return known is not None and known.optional and not stated
@@ -375,7 +375,7 @@ def _source(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
 
 
 def _loss(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
-    """Return the settings of a loss to surroundings at the temperature of the first readings."""
+    """Return the settings of an unknown loss to the surroundings (see `_surroundings`)."""
     case, name = prepared.case, prepared.case.equation.loss
     if not (_free(case, name) and cause.size > 0.0):
         return ()
@@ -390,14 +390,14 @@ def _loss(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
 
 
 def _rate(name: str, size: float) -> str:
-    """Return the setting that adds a positive unknown of a size."""
+    """Return the setting that adds a positive unknown with a given prior median and std."""
     return _adding(name, size, prior=float(f"{size:.2g}"), transform="log")
 
 
 def _surroundings(prepared: Prepared) -> float | str | None:
-    """Return the temperature of the surroundings: "ambient" if stated, else the first readings'.
+    """Return the temperature of the surroundings: "ambient" if the case defines this input.
 
-    None without readings.
+    The default is the mean of the first readings; None without readings.
     """
     spec = prepared.case.spec
     if "ambient" in spec.channels or "ambient" in spec.inputs:
@@ -417,7 +417,7 @@ def _boundary(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
 
 
 def _end(case: Case, name: str, what: str) -> str:
-    """Return the name of an unknown that may pass through an end of an interval; empty if none."""
+    """Return a name for an unknown condition at a free end of an interval; empty if impossible."""
     taken = {*case.spec.boundary, *(item.at for item in case.roles("boundary").values())}
     if case.equation.fluxes is None or len(case.mesh.p) != 1 or name in taken:
         return ""
@@ -431,7 +431,7 @@ def _flux(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     label = _end(case, name, "flux")
     if not (label and cause.size):
         return ()
-    # What a source of this size brings into the whole interval.
+    # The flux that is equivalent to a source of this size in the whole interval.
     size = WIDE * abs(cause.size) * _capacity(case) * float(np.ptp(case.mesh.p[0]))
     return _adding(label, size), f"boundary.{toml_key(name)}.flux={toml_value(label)}"
 
@@ -442,9 +442,9 @@ def _transfer(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     label, ambient = _end(case, name, "transfer"), _surroundings(prepared)
     if not (label and cause.size > 0.0) or ambient is None:
         return ()
-    if ambient in case.spec.inputs:  # a constant
+    if ambient in case.spec.inputs:  # a constant input
         ambient = case.spec.inputs["ambient"]
-    # What a loss of this size takes from the whole interval.
+    # The transfer coefficient that is equivalent to a loss of this size in the whole interval.
     size = cause.size * _capacity(case) * float(np.ptp(case.mesh.p[0]))
     condition = toml_value({"transfer": label, "ambient": ambient})
     return _rate(label, size), f"boundary.{toml_key(name)}={condition}"

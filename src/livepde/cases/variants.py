@@ -1,4 +1,4 @@
-"""Variants of a case, and how the run of each one ends."""
+"""Variants of a case, and the results of their runs."""
 
 from __future__ import annotations
 
@@ -35,89 +35,89 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-EVERY = 1_000_000_000  # fields are not compared
+EVERY = 1_000_000_000  # interval of stored fields: none, since fields are not compared
 AS_STATED = "as stated"
-MISSED = 5.0  # of log density, from which the case misses a reading
-GAINED = 3.0  # of log evidence: strong evidence (Kass and Raftery 1995), 20 to 1
-SAME = 1e-9  # of the length of a run: times that differ by less are one moment
+MISSED = 5.0  # gain in log density per reading above which the case misses the readings
+GAINED = 3.0  # difference of log evidence that is strong: 20 to 1 (Kass and Raftery 1995)
+SAME = 1e-9  # tolerance for equal times, as a share of the length of a run
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A case with other values."""
+    """A named set of changes to a case."""
 
     name: str
-    settings: tuple[str, ...] = ()  # "key=value" as for `--set`
+    settings: tuple[str, ...] = ()  # "key=value", as in `--set`
 
 
 @dataclass(frozen=True)
 class LastEstimate:
-    """Last estimate of an unknown."""
+    """Last estimate of an unknown, with its 95 % interval."""
 
     value: float
     std: float
-    low: float  # ends of the 95 % interval, which allows for errors of the model if they are known
+    low: float  # ends of the interval, which includes model errors if they are known
     high: float
     unit: str = ""
 
     def overlaps(self, other: LastEstimate) -> bool:
-        """Return whether two intervals have a point in common; true if one is not known."""
+        """Return whether two intervals overlap; true if an interval is unknown."""
         return not (self.low > other.high or other.low > self.high)
 
 
 @dataclass(frozen=True)
 class VariantRun:
-    """How the run of a variant ended."""
+    """Results of the run of a variant."""
 
     variant: Variant
-    error: str = ""  # why it failed; empty if it did not
-    verdict: Mapping[str, Any] = field(default_factory=dict)  # of `Verdict.to_dict`
-    log_evidence: float = math.nan  # a density in the unit of the data, whatever unit it states
+    error: str = ""  # reason of a failure; empty if the run did not fail
+    verdict: Mapping[str, Any] = field(default_factory=dict)  # as returned by `Verdict.to_dict`
+    log_evidence: float = math.nan  # of readings as numbers in the data, whatever their unit
     readings: Mapping[str, int] = field(default_factory=dict)  # sensor -> number assimilated
-    # Log evidence of the case with these readings: None if they are those of the case, NaN if the
-    # case has not all of them.
+    # Log evidence of the case with the readings of this variant: None if the case has the same
+    # readings, NaN if it lacks some of them.
     same_readings: float | None = None
-    # Sensor -> log density of a usual reading, by its errors one step ahead.
+    # Sensor -> log density of a typical reading, from its one-step prediction error.
     densities: Mapping[str, float] = field(default_factory=dict)
     misfits: Mapping[str, float] = field(default_factory=dict)  # sensor -> misfit over noise
-    # Sensor -> root mean square error one step ahead, second half of the samples.
-    errors: Mapping[str, float] = field(default_factory=dict)  # assimilated
-    validation: Mapping[str, float] = field(default_factory=dict)
+    # Sensor -> root mean square one-step prediction error in the second half of the samples.
+    errors: Mapping[str, float] = field(default_factory=dict)  # assimilated sensors
+    validation: Mapping[str, float] = field(default_factory=dict)  # validation sensors
     estimates: Mapping[str, LastEstimate] = field(default_factory=dict)
-    unknowns: int = 0  # numbers, and modes of fields
-    # Variants that fit as well with other values; the intervals contain theirs.
+    unknowns: int = 0  # number of scalar unknowns and modes of fields
+    # Variants that fit as well with other estimates; the intervals include their intervals.
     rivals: tuple[str, ...] = ()
-    # Variants with strong evidence against this one, of which none is usable, the best first.
+    # Unusable variants with strong evidence against this variant, the best first.
     better: tuple[str, ...] = ()
 
     @property
     def level(self) -> str:
-        """Level of the verdict; "failed" of a run that failed.
+        """Level of the verdict, or "failed" if the run failed.
 
-        It is at most "caution" where other variants fit as well or better.
+        It is at most "caution" if other variants fit as well or better.
         """
         level = "failed" if self.error else str(self.verdict["level"])
         return "caution" if (self.rivals or self.better) and level == "trusted" else level
 
     @property
     def failed(self) -> bool:
-        """Whether the fit misses the readings grossly, or the run has failed."""
+        """Whether the run failed or its fit misses the readings grossly."""
         errors = Verdict.from_dict(self.verdict).errors if self.verdict else None
         return bool(self.error) or (errors is not None and errors.failed)
 
     @property
     def misfit(self) -> float:
-        """Root mean square over the sensors."""
+        """Root mean square of the misfits over the sensors; NaN if none is known."""
         return _pooled(self.misfits.values())
 
     @property
     def validation_error(self) -> float:
-        """Root mean square over the validation sensors; NaN if there are none."""
+        """Root mean square error over the validation sensors; NaN if there are none."""
         return _pooled(self.validation.values())
 
     @property
     def causes(self) -> list[Cause]:
-        """Causes that a setting frees, the worst finding first, each once."""
+        """Distinct causes in the verdict that a setting can remedy, the worst finding first."""
         found: dict[str, Cause] = {}
         for finding in Verdict.from_dict(self.verdict).findings if self.verdict else ():
             for cause in finding.causes:
@@ -126,7 +126,7 @@ class VariantRun:
         return list(found.values())
 
     def gained(self, base: VariantRun) -> float:
-        """Return log evidence minus that of the case itself; NaN if other readings count."""
+        """Return the log evidence less the case's; NaN if their readings cannot be compared."""
         if self.same_readings is not None:
             return self.log_evidence - self.same_readings + self._evidence_of_lacking(base)
         if self.error or dict(self.readings) != dict(base.readings):
@@ -134,10 +134,10 @@ class VariantRun:
         return self.log_evidence - base.log_evidence
 
     def _evidence_of_lacking(self, base: VariantRun) -> float:
-        """Return the log evidence that readings add which the variant lacks.
+        """Return the log evidence gained by readings of the case that the variant lacks.
 
-        Where the case misses those, its evidence moves by thousands with a few of them, and other
-        variants gain that. For the variant they are usual readings then. Else they add nothing.
+        If the case misses these readings, a few of them change its evidence by thousands, which
+        other variants gain. For this variant they then count as typical readings; otherwise, as 0.
         """
         lacking = {name: n - self.readings.get(name, 0) for name, n in base.readings.items()}
         usual = sum(n * self.densities.get(name, math.nan) for name, n in lacking.items() if n)
@@ -145,7 +145,7 @@ class VariantRun:
         return more if more > MISSED * sum(lacking.values()) else 0.0
 
     def apart(self, base: VariantRun) -> list[str]:
-        """Return the unknowns whose intervals in both runs have no point in common."""
+        """Return the unknowns whose intervals in both runs do not overlap."""
         return [
             name
             for name, one in self.estimates.items()
@@ -153,7 +153,7 @@ class VariantRun:
         ]
 
     def beside(self, rivals: Sequence[VariantRun]) -> VariantRun:
-        """Return the run with intervals that contain those of its rivals."""
+        """Return the run with intervals that include the intervals of its rivals."""
 
         def both(name: str, own: LastEstimate) -> LastEstimate:
             each = [own, *(one.estimates[name] for one in rivals if name in one.estimates)]
@@ -166,7 +166,7 @@ class VariantRun:
         return replace(self, estimates=estimates, rivals=names)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the run as JSON can hold it."""
+        """Return the run as values that JSON can represent."""
         return {
             "name": self.variant.name,
             "settings": list(self.variant.settings),
@@ -188,7 +188,7 @@ class VariantRun:
 
 
 def _known(value: Any) -> Any:
-    """Return a value, None for a number that is not finite."""
+    """Return a value, or None for a number that is not finite."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -198,7 +198,7 @@ def _pooled(values: Iterable[float]) -> float:
 
 
 def variant_of(text: str) -> Variant:
-    """Return the variant in a text: 'name: key=value; key=value', the name may be missing."""
+    """Return the variant in a text 'name: key=value; key=value' with an optional name."""
     head, colon, rest = text.partition(":")
     named = bool(colon) and "=" not in head
     settings = settings_in(rest if named else text)
@@ -215,21 +215,21 @@ def run_variant(
     data: str | None = None,
     allow_code: bool = False,
 ) -> VariantRun:
-    """Run a variant of a case with further settings, in memory; a failure is its reason."""
+    """Run a variant of a case with further settings in memory; failures are stored as `error`."""
     try:
         every = parse(settings), parse(variant.settings)
         prepared = load(path, allow_code=allow_code, settings=every).prepare(data)
-        # Errors of single columns are looked for in the case itself, to be proposed.
+        # Only the case itself is searched for errors of single columns, to propose variants.
         found = _run(variant, prepared, prepared.stream, columns=not variant.settings)
         stated = load(path, allow_code=allow_code, settings=every[:1])
         if delays(stated) == delays(prepared.case):
             return found
-        if stated.spec.data.stop is not None:  # after it stand readings that are late
+        if stated.spec.data.stop is not None:  # the variant may use late readings after it
             ends = every[0], {"data.stop": None}
             stated = load(path, allow_code=allow_code, settings=ends)
         same = _evidence_of_same(stated.prepare(data), prepared, found)
         return replace(found, same_readings=same)
-    except Exception as error:  # noqa: BLE001  whatever it is, it is a row of the table
+    except Exception as error:  # noqa: BLE001  any failure becomes a row of the table
         reason = str(error).strip() or "no reason given"
         return VariantRun(variant, error=f"{type(error).__name__}: {reason}")
 
@@ -237,7 +237,7 @@ def run_variant(
 def _run(
     variant: Variant, prepared: Prepared, samples: Iterable[Sample], *, columns: bool
 ) -> VariantRun:
-    """Run a case; `columns`: whether its verdict looks for errors of single columns."""
+    """Run a case; `columns`: whether the verdict searches for errors of single columns."""
     who = prepared.identifier
     result = Result(who.model, who.observed, who.validation, EVERY, layout=prepared.layout)
     for sample in samples:
@@ -248,14 +248,14 @@ def _run(
 
 
 def _evidence_of_same(stated: Prepared, late: Prepared, found: VariantRun) -> float | None:
-    """Return the log evidence of the case as stated with the readings that a variant has used."""
+    """Return the log evidence of the stated case with a variant's readings (`same_readings`)."""
     known, table = late.stream, stated.stream
     if not (isinstance(known, DataTable) and isinstance(table, DataTable)):
         return math.nan
-    apart = 0.0  # of times that are numbers
+    offset = 0.0  # between the origins of both tables
     if known.origin is not None and table.origin is not None:
-        apart = since_1970(known.origin) - since_1970(table.origin)
-        apart *= clock_of(stated.case).second
+        offset = since_1970(known.origin) - since_1970(table.origin)
+        offset *= clock_of(stated.case).second
     before, after = delays(late.case), delays(stated.case)
     values, last = table.values.copy(), -math.inf
     for name in found.readings:
@@ -263,8 +263,8 @@ def _evidence_of_same(stated: Prepared, late: Prepared, found: VariantRun) -> fl
         used = np.isfinite(column) & (known.t >= late.assimilate_from)
         if not used.any():
             return math.nan
-        # As they stand in the table that the case states.
-        shift = apart + before.get(name, 0.0) - after.get(name, 0.0)
+        # Times of the readings in the table of the stated case.
+        shift = offset + before.get(name, 0.0) - after.get(name, 0.0)
         width = SAME * max(float(np.ptp(table.t)), 1.0)
         low, high = known.t[used][0] + shift - width, known.t[used][-1] + shift + width
         values[(table.t < low) | (table.t > high), table.names.index(name)] = np.nan
@@ -278,7 +278,7 @@ def _evidence_of_same(stated: Prepared, late: Prepared, found: VariantRun) -> fl
 
 
 def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun:
-    """Return how a run ended, from its dataset."""
+    """Return the results of a run from its dataset."""
     channels = channel_errors(data)
     labels, fields = scalars(data), prepared.case.model.parameter_space.fields
     raw = prepared.raw
@@ -291,7 +291,7 @@ def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun
     seen = np.isfinite(data["innovation"].transpose("time", "sensor").values[used]).sum(axis=0)
     readings = dict(zip(map(str, data["sensor"].values), seen.tolist(), strict=True))
     evidence = float(data.attrs.get("log_evidence", math.nan))
-    # A density in the unit of the data, not of the model: the case may state another unit.
+    # Variants may state different units: evidence is a density in the numbers of the data.
     columns = columns_of(prepared.case)
     volumes = (n * math.log(abs(columns[k].factor)) for k, n in readings.items() if k in columns)
     return VariantRun(
@@ -309,7 +309,7 @@ def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun
 
 
 def _densities(prepared: Prepared, channels: Mapping[str, ChannelErrors]) -> dict[str, float]:
-    """Return the log density of a usual reading of each sensor, by its errors one step ahead."""
+    """Return sensor -> log density of a typical reading, from its one-step prediction error."""
     noise, law, observed = math.nan, prepared.case.law, prepared.identifier.observed
     if isinstance(law, SensitivityLaw) and isinstance(law.noise, int | float):
         noise = law.noise
@@ -324,12 +324,12 @@ def _densities(prepared: Prepared, channels: Mapping[str, ChannelErrors]) -> dic
 
 
 def _later_errors(channels: Mapping[str, ChannelErrors], role: str) -> dict[str, float]:
-    """Return the root mean square errors of the channels of a role in the second half."""
+    """Return channel -> root mean square error in the second half, for channels of a role."""
     return {name: rmse(one.later) for name, one in channels.items() if one.role == role}
 
 
 def _last_estimates(data: xr.Dataset, errors: ModelErrors | None) -> dict[str, LastEstimate]:
-    """Return the last estimate of each number, with an interval that allows for model errors."""
+    """Return the last estimate of each scalar unknown, with an interval including model errors."""
     found = {}
     allowed = {one.label: one for one in errors.unknowns} if errors is not None else {}
     for label in scalars(data):
@@ -343,7 +343,7 @@ def _last_estimates(data: xr.Dataset, errors: ModelErrors | None) -> dict[str, L
 
 
 def _misfits(data: xr.Dataset) -> dict[str, float]:
-    """Return the misfit of each assimilated sensor over its noise."""
+    """Return the rms innovation of each assimilated sensor over its noise, estimated from steps."""
     columns, found = used_errors(data, "innovation", "sensor").T, {}
     for name, column in zip(map(str, data["sensor"].values), columns, strict=True):
         later = column[len(column) // 2 :]
