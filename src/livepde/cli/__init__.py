@@ -52,16 +52,16 @@ for command in COMMANDS:
 
 
 def main(program: typer.Typer | None = None) -> int:
-    """Run a command line and return its exit code: by default that of livepde."""
+    """Run a command line, by default `livepde`, and return its exit code."""
     tame_libraries()
     try:
-        # The dense matrices of a step are small: threads for them cost more than they save.
+        # The dense matrices of a step are small: several threads would be slower than one.
         with threadpool_limits(1):
             (program or app)(standalone_mode=True)
     except LivepdeError as error:
         terminal(err=True).print(f"[bold red]Error:[/] {escape(str(error))}")
         return BAD_INPUT
-    except BrokenPipeError:  # the reader of a pipe has seen enough
+    except BrokenPipeError:  # the reader of a pipe has closed it
         sys.stderr.close()
     return 0
 

@@ -1,4 +1,4 @@
-"""A case to start from, the built-in equations, and the JSON schema of cases."""
+"""Commands `init`, `equations` and `schema`."""
 
 from __future__ import annotations
 
@@ -98,10 +98,10 @@ def _begin(
     time_format: str,
     skip: int | None,
 ) -> None:
-    """Write a case for tables, with some keys set, and print a summary with its open keys."""
+    """Write a case for tables with changed keys, and print a summary with the keys to fill in."""
     zone = zone_named(str(changes.get("data.zone") or "UTC"), "--set data.zone")
     missing = missing_in(changes.get("data.missing"), "--set data.missing")
-    if missing:  # else the key goes, and what the table shows with it
+    if missing:  # `files_for` writes them; an empty setting removes the key and detected markers
         del changes["data.missing"]
     how: dict[str, Any] = {"time_format": time_format, "skip": skip, "zone": zone}
     how |= {"missing": missing, "stated": str(changes.get("data.time_unit") or "")}
@@ -123,10 +123,10 @@ def _show_written(
     blanks = blanks_in(read_toml(files["case.toml"], str(case)))
     places = [f"{key} = {toml_value(value)}" for key, value in blanks.items()]
     places += [f"positions in {case.parent / name}" for name in files if name != "case.toml"]
-    told = f"replace each '?' ({len(places)})" if places else "nothing is left open. Next"
+    task = f"replace each '?' ({len(places)})" if places else "nothing is left open. Next"
     *others, last = map(str, data)
     tables = f"{', '.join(others)} and {last}" if others else last
-    console.print(f"Wrote {case} for {tables}: {told}:")
+    console.print(f"Wrote {case} for {tables}: {task}:")
     for place in places:
         console.print(escape(f"  {place}"))
     if places:
@@ -148,7 +148,7 @@ def _show_read(console: Console, read: Measured, equation: Equation) -> None:
 def _channel_row(
     item: new_case.FoundChannel, read: Measured, equation: Equation
 ) -> tuple[Any, ...]:
-    """Return columns, role, name, unit, range and number of missing values of a channel."""
+    """Return columns, role, name, unit, minimum, maximum and missing values of a channel."""
     role, given = item.given["role"], item.given.get("unit", "")
     model = (equation.inputs[item.name] if role == "input" else equation.state).unit
     if item.given.get("quantity") == "flux" and equation.fluxes is not None:
@@ -187,7 +187,7 @@ def equations(
 
 
 def _entries(found: Equation) -> list[tuple[str, ...]]:
-    """Return the case keys of an equation: table, key, meaning, unit and default of each."""
+    """Return the case keys of an equation as rows: table, key, meaning, unit, default."""
     unit = found.state.unit
     rows: list[tuple[str, ...]] = [("state", "u", found.state.text, unit, "")]
     for table, known in (("[unknowns]", found.unknowns), ("[channels], input", found.inputs)):

@@ -1,4 +1,4 @@
-"""Check of a case before a run: model, data, and identifiability by its sensors."""
+"""Command `check`: model, data and identifiability of a case before a run."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from livepde.streams.oddities import sentinels
 from livepde.units import has_states
 from livepde.verdict.sentences import LONGER_DATA
 
-MOST_CHANNELS = 40  # rows of the table of channels
-FEWEST = 10  # readings that show how a sensor moves
-OPPOSITE = -0.9  # correlation with the prediction of readings that move the other way
+MOST_CHANNELS = 40  # largest number of rows in tables of channels
+FEWEST = 10  # readings required for a correlation with the prediction
+OPPOSITE = -0.9  # correlation with the prediction below which the sign may be wrong
 
 
 def check(
@@ -74,7 +74,7 @@ def check(
 
 
 def _refused(prepared: Prepared) -> list[str]:
-    """Return sentences on values of input channels that a run will refuse, or make up."""
+    """Return sentences on values that a run will leave out, reject or interpolate."""
     texts = {
         "start": "{name}: the first {n} values are outliers. A run counts them as missing.",
         "spike": "{name}: {n} values are spikes. A run rejects them. To use them, set "
@@ -98,24 +98,24 @@ def _refused(prepared: Prepared) -> list[str]:
 
 
 def _sentinels(case: Case, samples: DataTable) -> list[str]:
-    """Return sentences on values that may be placeholders, as they are in the file."""
-    said: list[str] = []
+    """Return sentences on values in the file that may be placeholders."""
+    sentences: list[str] = []
     for name, values in zip(samples.names, samples.values.T, strict=True):
         column = case.columns[name]
-        if len(column.names) > 1:  # a mean is none of the values in the file
+        if len(column.names) > 1:  # means of columns are not values in the file
             continue
         constants = not (name in case.roles("input") and has_states(case.unit(name)))
-        said += [
+        sentences += [
             f"{name}: {found.value:g} occurs {found.times} times, far outside the other values "
             f"({found.low:.4g} to {found.high:.4g}). If it is a placeholder, add it to "
             f"`data.missing`. Otherwise specify the range with `channels.{name}.valid`."
             for found in sentinels(np.round((values - column.offset) / column.factor, 9), constants)
         ]
-    return said
+    return sentences
 
 
 def _sampling(prepared: Prepared, samples: DataTable) -> list[str]:
-    """Return sentences on times that change their unit or leap, and on pauses."""
+    """Return sentences on pauses, and on times that jump or change their unit."""
     import xarray as xr
 
     unit = {"units": prepared.case.equation.time_unit}
@@ -136,7 +136,7 @@ def _switching(case: Case, samples: DataTable) -> list[str]:
 
 
 def _show_predicted(console: Console, prepared: Prepared) -> list[str]:
-    """Print the readings and their prediction at the prior; return a sentence on opposite signs."""
+    """Print readings and their prior predictions; return a sentence on opposite signs, if any."""
     measured, prior = predicted(prepared, prepared.stream)
     against: list[str] = []
     rows: list[tuple[str, ...]] = []
@@ -163,7 +163,7 @@ def _show_predicted(console: Console, prepared: Prepared) -> list[str]:
 
 
 def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
-    """Print how well the sensors can identify the unknowns; return sentences on it."""
+    """Print the standard deviations in the preview; return its sentences on identifiability."""
     found = preview(prepared, prepared.stream)
     late = {item.name: item.left for item in found.last}
     rows = [
@@ -193,7 +193,7 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
 
 
 def _show_advice(console: Console, prepared: Prepared) -> None:
-    """Print where one more sensor would help most."""
+    """Print the best position for an additional sensor."""
     found = advise(prepared, prepared.stream)
     unit = prepared.case.equation.length_unit
     at = ", ".join(f"{x:.3g}" for x in found.position)
@@ -210,7 +210,7 @@ def _show_advice(console: Console, prepared: Prepared) -> None:
 
 
 def _show_wiring(console: Console, case: Case) -> None:
-    """Print the source of a process's samples, and the intake policy of each channel."""
+    """Print the source of a live case, and the intake policy of each channel."""
     policy, unit = policy_of(case), case.equation.time_unit
     rows: list[tuple[str, ...]] = []
     for name, column in case.columns.items():
@@ -225,11 +225,11 @@ def _show_wiring(console: Console, case: Case) -> None:
                 f"{policy.longest(habit):g} {unit}".rstrip(),
                 policy.keeps(name),
                 "skip" if column.needed else spec.gaps if spec.drives else "continue",
-                spec.between if spec.drives else "",  # only sensors have a column of noise
+                spec.between if spec.drives else "",  # a noise column belongs to a sensor
             )
         )
     columns = ("channel", "role", "column", "valid", "wait", "repeated", "missing", "between")
-    # Most channels are lines: the table stays narrow then.
+    # If all channels have the default, the column `between` is left out.
     shown = len(columns) - all(row[-1] in ("", "line") for row in rows)
     rows = [row[:shown] for row in rows]
     print_table(console, Table(f"Channels from {source_text(case)}", columns[:shown], rows))
@@ -263,7 +263,7 @@ def _show_data(console: Console, case: Case, prepared: Prepared, samples: DataTa
     for name, values in list(zip(samples.names, samples.values.T, strict=True))[:MOST_CHANNELS]:
         least, largest, missing = extent(values)
         of = case.columns[name].noise_of
-        # Distances between known values, with one before the first and one after the last.
+        # Known values, with an additional one before the first and after the last row.
         known = np.flatnonzero(np.concatenate([[True], np.isfinite(values), [True]]))
         longest_gap = int(np.diff(known).max()) - 1
         rows.append(
@@ -284,7 +284,7 @@ def _show_data(console: Console, case: Case, prepared: Prepared, samples: DataTa
 
 
 def _show_checks(console: Console, prepared: Prepared) -> bool:
-    """Run the library's checks on the model of the case; True if one failed."""
+    """Print the checks of model and observation; return whether a check failed."""
     from livepde.diagnostics import check_model, check_observation
 
     case, first = prepared.case, prepared.first

@@ -1,4 +1,4 @@
-"""Variants of a case side by side."""
+"""Command `compare`: run variants of a case and recommend one."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from livepde.progress import timed
 from livepde.runs import Table
 from livepde.runs.summary import digits, interval, shown
 
-WIDE = 3  # panels beside each other
+WIDE = 3  # largest number of panels in a row
 
 
 def compare(
@@ -128,7 +128,7 @@ def compare(
 def _case_of(
     case: Path, settings: list[str], data: str | None
 ) -> tuple[Path, list[str], str | None]:
-    """Return case file, settings and data: those that are named, or of the run that is."""
+    """Return case file, settings and data; if `case` is a run directory, those of the run."""
     if not case.is_dir():
         return case, settings, data
     run = runs.open(case)
@@ -143,7 +143,7 @@ def _written(
     data: str | None,
     allow_code: bool,
 ) -> str:
-    """Write the recommended variant of a case, if it is another one; return a sentence on it."""
+    """Write the recommended variant unless it is the case itself; return a sentence on it."""
     if not best.settings:
         return f"{target} is not written: the case itself is recommended."
     text = read_text(case)
@@ -152,14 +152,14 @@ def _written(
         with_members(document, parse(each), case, allow_code)
         text = filled(tomlkit.dumps(document), parse(each), str(case))
     write_bytes(target, text.encode())
-    of = "" if data is None else f" --data {data}"  # the case may name other data
+    of = "" if data is None else f" --data {data}"  # the case may specify other data
     return f"Wrote {target}: livepde run {target}{of}"
 
 
 def _all(
     run: Callable[[Variant], VariantRun], variants: Sequence[Variant], jobs: int, quiet: bool
 ) -> list[VariantRun]:
-    """Return how the runs of variants ended, in their order; each in its own process."""
+    """Return the runs of variants in their order; with several jobs, each in its own process."""
 
     def apart(variant: Variant) -> VariantRun:
         spawn = multiprocessing.get_context("spawn")
@@ -186,13 +186,13 @@ def _all(
 def _run(
     case: Path, settings: Sequence[str], variant: Variant, *, data: str | None, allow_code: bool
 ) -> VariantRun:
-    """Run one variant with one thread."""
+    """Run a variant with one thread."""
     with threadpool_limits(1):
         return run_variant(case, settings, variant, data, allow_code)
 
 
 def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> list[Table]:
-    """Return the variants, that of the best evidence first, and those that failed."""
+    """Return tables of variants by evidence, of estimates, of failures, and of settings."""
 
     def rank(one: VariantRun) -> tuple[bool, float]:
         gained = one.gained(base)
@@ -222,14 +222,14 @@ def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> 
 
 
 def _marked(one: VariantRun, best: VariantRun) -> str:
-    """Return the name of a variant, with a mark if it is recommended."""
+    """Return the name of a variant, marked with `*` if it is recommended."""
     return one.variant.name + (" *" if one is best else "")
 
 
 def _estimates(
     base: VariantRun, ended: Sequence[VariantRun], best: VariantRun
 ) -> list[tuple[str, ...]]:
-    """Return a row for each unknown and variant."""
+    """Return a row of the table of estimates for each unknown and variant."""
     rows: list[tuple[str, ...]] = []
     for label in dict.fromkeys(label for one in (base, *ended) for label in one.estimates):
         for one in ended:
@@ -243,7 +243,7 @@ def _estimates(
 
 
 def _drawn(runs: Sequence[VariantRun], best: VariantRun, target: Path) -> str:
-    """Draw the intervals of each unknown, those of the case first; return a sentence on it."""
+    """Draw the intervals of the case's unknowns in all variants; return a sentence on it."""
     from livepde.plots import figure, intervals
 
     if not runs[0].estimates:
@@ -267,7 +267,7 @@ def _drawn(runs: Sequence[VariantRun], best: VariantRun, target: Path) -> str:
 
 
 def _check_targets(case_target: Path | None, figure: Path | None, case: Path, force: bool) -> None:
-    """Refuse files that would be wrong where they are to be written, before anything runs."""
+    """Refuse invalid output files before variants are run."""
     if case_target is not None:
         _check_target(case_target, case, force)
     if figure is not None:

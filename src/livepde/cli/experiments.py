@@ -1,4 +1,4 @@
-"""Published experiments: the demo, reproductions of the paper's experiments, and citations."""
+"""Commands `demo`, `reproduce` and `citation`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from livepde.cli.options import JsonOption, OutOption, names_in, option
 from livepde.cli.printing import can_draw, exit_if_failed, named, present, show, terminal
 from livepde.runs import Outcome, RunWriter, free_path
 
-# The facts are those of CITATION.cff, as a test checks; the year is that of the release.
+# A test compares these facts with CITATION.cff; the year is the year of the release.
 BIBTEX = """\
 @misc{{livepde{year},
   author = {{{{The livepde authors}}}},
@@ -78,9 +78,9 @@ def demo(out: OutOption = None) -> None:
 def run_experiment(
     run: Callable[[], Outcome], out: Path | None, command: Sequence[str], title: str, as_json: bool
 ) -> None:
-    """Run an experiment, keep its outcome in a new run directory if one is named, and print it.
+    """Run an experiment, print its outcome, and store it in the run directory `out`, if given.
 
-    With `as_json` a failed check ends the command with exit code 1.
+    With `as_json`, a failed check ends the command with exit code 1.
     """
     writer = None
     if out is not None:
@@ -95,7 +95,7 @@ def run_experiment(
 
 
 def _finish(writer: RunWriter, outcome: Outcome, console: Console) -> Iterable[str]:
-    """Write the outcome of an experiment; return the names of its figures, if any can be drawn."""
+    """Write the outcome of an experiment; return the names of its figures that can be drawn."""
     figures = outcome.figures if can_draw(console) else {}
     writer.finish(
         status="finished",

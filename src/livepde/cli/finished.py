@@ -1,4 +1,4 @@
-"""Commands on a run: report, export and page; and export of a case as a unit."""
+"""Commands `report`, `export` and `watch` for runs, and `fmu` for cases."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def report(
 
 
 def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: bool) -> None:
-    """Process the samples of a run again; print and write the theory report."""
+    """Process the samples of a run again, and print and write the theory report."""
     from livepde.diagnostics import theory_report
 
     case = opened.case_file()
@@ -125,7 +125,7 @@ def export(
     from livepde.runs.exported import export as write
 
     opened = runs.open(folder)
-    for target in targets:  # all of them, before one is written
+    for target in targets:  # all targets are checked before the first is written
         check_target(target, [*FORMATS, REPORT])
         if target.suffix.lower() == REPORT:
             need(target, ["plotly", "jinja2"], "dashboard")
@@ -142,7 +142,7 @@ def export(
 
 
 def _moment(text: str, data: Dataset) -> float:
-    """Return a time of the command line in the run's unit."""
+    """Return the time in the option --at, a number, quantity or date, in the run's unit."""
     unit = str(data["time"].attrs.get("units", ""))
     with suppress(ValueError):
         return float(text)
@@ -160,7 +160,7 @@ def _moment(text: str, data: Dataset) -> float:
 
 
 class Standard(StrEnum):
-    """Versions of the interface."""
+    """Versions of FMI."""
 
     two = "2"
     three = "3"
@@ -237,10 +237,10 @@ def watch(
     from livepde.dashboard import serve
 
     if not runs.run_names(folder) or (folder / runs.RECORD).exists():
-        runs.open(folder)  # a folder that is not a run is reported before all else
+        runs.open(folder)  # reports a folder that is not a run first
     server = serve(folder, Address.read(address, PORT, token))
     try:
-        if attached:  # to a run that may be killed at any time
+        if attached:  # the parent process may be killed at any time
 
             def end_with_input() -> None:
                 sys.stdin.read()

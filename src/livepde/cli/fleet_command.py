@@ -1,4 +1,4 @@
-"""Many runs of one case, which a table lists."""
+"""Command `fleet`: runs of one case for each row of a table."""
 
 from __future__ import annotations
 
@@ -32,38 +32,38 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SUMMARY = "fleet.csv"
-NAME, DATA = "name", "data"  # columns of the table; every other one is a key of the case
-ASKED, GOES_ON = "--separately", "resumed runs"
-UNFIT = frozenset('/\\:*?"<>|')  # what names of folders do without
+NAME, DATA = "name", "data"  # columns of the table; all other columns are keys of the case
+ASKED, GOES_ON = "--separately", "resumed runs"  # reasons for separate runs
+UNFIT = frozenset('/\\:*?"<>|')  # characters that are invalid in names of folders
 Row = TypeVar("Row")
 Found = TypeVar("Found")
-LARGEST = 256  # members of a part: so many runs are interrupted if a worker dies
-ATTEMPTS = 5  # without a part that comes back in between
-DEAD_WORKER = {"KilledWorker", "ActorDiedError"}  # what Dask and Ray call it
+LARGEST = 256  # largest number of members in a part, whose runs are interrupted if a worker dies
+ATTEMPTS = 5  # losses of a worker, without a completed part in between, until the fleet fails
+DEAD_WORKER = {"KilledWorker", "ActorDiedError"}  # exceptions of Dask and Ray for a lost worker
 
 
 @dataclass(frozen=True)
 class Member:
     """One row of the table."""
 
-    name: str  # of its run directory
-    data: str = ""  # its file; empty: that of the case
+    name: str  # name of the run directory
+    data: str = ""  # data file; empty: the data of the case
     settings: tuple[str, ...] = ()  # KEY=VALUE
 
 
 @dataclass(frozen=True)
 class MemberOutcome:
-    """How the run of a member ended."""
+    """Outcome of the run of a member."""
 
     name: str
     status: str  # "finished", "interrupted" or "failed"
     samples: int = 0
-    level: str = ""  # of its verdict; empty without samples
+    level: str = ""  # level of the verdict; empty without samples
     unknowns: dict[str, tuple[float, float]] = field(default_factory=dict)  # last value, std
-    failed: tuple[str, ...] = ()  # names of checks
-    lost: dict[str, int] = field(default_factory=dict)  # why steps failed -> how many
+    failed: tuple[str, ...] = ()  # names of failed checks
+    lost: dict[str, int] = field(default_factory=dict)  # reason -> number of failed steps
     error: str = ""
-    apart: str = ""  # why it was run separately; empty if it was not
+    apart: str = ""  # reason for a separate run; empty if it was stepped in a block
 
 
 def fleet(
@@ -130,7 +130,7 @@ def fleet(
 
 
 def _refuse(resume: bool, out: Path | None, jobs: int) -> None:
-    """Refuse options that do not fit together."""
+    """Refuse conflicting options."""
     if resume and out is None:
         raise ConfigurationError("--resume requires --out: the folder of the runs to resume.")
     if jobs == 0:
@@ -138,14 +138,14 @@ def _refuse(resume: bool, out: Path | None, jobs: int) -> None:
 
 
 def _read(path: Path) -> list[Member]:
-    """Return the rows of the table."""
+    """Return the members in the table; raises `DataError`."""
     import pandas as pd
 
     try:
         table = pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True)
     except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
         raise DataError(f"Cannot read the members in {path}: {error}.") from error
-    if not isinstance(table.index, pd.RangeIndex):  # pandas takes the first cells for labels
+    if not isinstance(table.index, pd.RangeIndex):  # pandas uses surplus first cells as labels
         raise DataError(
             f"{path}: its rows have more cells than its header: name each column, and end no row "
             "with a separator."
@@ -167,7 +167,7 @@ def _read(path: Path) -> list[Member]:
 
 
 def _member(content: Mapping[Hashable, str], path: Path) -> Member:
-    """Return the member that a row of the table at `path` describes."""
+    """Return the member in a row of the table at `path`; raises `DataError`."""
     texts = {str(key).strip(): str(value).strip() for key, value in content.items()}
     name, data = texts.pop(NAME), texts.pop(DATA, "")
     if not name or name.startswith(".") or UNFIT & set(name):
@@ -191,13 +191,13 @@ def _each(
 
     try:
         here = jobs == 1 and backend is None
-        # A backend may run a part again by itself, so each part goes on with what is there.
+        # A backend may run a part again by itself, so each part resumes existing runs.
         parallel = replace(run, resume=True, home=Path.cwd())
         for found in [run(rows)] if here else in_parts(parallel, rows, jobs, backend, told):
             ended |= {item.name: item for item in found}
     except ConfigurationError:
         raise
-    except RunError as error:  # workers died again and again
+    except RunError as error:  # workers died repeatedly
         given_up = f"{error} Resume with --resume."
         lost = {row.name: MemberOutcome(row.name, "failed", error=given_up) for row in rows}
         ended = lost | run.left(rows, ended, "failed", given_up) | ended
@@ -210,13 +210,13 @@ def _each(
 
 
 def _in_order(rows: Sequence[Member], ended: Mapping[str, MemberOutcome]) -> list[MemberOutcome]:
-    """Return the outcomes that there are, in the order of the table."""
+    """Return the existing outcomes in the order of the table."""
     return [ended[row.name] for row in rows if row.name in ended]
 
 
 @dataclass(frozen=True)
 class FleetRunner:
-    """Runner of the members of one process; its fields are options of the command."""
+    """Runner of members in one process; its fields are options of the command."""
 
     case: Path
     folder: Path
@@ -224,10 +224,10 @@ class FleetRunner:
     settings: tuple[str, ...]
     resume: bool
     separately: bool = False
-    home: Path = Path()  # where relative paths begin, for processes that run elsewhere
+    home: Path = Path()  # start of relative paths, for processes with another working directory
 
     def __call__(self, rows: Sequence[Member]) -> list[MemberOutcome]:
-        """Run members as `livepde run` would, as blocks where they can."""
+        """Run members and return their outcomes; members are stepped in blocks if possible."""
         members = {row.name: row for row in rows}
         ready, ended = self._prepared(rows)
         new, begun = dict[str, Prepared](), dict[str, str]()
@@ -247,10 +247,10 @@ class FleetRunner:
     def _prepared(
         self, rows: Sequence[Member]
     ) -> tuple[dict[str, Prepared], dict[str, MemberOutcome]]:
-        """Return the members whose case and data could be read, and how the others ended."""
+        """Return the members whose case and data can be read, and the outcomes of the others."""
         ended: dict[str, MemberOutcome] = {}
         ready: dict[str, Prepared] = {}
-        # Members with the same settings share a case, which is then read and checked only once.
+        # Members with the same settings share a case, which is read and checked only once.
         loaded: dict[tuple[str, ...], Case] = {}
         for row in rows:
             try:
@@ -260,7 +260,7 @@ class FleetRunner:
                 case = loaded[row.settings]
                 target = self._target(row.name)
                 if self.resume and (target / runs.RECORD).exists():
-                    # A run to resume has to be one of this member.
+                    # The run to resume has to be a run of this member.
                     command = self._command(row)
                     runs.open(target).refuse_other(command, case.text, self._own(row))
                 ready[row.name] = case.read(str(self.home / row.data) if row.data else None)
@@ -271,7 +271,7 @@ class FleetRunner:
     def left(
         self, rows: Sequence[Member], ended: Mapping[str, MemberOutcome], status: str, why: str
     ) -> dict[str, MemberOutcome]:
-        """Return how the other runs ended; those still marked as running get this status."""
+        """Return the outcomes of runs not in `ended`; runs marked as running get `status`."""
         found = {}
         for name in (row.name for row in rows if row.name not in ended):
             target = self._target(name)
@@ -299,7 +299,7 @@ class FleetRunner:
         return [*self.settings, *member.settings]
 
     def _command(self, member: Member) -> list[str]:
-        target = self.folder / member.name  # as the user names it: records say the same anywhere
+        target = self.folder / member.name  # without `home`: records are the same in all processes
         command = ["livepde", "run", str(self.case), "--out", str(target)]
         command += ["--data", member.data] if member.data else []
         return command + [word for text in self._own(member) for word in ("--set", text)]
@@ -311,7 +311,7 @@ class FleetRunner:
     def _together(
         self, block: MemberBlock, members: Mapping[str, Member]
     ) -> dict[str, MemberOutcome]:
-        """Run members as a block."""
+        """Run a block of members and return their outcomes."""
         ended = {}
         try:
             writers = {
@@ -323,13 +323,13 @@ class FleetRunner:
                     one = (block.members[name], identifier, driven, writer)
                     dataset, _, checks, _ = concluded(*one, draw=False)
                 ended[name] = _outcome_of(name, driven, dataset, checks)
-        except LivepdeError as error:  # no room, say: it concerns all that are not through
+        except LivepdeError as error:  # such as a full disk: all unfinished members fail
             for name in block.members.keys() - ended.keys():
                 ended[name] = MemberOutcome(name, "failed", error=str(error))
         return ended
 
     def _alone(self, member: Member, prepared: Prepared) -> MemberOutcome:
-        """Run one member, if it has not finished."""
+        """Run a member separately, unless its run has finished, and return the outcome."""
         name, table = member.name, prepared.stream
         target = self._target(name)
         try:
@@ -348,7 +348,7 @@ class FleetRunner:
 
 
 def _interrupted(ended: Iterable[MemberOutcome]) -> bool:
-    """Return whether Ctrl-C has ended a run, and with it all."""
+    """Return whether Ctrl-C has interrupted a run, which ends the fleet."""
     return any(item.status == "interrupted" for item in ended)
 
 
@@ -377,7 +377,7 @@ def _outcome_of(
 
 
 def _complaints(ended: Sequence[MemberOutcome]) -> list[str]:
-    """Return sentences on what went wrong: errors first, then failed steps, then failed checks."""
+    """Return sentences on errors, then on failed steps, then on failed checks."""
     steps = [(item, why, count) for item in ended for why, count in item.lost.items()]
     return [
         *(f"{item.name}: {item.error}" for item in ended if item.error),
@@ -387,7 +387,7 @@ def _complaints(ended: Sequence[MemberOutcome]) -> list[str]:
 
 
 def _how(ended: Sequence[MemberOutcome]) -> list[str]:
-    """Return a sentence, if any, on members stepped together, and on reasons of the others."""
+    """Return a sentence, if any, on members stepped together and reasons for separate runs."""
     apart = Counter(item.apart for item in ended if item.apart)
     count = sum(apart.values())
     together = sum(not item.apart and item.samples > 0 for item in ended)
@@ -414,7 +414,7 @@ def _summary(ended: Sequence[MemberOutcome]) -> pd.DataFrame:
 
 
 class Backend(StrEnum):
-    """Backends of joblib that livepde can set up by itself."""
+    """Backends of joblib that livepde can configure."""
 
     loky = "loky"
     dask = "dask"
@@ -428,10 +428,10 @@ def in_parts(
     backend: Backend | None,
     told: list[str],
 ) -> Iterator[Found]:
-    """Run rows in parts of bounded size, and iterate over their results, in any order.
+    """Run rows in parts of bounded size, and iterate over their results in any order.
 
-    A part whose worker died is run again; `run` has to resume from its run directories. `told`
-    receives a sentence for each loss of a worker.
+    If a worker dies, its part is run again; `run` has to resume from its run directories. A
+    sentence for each lost worker is appended to `told`.
     """
     with ExitStack() as stack:
         _configure(backend, stack)
@@ -444,7 +444,7 @@ def in_parts(
         lost = 0
         while parts:
             tasks = [delayed(_attempt)(run, k, part) for k, part in parts.items()]
-            soon = get_active_backend()[0].supports_return_generator  # Ray gives all at the end
+            soon = get_active_backend()[0].supports_return_generator  # Ray returns all at the end
             how = "generator_unordered" if soon else "list"
             parallel = Parallel(n_jobs=jobs, batch_size=1, return_as=how)
             try:
@@ -473,7 +473,7 @@ def _attempt(
 
 
 def _configure(backend: Backend | None, stack: ExitStack) -> None:
-    """Configure the backend of joblib, if one is named, until the stack is closed."""
+    """Configure a backend of joblib, unless it is None, until the stack is closed."""
     try:
         from joblib import parallel_config
     except ImportError as error:
@@ -500,7 +500,7 @@ def _configure(backend: Backend | None, stack: ExitStack) -> None:
                 "workers."
             ) from error
         dask: Any = distributed  # without types
-        # Of DASK_SCHEDULER_ADDRESS, or of its own.
+        # Connects to DASK_SCHEDULER_ADDRESS, or starts a local cluster.
         client: AbstractContextManager[Any] = dask.Client()
         stack.enter_context(client)
     stack.enter_context(parallel_config(backend=backend.value))

@@ -17,12 +17,12 @@ from livepde.errors import CaseError, RunError
 
 
 def option(text: str, *names: str, **more: Any) -> Any:
-    """Return an option whose help names its default, or needs none."""
+    """Return an option without a displayed default: its help text states it if necessary."""
     return typer.Option(*names, help=text, show_default=False, **more)
 
 
 def argument(text: str, **more: Any) -> Any:
-    """Return an argument without a default."""
+    """Return an argument without a displayed default."""
     return typer.Argument(help=text, show_default=False, **more)
 
 
@@ -79,7 +79,7 @@ def load_case(case: Path, allow_code: bool, settings: Sequence[str] | None) -> C
 
 @contextmanager
 def of_a_run(stored: bool) -> Iterator[None]:
-    """Raise an error of a case as one of its run, if the case is the one that the run stored."""
+    """Convert a `CaseError` to a `RunError` with a remedy if the case is stored in a run."""
     try:
         yield
     except CaseError as error:

@@ -21,25 +21,25 @@ from livepde.errors import ConfigurationError
 from livepde.runs import Check, Journal, Table
 from livepde.runs.directory import plain
 
-MOST_CURVES = 100_000  # samples of a run whose readings are drawn
+MOST_CURVES = 100_000  # largest number of samples for which readings are drawn
 CHECK_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
 FIGURES_MISSING = "No figures: they require Matplotlib, pip install 'livepde[plots]'."
 
 
 def terminal(*, err: bool = False) -> Console:
-    """Return where to print: standard output, or standard error. Lines are not wrapped."""
+    """Return a console for standard output or standard error that does not wrap lines."""
     return Console(stderr=err, highlight=False, soft_wrap=True)
 
 
 def named(name: str, known: Mapping[str, Any], what: str) -> Any:
-    """Return an item by name; one sentence with the closest name if there is none."""
+    """Return an item by name; raises `ConfigurationError` with the closest name."""
     if name not in known:
         raise ConfigurationError(f"there is no {what} '{name}'; {did_you_mean(name, known)}")
     return known[name]
 
 
 def can_draw(console: Console) -> bool:
-    """Return whether figures can be drawn; if not, print why."""
+    """Return whether figures can be drawn, and print the reason if not."""
     found = importlib.util.find_spec("matplotlib") is not None
     if not found:
         console.print(escape(FIGURES_MISSING))
@@ -47,7 +47,7 @@ def can_draw(console: Console) -> bool:
 
 
 def figures_of(dataset: Any, title: str, journal: Journal | None) -> dict[str, Any]:
-    """Return the figures of a run: name -> function that draws, with readings of the journal."""
+    """Return the figures of a run, name -> function that draws, with readings of the journal."""
     if not dataset.sizes["time"]:
         return {}
     kinds = [of for of in ("sensor", "validation") if of in dataset]
@@ -70,8 +70,8 @@ def present(
 ) -> None:
     """Print results as text, or as one JSON object.
 
-    Title and lines, with markup, are for the text; measures and verdict of the dataset and the
-    facts for the object.
+    `title` and `lines`, which may contain markup, are for the text. The JSON object also contains
+    the facts, and the measures and verdict of the dataset.
     """
     console = terminal()
     if not as_json:
@@ -92,7 +92,7 @@ def present(
 
 
 def exit_if_failed(checks: Iterable[Check]) -> None:
-    """End the command with the exit code of failed checks, if one failed."""
+    """Exit with code `CHECK_FAILED` if a check failed."""
     if not all(item.ok for item in checks):
         raise typer.Exit(CHECK_FAILED)
 
@@ -114,14 +114,14 @@ def show(
 
 
 def extent(values: Any) -> tuple[str, str, int]:
-    """Return the least and the largest of the values that are present, and how many are not."""
+    """Return minimum and maximum of the finite values as text, and the number of others."""
     present = values[np.isfinite(values)]
     ends = (f"{present.min():.4g}", f"{present.max():.4g}") if present.size else ("–", "–")
     return *ends, values.size - present.size
 
 
 def print_table(console: Console, table: Table) -> None:
-    """Print a table; in a narrow terminal words are folded, and numbers are never cut."""
+    """Print a table; a narrow terminal folds text between words and does not cut numbers."""
     if not table.rows:
         console.print(f"[bold]{escape(table.title)}[/]")
         return
@@ -132,7 +132,7 @@ def print_table(console: Console, table: Table) -> None:
     for k, column in enumerate(table.columns):
         values = [row[k] for row in table.rows]
         numbers = k > 0 and all(map(_numeric, values))
-        # The title and text can be folded between words.
+        # The heading and text can be folded between words.
         cells = list(map(_cell, values))
         words = [*(cells if numbers else " ".join(cells).split()), *column.split()]
         width = max(map(len, words), default=0)

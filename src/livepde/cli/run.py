@@ -1,4 +1,4 @@
-"""Run of a case, on complete data or live: estimate its unknowns, write a run directory."""
+"""Command `run`: estimate the unknowns of a case from complete or live data."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from livepde.verdict import Verdict
 if TYPE_CHECKING:
     import xarray as xr
 LOG = logging.getLogger("livepde.run")
-BEAT = 60.0  # seconds between two lines of the log that say how far a run is
+BEAT = 60.0  # seconds between progress lines in the log
 METRICS_PORT = 9100
 
 
@@ -141,14 +141,14 @@ def run(
             prepared = loaded.prepare(how.source)
             writer, taken = run_batch(prepared, folder, write, stack, quiet=as_json)
         prepared, driven = taken
-        # A service that is stopped has seconds: `livepde report` draws its figures.
+        # A service must stop within seconds: `livepde report` can draw the figures later.
         draw = not (how.live and driven.status == "interrupted")
         found = concluded(prepared, prepared.identifier, driven, writer, draw=draw)
     if driven.error is not None:
         raise driven.error
-    if not estimates:  # which are all that standard output is for then
+    if not estimates:  # with --estimates, standard output is for estimates only
         _show(loaded.title, folder, driven, found, as_json)
-    if driven.status == "interrupted" and not how.live:  # a live run usually ends by a signal
+    if driven.status == "interrupted" and not how.live:  # a signal is the usual end of a live run
         raise typer.Exit(printing.INTERRUPTED)
     printing.exit_if_failed(found.checks if as_json else ())
 
@@ -169,7 +169,7 @@ def _show(title: str, folder: Path, driven: Driven, found: Conclusion, as_json: 
 
 
 def _run_directory(loaded: Case, out: Path | None, resume: bool) -> Path:
-    """Return the folder of the run: the given one, which must be free for a new run, or another."""
+    """Return the run directory: `out`, which must be free for a new run, or a new default."""
     if out is None:
         if resume:
             raise ConfigurationError("--resume requires --out: the run directory to resume.")
@@ -180,14 +180,14 @@ def _run_directory(loaded: Case, out: Path | None, resume: bool) -> Path:
 
 
 def _refuse(how: LiveOptions, as_json: bool) -> None:
-    """Refuse options that exclude each other, before anything is read."""
-    beside_only = {
+    """Refuse conflicting options before data are read."""
+    live_only = {
         "--speed": how.speed is not None,
         "--listen": how.listen,
         "--watch": how.page,
         "--estimates": how.estimates,
     }
-    for name, given in beside_only.items():
+    for name, given in live_only.items():
         if given and not how.live:
             raise ConfigurationError(f"{name} requires --realtime.")
     if as_json and how.estimates:
@@ -201,7 +201,7 @@ def _refuse(how: LiveOptions, as_json: bool) -> None:
 def writer_of(
     loaded: Case, folder: Path, settings: Sequence[str], resume: bool, command: Sequence[str]
 ) -> RunWriter:
-    """Return the writer of the run directory, a new or a resumed one."""
+    """Return the writer of a new or resumed run directory."""
     about: dict[str, Any] = {"version": __version__, "command": command, "settings": settings}
     about |= {"case": loaded.text, "original": loaded.original}
     if resume and (folder / RECORD).exists():
@@ -217,8 +217,8 @@ def run_batch(
     *,
     quiet: bool,
 ) -> tuple[RunWriter, tuple[Prepared, Driven]]:
-    """Run a case on finished data; an unusable sample ends the run."""
-    identifier = prepared.identifier  # raises on inconsistent data before anything is written
+    """Run a case on complete data; an unusable sample ends the run."""
+    identifier = prepared.identifier  # raises on inconsistent data before files are written
     writer, path = write(), folder / JOURNAL
     table = prepared.stream if isinstance(prepared.stream, DataTable) else None
     if path.exists():
@@ -263,7 +263,7 @@ def concluded(
     nothing: list[Any] = []
     ended = attempted("The final estimate", driven.result.dataset, None, notes)
     dataset = journal.dataset() if ended is None else ended
-    # The estimates are written first: they are safe if something below fails or takes long.
+    # The estimates are written first, so that they are safe if a later step fails or takes long.
     writer.finish(status=driven.status, dataset=dataset, identifier=identifier, notes=loaded.notes)
     judged = partial(_judged, prepared, driven, dataset)
     found = attempted("The verdict", judged, Verdict.unjudged(), notes)
@@ -283,8 +283,8 @@ def concluded(
             )
         if loaded.spec.output.smoothed:
             smooth = partial(_with_smoothed, prepared, driven, dataset)
-            dataset, told = attempted("The smoother", smooth, (dataset, nothing), notes)
-            notes += told
+            dataset, more = attempted("The smoother", smooth, (dataset, nothing), notes)
+            notes += more
     if driven.status == "interrupted":
         notes.append(f"Interrupted after {len(driven.result)} samples.")
     if driven.error is not None:
@@ -305,7 +305,7 @@ def concluded(
 
 
 def _judged(prepared: Prepared, driven: Driven, dataset: xr.Dataset) -> Verdict:
-    """Return the verdict on a run, with settings of the case that would remedy its findings."""
+    """Return the verdict on a run, with settings of the case as remedies for its findings."""
     raw, journal = prepared.raw, driven.journal
 
     def readings() -> tuple[Array, Array]:
@@ -321,7 +321,7 @@ def _judged(prepared: Prepared, driven: Driven, dataset: xr.Dataset) -> Verdict:
 def _with_smoothed(
     prepared: Prepared, driven: Driven, dataset: xr.Dataset
 ) -> tuple[xr.Dataset, list[str]]:
-    """Return the dataset of a run with smoothed estimates, or with a note on their absence."""
+    """Return the dataset of a run with smoothed estimates, and notes if they are unavailable."""
     from livepde.hindsight import with_smoothed
 
     if driven.status != "finished" or not len(driven.result):
@@ -337,10 +337,10 @@ def _with_smoothed(
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """Options of a live run, as given to the command."""
+    """Options of the command that concern live runs."""
 
-    data: str | None  # instead of the case's own source
-    own: bool  # whether the source of the case, or a file in its place, continues by itself
+    data: str | None  # replaces the source of the case
+    own: bool  # whether the source of the case, or the file that replaces it, is live
     realtime: bool
     resume: bool
     speed: float | None
@@ -352,7 +352,7 @@ class LiveOptions:
 
     @property
     def source(self) -> str | Iterable[str] | None:
-        """The data, or lines of standard input."""
+        """The data, with `-` replaced by standard input."""
         return sys.stdin if self.data == "-" else self.data
 
     @property
@@ -363,12 +363,12 @@ class LiveOptions:
     @property
     def live(self) -> bool:
         """Whether to run online."""
-        # What is sent to a run that is resumed begins anywhere: times count from the first start.
+        # Rows sent to a resumed run may begin at any time: times count from the first start.
         return self.own or self.realtime or (self.resume and self.data == "-")
 
     @property
     def pace(self) -> float:
-        """Speed of the samples relative to real time; inf: each is taken as soon as it is there."""
+        """Speed of the samples relative to real time; inf: samples are processed immediately."""
         if self.goes_on:
             return math.inf
         return 1.0 if self.speed is None else self.speed
@@ -377,10 +377,10 @@ class LiveOptions:
 def run_live(
     case: Case, how: LiveOptions, folder: Path, write: Callable[[], RunWriter], stack: ExitStack
 ) -> tuple[RunWriter, tuple[Prepared, Driven]]:
-    """Run a case in its run directory until its source ends or a signal comes.
+    """Run a case in its run directory until its source ends or a signal arrives.
 
-    `write` creates the run directory, when the source is connected. `stack` closes what is opened,
-    among it the journal, from which the result reads.
+    `write` creates the run directory after the source is connected. `stack` closes all resources,
+    including the journal from which the result reads.
     """
     wiring = stack.enter_context(
         LiveCase(
@@ -390,7 +390,7 @@ def run_live(
     health, stopping = partial(_health, wiring), threading.Event()
     sinks = _observers(case, how, stack, health)
     writer = write()
-    # The report at the end needs them, when a signal leaves few seconds.
+    # The final report needs them, and after a signal there is no time to import them.
     for library in ("xarray", "pint"):
         import_module(library)
     if how.page is not None:
@@ -408,7 +408,7 @@ def run_live(
 
 
 def _health(wiring: LiveCase) -> Mapping[str, Any]:
-    """Return the content of /health, also before the first sample."""
+    """Return the content of /health, including the time before the first sample."""
     if wiring.running is not None:
         return wiring.running.health
     silent, why = wiring.silent, wiring.why  # read once: another thread sets them
@@ -445,7 +445,7 @@ def _observers(
     if how.page is not None:
         from livepde.dashboard import check_installed
 
-        Address.read(how.page, 0, how.token)  # an invalid address is reported before all else
+        Address.read(how.page, 0, how.token)  # reports an invalid address first
         check_installed()
     sinks: list[Sink] = [_Heartbeat()]
     if how.estimates:
@@ -460,7 +460,7 @@ def _observers(
 
 
 def _serve_page(page: str, token: str, folder: Path, stack: ExitStack) -> None:
-    """Serve the page from a separate process: drawing must not delay steps."""
+    """Serve the page from a separate process, so that drawing does not delay steps."""
     watch = [sys.executable, "-m", "livepde", "watch", str(folder), "--address", page]
     secret = {"LIVEPDE_TOKEN": token} if token else {}
     process = subprocess.Popen(
@@ -469,4 +469,4 @@ def _serve_page(page: str, token: str, folder: Path, stack: ExitStack) -> None:
         stdout=sys.stderr,
         env={**os.environ, **secret},
     )
-    stack.callback(process.communicate)  # closes its standard input, and waits
+    stack.callback(process.communicate)  # closes its standard input and waits for its end
