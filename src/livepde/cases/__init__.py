@@ -1,4 +1,4 @@
-"""Case files: a whole identification in one TOML file, units and data checked."""
+"""Case files: an identification in one TOML file, with checks of units and data."""
 
 from livepde.cases.case import Case, Prepared, load
 from livepde.cases.live_case import LiveCase

@@ -43,7 +43,7 @@ MEMBERS = 10_000  # largest number of channels of a family
 
 
 def columns_of(case: CaseContent) -> dict[str, Column]:
-    """Return channel -> its column in the data; noise columns have the key `noise_channel`."""
+    """Return channel -> its column in the data, with noise columns under `noise_channel(name)`."""
     found, decimal = {}, case.spec.data.decimal
     for name, channel in case.spec.channels.items():
         unit = case.unit(name)
@@ -228,7 +228,7 @@ def _points(
     """Return the observation of sensors at points."""
     points = {name: _position(case, name, item) for name, item in channels.items()}
     constants = case.constants
-    direct = {  # direct terms of a quantity, in addition to the state at its point
+    direct = {  # direct dependence of a quantity on the parameter
         name: fem.with_constants(
             case.equation.quantities[item.quantity].direct(case.options), constants
         )
@@ -409,7 +409,7 @@ def _made_of_readings(case: CaseContent) -> bool:
 
 
 def initial_errors(case: CaseContent, first: Sample) -> tuple[Any, ...]:
-    """Return the error modes of the initial state, functions of x from `random_field`."""
+    """Return the errors of the initial state itself as functions of x, see `random_field`."""
     initial = case.spec.initial
     if initial is None or isinstance(initial, dict):
         return ()

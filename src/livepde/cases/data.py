@@ -610,7 +610,7 @@ def passwords_of(case: CaseContent, own: bool, allowed: Iterable[str]) -> dict[s
 
 
 def limits_of(case: CaseContent) -> tuple[Backlog, Retention, float | None]:
-    """Return limits of backlog and retention, and after how many seconds a source is silent."""
+    """Return limits of backlog and retention, and seconds until a source is silent, or None."""
     intake, output = case.spec.intake, case.spec.output
     # By default all estimates are kept.
     span = case.positive(output.retain, case.equation.time_unit, "output.retain", math.inf)

@@ -235,7 +235,7 @@ class LiveCase:
         return [remark for remark in remarks if (remark.kind, remark.channel) not in known]
 
     def _is_sure(self, found: list[Ready]) -> bool:
-        """Return whether outliers in the first row can be detected without further rows."""
+        """Return whether the first row can be accepted without waiting for further rows."""
         many = self._feed.done or len(found) > FEWEST_FOLLOWING
         return many or not suspect_start(self.case, found[0].values)
 

@@ -108,13 +108,13 @@ class Measured:
         samples, steps = self.samples, self.steps
         unit = self.time_unit.replace(BLANK, "")
         begin, end = (_moment(t, samples.origin) for t in samples.t[[0, -1]])
-        told = f"{len(samples)} rows from {begin} to {end}{' UTC' if samples.origin else ''}"
+        text = f"{len(samples)} rows from {begin} to {end}{' UTC' if samples.origin else ''}"
         if len(steps):
-            told += f", {np.median(steps):g} {unit}".rstrip() + " apart"
+            text += f", {np.median(steps):g} {unit}".rstrip() + " apart"
         if len(steps) and steps.max() > 1.01 * steps.min():
-            told += f" (median), {steps.min():g} to {steps.max():g}"
+            text += f" (median), {steps.min():g} to {steps.max():g}"
         known = self.counted or (self.time_format if self.time_format in ELAPSED else "")
-        return f"{told}; times are read as {known}" if known else told
+        return f"{text}; times are read as {known}" if known else text
 
 
 def _moment(t: float, origin: datetime | None) -> str:

@@ -148,17 +148,17 @@ def _data_lines(
     table: Measured, folder: Path, equation: Equation, channels: list[FoundChannel]
 ) -> Iterator[str]:
     """Yield the line of [data], with a comment on what to check."""
-    data, told = _data(table, folder, _with_states(equation, channels)), list[str]()
+    data, comments = _data(table, folder, _with_states(equation, channels)), list[str]()
     if len(data.get("missing", ())) > len(table.missing):
-        told.append("missing: far outside the other values; check them")
+        comments.append("missing: far outside the other values; check them")
     if table.counted:
-        told.append("time_unit: found from the numbers; check the dates above")
+        comments.append("time_unit: found from the numbers; check the dates above")
     # Times that are numbers begin at an event: the process is at rest before the first row.
     first = min(one.samples.t[0] for one in table.tables)
     if equation.spacing == "geometric" and table.samples.origin is None and first > 0.0:
         data["t0"] = _open(table.time_unit)
-        told.append("t0: when the process began, at rest")
-    yield from _inline("data", data, "; ".join(told))
+        comments.append("t0: when the process began, at rest")
+    yield from _inline("data", data, "; ".join(comments))
 
 
 def _with_states(equation: Equation, channels: list[FoundChannel]) -> set[str]:
@@ -182,11 +182,11 @@ def _open(unit: str, number: str = BLANK) -> str:
     return f"{number} {unit}".rstrip()
 
 
-def _inline(key: str, given: Mapping[str, Any], told: str = "") -> Iterator[str]:
+def _inline(key: str, given: Mapping[str, Any], comment: str = "") -> Iterator[str]:
     """Yield the line of an inline table with a comment; no line if the table is empty."""
     if given:
         shown = toml_line("x", given).partition(" = ")[2]
-        yield _told(f"{key} = {shown}", told)
+        yield _told(f"{key} = {shown}", comment)
 
 
 def _told(line: str, text: str) -> str:
@@ -446,20 +446,20 @@ def _stated(name: str, unit: str) -> str:
 def _sensor(equation: Equation, key: str, column: str, name: str, values: Array) -> FoundChannel:
     """Return a sensor with the position and unit in the name of its column."""
     at, remark = _place(equation, name)
-    told = [_range(values), *filter(None, [remark])]
+    comments = [_range(values), *filter(None, [remark])]
     given: dict[str, Any] = {"role": "sensor", "column": column, "at": at}
     if equation.components:
         given["of"] = equation.components[0]
-        told.append(f"of {' or '.join(equation.components)}")
+        comments.append(f"of {' or '.join(equation.components)}")
     unit, model = _unit_of_sensor(name, equation.state.unit), equation.state.unit
     stated = unit.removeprefix(BLANK).strip()
     flux = equation.fluxes.flux if equation.fluxes and equation.conductivity else ""
     if unit.startswith(BLANK) and flux and converts(stated, flux):
         given["quantity"], unit, model = FLUX, stated, flux
-        told.append('flux along x, at an end: at = "left" or "right"')
+        comments.append('flux along x, at an end: at = "left" or "right"')
     same = converts(unit, model) and conversion(unit, model, name) == Affine()  # °C
     given |= {"unit": unit} if unit and not same else {}
-    return FoundChannel(key, given, (column,), ", ".join(told))
+    return FoundChannel(key, given, (column,), ", ".join(comments))
 
 
 def _place(equation: Equation, name: str) -> tuple[Any, str]:
@@ -519,12 +519,12 @@ def _family(equation: Equation, stem: str, members: list[FoundChannel]) -> Found
     given = {key: value for key, value in first.items() if key not in ("column", "at")}
     if equation.dimension == 1 and columns == tuple(f"{stem}{k}" for k in range(count)):
         given |= {"column": f"{stem}{{}}", "each": [first["at"], first["at"], count]}
-        told = f'evenly from ... to ...; else positions = "{PLACES}" (name, x)'
+        comment = f'evenly from ... to ...; else positions = "{PLACES}" (name, x)'
     else:
         given |= {"positions": PLACES}
-        told = "fill in the places there"
+        comment = "fill in the places there"
     label = re.sub(r"\W+", "_", stem).strip("_") or "sensor"
-    return FoundChannel(label, given, columns, told)
+    return FoundChannel(label, given, columns, comment)
 
 
 def _range(values: Array) -> str:
@@ -533,8 +533,8 @@ def _range(values: Array) -> str:
     missing = len(values) - len(present)
     if not len(present):
         return "nothing"
-    told = f"{present.min():.4g} to {present.max():.4g}"
-    return f"{told}, {missing} missing" if missing else told
+    text = f"{present.min():.4g} to {present.max():.4g}"
+    return f"{text}, {missing} missing" if missing else text
 
 
 def write_template(

@@ -368,7 +368,7 @@ def _left(weights: Mapping[str, Array], C: Array) -> dict[str, float]:
 
 
 def _weights(model: Model, factor: Array) -> dict[str, Array]:
-    """Return unknown -> W, where trace(W P) is its mean variance over the prior's, P = I."""
+    """Return unknown -> W with trace(W P) its mean variance, relative to its prior (P = I)."""
     space = model.parameter_space
     found = {label: np.outer(factor[k], factor[k]) for label, k in space.labels.items()}
     # The mass matrix integrates the variance of a field over the domain. Division by the trace

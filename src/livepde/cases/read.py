@@ -99,7 +99,7 @@ def read_text(path: Path) -> str:
 
 
 def _nearest(folder: Path, name: str) -> str:
-    """Return a hint to a case file with a similar name in a folder or its subfolders."""
+    """Return a hint to a similarly named case file in a folder or below, or to the only one."""
     known = [*folder.glob("*.toml"), *folder.glob("*/*.toml")]
     names = difflib.get_close_matches(name, [item.name for item in known], n=1, cutoff=0.75)
     near = [item for item in known if item.name in names] or known[: len(known) == 1]
@@ -172,7 +172,7 @@ def blanks_in(document: Mapping[str, Any], table: str = "") -> dict[str, Any]:
 
 def beside(path: Path, folder: Path) -> Path:
     """Return the path of a file relative to a folder; absolute if it is on another drive."""
-    try:  # links are resolved, since '..' of a link is not the parent of its target
+    try:  # links are resolved, since '..' after a link is the parent of its target
         return Path(os.path.relpath(path.parent.resolve() / path.name, folder.resolve()))
     except ValueError:
         return path.absolute()

@@ -48,7 +48,7 @@ def _ahead(base: VariantRun, others: Sequence[VariantRun]) -> list[VariantRun]:
 
 
 def _worse_sensors(one: VariantRun, base: VariantRun) -> list[str]:
-    """Return texts with the errors of validation sensors that a run predicts worse than `base`."""
+    """Return the errors of validation sensors predicted worse than by `base`, or not at all."""
     return [
         f"{name} {own:.3g} instead of {error:.3g}"
         for name, error in base.validation.items()

@@ -43,7 +43,7 @@ from livepde.observation import Discrepancy
 from livepde.runs.backlog import Retention
 from livepde.stepping import Between
 
-SENSORS = ("sensor", "validation", "ignored")  # roles of channels that are measurements
+SENSORS = ("sensor", "validation", "ignored")  # roles of channels that are sensors
 
 
 Spacing = Literal["uniform", "geometric"]

@@ -1,4 +1,4 @@
-"""Likely errors of a rejected sensor, from its readings and their predictions."""
+"""Likely errors of an excluded sensor, from its readings and their predictions."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class _Sensor(NamedTuple):
 
 
 def with_errors_of_set_aside(prepared: Prepared, data: xr.Dataset, verdict: Verdict) -> Verdict:
-    """Return the verdict with the likely causes of the error of each rejected sensor."""
+    """Return the verdict with likely causes for each excluded sensor."""
     table, who = prepared.raw, prepared.identifier.observed
     if not isinstance(table, DataTable):
         return verdict

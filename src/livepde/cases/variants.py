@@ -343,7 +343,7 @@ def _last_estimates(data: xr.Dataset, errors: ModelErrors | None) -> dict[str, L
 
 
 def _misfits(data: xr.Dataset) -> dict[str, float]:
-    """Return the rms innovation of each assimilated sensor over its noise, estimated from steps."""
+    """Return sensor -> rms innovation in the second half, over noise estimated from its steps."""
     columns, found = used_errors(data, "innovation", "sensor").T, {}
     for name, column in zip(map(str, data["sensor"].values), columns, strict=True):
         later = column[len(column) // 2 :]

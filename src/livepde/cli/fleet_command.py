@@ -116,9 +116,9 @@ def fleet(
     for row in () if resume else rows:
         runs.refuse_taken(folder / row.name)
     run = FleetRunner(case, folder, allow_code, tuple(settings or ()), resume, separately)
-    ended, told, summary = _each(run, rows, jobs, backend)
+    ended, losses, summary = _each(run, rows, jobs, backend)
     wrong = [item for item in ended if item.status == "failed" or item.failed]
-    notes = [*_how(ended), *told, *_complaints(ended)]
+    notes = [*_how(ended), *losses, *_complaints(ended)]
     lines = [f"[bold]Run directories: {escape(str(folder))}[/]"]
     cells = list(summary.itertuples(index=False, name=None))
     tables = [Table(f"{len(cells)} runs", list(map(str, summary.columns)), cells)]
@@ -181,7 +181,7 @@ def _each(
 ) -> tuple[list[MemberOutcome], list[str], pd.DataFrame]:
     """Run all members; return their outcomes, notes on lost workers, and the written summary."""
     ended: dict[str, MemberOutcome] = {}
-    told: list[str] = []
+    losses: list[str] = []
 
     def summed_up() -> pd.DataFrame:
         summary = _summary(_in_order(rows, ended))
@@ -193,7 +193,7 @@ def _each(
         here = jobs == 1 and backend is None
         # A backend may run a part again by itself, so each part resumes existing runs.
         parallel = replace(run, resume=True, home=Path.cwd())
-        for found in [run(rows)] if here else in_parts(parallel, rows, jobs, backend, told):
+        for found in [run(rows)] if here else in_parts(parallel, rows, jobs, backend, losses):
             ended |= {item.name: item for item in found}
     except ConfigurationError:
         raise
@@ -206,7 +206,7 @@ def _each(
         ended |= run.left(rows, ended, status, "The command was ended. Resume with --resume.")
         summed_up()
         raise
-    return _in_order(rows, ended), told, summed_up()
+    return _in_order(rows, ended), losses, summed_up()
 
 
 def _in_order(rows: Sequence[Member], ended: Mapping[str, MemberOutcome]) -> list[MemberOutcome]:
