@@ -1,4 +1,4 @@
-"""Whether a live run is well, and why not: a full disk, a silent source, rows of no use."""
+"""Health of a live run: detects a full disk, a silent source and unusable rows."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from livepde.runs.feeds import Feed
 from livepde.runs.journal import Journal
 from livepde.streams.intake import Remark
 
-# Without `intake.silence`: usual intervals and seconds after which a source without rows is silent.
+# Defaults for `intake.silence`: a source is silent after 10 usual intervals, at least 60 s.
 SILENT, LEAST_SILENCE = 10.0, 60.0
-REFUSED = 20  # rows and values refused in a row, after which a run is not well
-UNUSED = frozenset(  # rows and values of no use
+REFUSED = 20  # consecutive refused rows and values after which a run is unhealthy
+UNUSED = frozenset(  # kinds of remarks on unusable rows and values
     {"malformed", "late", "conflict", "leap", "outside", "skipped"}
 )
 
 
 class Ailments:
-    """Faults of a live run, from its events.
+    """Faults of a live run, detected from its events.
 
-    A verdict is no ailment: the process is well while its model is not.
+    A verdict is not an ailment: a healthy run may have a poor model.
 
     Attributes
     ----------
     reasons
-        Kind -> function that returns the reason why the run is not well, in one sentence, or an
-        empty string; /health, the log and the page report the first reason, the metrics its kind.
+        Kind -> function that returns why the run is unhealthy, in one sentence, or an empty string.
+        /health, the log and the page report the first reason, the metrics its kind.
     unwritten
-        Why the journal cannot be written; empty if it can.
+        Why the journal cannot be written; empty if it can be written.
     busy
-        Whether a step is taken.
+        Whether a step is in progress.
     """
 
     def __init__(
@@ -46,10 +46,10 @@ class Ailments:
         self.silent = self.busy = False
         self.unwritten = ""
         self._heard = self._taken = clock()
-        self._longest = 0.0  # silence of the source that has ended
-        self._refused = self._failed = 0  # in a row
+        self._longest = 0.0  # longest interval between rows so far
+        self._refused = self._failed = 0  # consecutive refusals and failures
         self._refusal = self._failure = ""
-        self._told = "", ""  # kind and reason that were reported last
+        self._told = "", ""  # kind and reason of the last report
         self.reasons: dict[str, Callable[[], str]] = {
             "disk": lambda: self.unwritten,
             "journal": self._unlinked,
@@ -61,9 +61,9 @@ class Ailments:
 
     @property
     def ill(self) -> tuple[str, str]:
-        """Kind of the first active ailment and its sentence; empty if there is none.
+        """Kind and sentence of the first active ailment; both are empty in a healthy run.
 
-        While the same ailment lasts, the sentence is that of its beginning.
+        The sentence does not change while the same ailment lasts.
         """
         kind, why = self._ailing()
         return self._told if kind == self._told[0] else (kind, why)
@@ -73,9 +73,9 @@ class Ailments:
         return next(found, ("", ""))
 
     def look(self) -> tuple[str, str] | None:
-        """Return kind and sentence of an event if the run's health has changed, else None.
+        """Return the kind and sentence of an event if the health has changed, else None.
 
-        The sentence is empty after a silence: its end is a separate event.
+        The sentence is empty at the end of a silence, which has a separate event.
         """
         (kind, why), before = self._ailing(), self._told[0]
         if kind == before:
@@ -86,16 +86,16 @@ class Ailments:
         return "well", "" if before == "silent" else "recovered"
 
     def away(self, why: str) -> None:
-        """Note that the journal cannot be written."""
+        """Record that the journal cannot be written."""
         self.unwritten, self._told = why, ("disk", why)
 
     def back(self) -> None:
-        """Note that it can be written again: the source was not polled meanwhile."""
+        """Record that the journal can be written again, and restart the timers of the source."""
         self.unwritten = ""
         self._heard = self._taken = self._clock()
 
     def listen(self, heard: bool) -> str:
-        """Note whether a row has come; return the report on a silence that ends."""
+        """Record whether a row has arrived; return the message at the end of a silence."""
         now, ended = self._clock(), ""
         if heard:
             if self.silent:
@@ -107,22 +107,22 @@ class Ailments:
         return ended
 
     def remarked(self, remark: Remark) -> None:
-        """Note a remark on irregular rows."""
+        """Record a remark on irregular rows."""
         if remark.kind in UNUSED:
             self.refused(f"{remark.kind}: {remark.message}", remark.number)
 
     def refused(self, why: str, number: int = 1) -> None:
-        """Note rows or values that were refused."""
+        """Record refused rows or values."""
         self._refused += number
         self._refusal = why
 
     def failed(self, why: str) -> None:
-        """Note a step that has failed."""
+        """Record a failed step."""
         self._failed += 1
         self._failure = why
 
     def stepped(self, estimate: Estimate) -> None:
-        """Note the status of a step."""
+        """Record the status of a step."""
         if estimate.status.taken:
             self._taken, self._refused = self._clock(), 0
         if estimate.status.ok:
@@ -135,7 +135,7 @@ class Ailments:
         """Seconds without a row after which the source is reported as silent."""
         if self._stated_silence is not None:
             return self._stated_silence
-        # A source that brings a day of rows once a day is silent for a day.
+        # A source that delivers its rows in daily batches is silent for a day each time.
         return max(LEAST_SILENCE, SILENT * self.feed.interval, 2.0 * self._longest)
 
     def _unlinked(self) -> str:

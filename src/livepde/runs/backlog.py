@@ -1,4 +1,4 @@
-"""Queue of a live run: samples that come too fast, old samples, and sinks of estimates."""
+"""Policies of a live run for excess samples and old records, and the interface of sinks."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class Sink(Protocol):
     """A destination of estimates."""
 
     def put(self, estimate: Estimate) -> None:
-        """Take one estimate."""
+        """Accept an estimate."""
 
     def close(self) -> None:
-        """Release its resources."""
+        """Release the resources of the sink."""
         return
 
 
@@ -32,9 +32,9 @@ class Backlog:
     Parameters
     ----------
     overflow
-        "queue": all samples wait, those beyond `length` at their source; "merge": the oldest beyond
-        `length` become one sample, with the mean of each channel at the last time; "drop": the
-        oldest are dropped. Merged and dropped samples are counted.
+        "queue": all samples wait, and samples beyond `length` stay at the source. "merge": the
+        oldest samples are merged into one, with the mean of each channel and the last time.
+        "drop": the oldest samples are dropped. Merged and dropped samples are counted.
     length
         Maximum number of waiting samples.
     """
@@ -43,7 +43,7 @@ class Backlog:
     length: int = 1000
 
     def relieved(self, waiting: deque[Ready]) -> list[Ready]:
-        """Shorten the queue, and return the samples that were merged or dropped."""
+        """Shorten the queue to `length`; return the samples that were merged or dropped."""
         excess = len(waiting) - self.length
         if self.overflow == "queue" or excess <= 0:
             return []

@@ -27,37 +27,36 @@ from livepde.stepping import LONG_SUBSTEPS, interruptible
 from livepde.streams.intake import Ready, Remark
 from livepde.verdict import LEVELS
 
-GROUP = 64  # most samples of one commit
-AGE = 0.25  # seconds after which no step begins before what was taken until then is committed
-CHECKPOINT = 256  # most samples between two checkpoints
-# Checkpoints also follow the time spent in steps, so that a run that is killed every few seconds
-# makes progress: they are a second of steps apart, or more where they would cost more than 5 %.
+GROUP = 64  # largest number of samples in a commit
+AGE = 0.25  # seconds since the last commit after which a step begins with a commit
+CHECKPOINT = 256  # largest number of samples between two checkpoints
+# Checkpoints also depend on the time spent in steps, so that a run that is killed every few seconds
+# makes progress: one follows each second of steps, or less often to cost at most 5 % of that time.
 APART, COST = 1.0, 0.05
-# Seconds after a signal in which a step may end, and the last fit; then they are interrupted.
+# Seconds after a signal until a step, or the last fit, is interrupted.
 GRACE, LAST_GRACE = 0.5, 1.0
-LOOK = 0.5  # seconds between two checks whether to stop
+LOOK = 0.5  # seconds between two checks of `stopping`
 LONGEST = 500  # characters of an event
-RECENT = 1000  # events that are written again when a journal has lost them
-TRIES = 2  # times that a sample in whose step the process has ended is tried again
+RECENT = 1000  # events kept in memory, which are written again if the journal loses them
+TRIES = 2  # crashes of the process in the step of a sample before the sample is skipped
 HARMLESS = frozenset({"heard", "well", "missing", "disordered", "outside"})
 LOG = logging.getLogger("livepde.run")
 
 
 class Interrupted(KeyboardInterrupt):
-    """A step was left between two substeps, since the run is to stop; the state is that before."""
+    """A step was interrupted between two substeps to stop the run; the state is unchanged."""
 
 
 class Live:
     """A live run, which continues until its source ends or it is stopped.
 
-    Samples that are at hand together are committed in groups. Nothing outside of the process is
-    told of a sample or its estimate before they are committed: sources are acknowledged, and sinks
-    get estimates, after the commit of their group. A group ends before the run waits for its
-    source, and before a step if it has 64 samples or the last commit is 0.25 s ago. The first 64
-    samples of a session are committed one by one, each before its step: a sample in whose step the
-    last session has ended is among them. Belief and diagnostics of a group's estimates are computed
-    together at its end, where each finds code and data of the one before in the caches of the
-    processor; if one of them cannot be computed, the samples are taken again one by one.
+    Samples that are available together are committed in groups. Sources are acknowledged, and sinks
+    receive estimates, only after the commit of their group. A group ends before the run waits for
+    its source, and before a step if it has 64 samples or the last commit is 0.25 s ago. The first
+    64 samples of a session are committed one by one, each before its step: if a step crashed the
+    last session, its sample is among them. Beliefs and diagnostics of a group's estimates are
+    computed together at its end, which uses the caches of the processor well. If one of these
+    computations fails, the samples are processed again one by one.
 
     Parameters
     ----------
@@ -66,26 +65,26 @@ class Live:
     feed, journal, sinks
         Source of samples, store of samples and estimates, and destinations of estimates.
     fields_every
-        Number of samples between two that keep their fields.
+        Interval, in samples, at which fields are kept.
     backlog
         Policy for samples that arrive faster than they are processed.
     retention
         Retention policy of the journal.
     silence
-        Seconds without a row after which the source is reported as silent; None: ten usual
-        intervals of its rows, twice its longest silence so far, and at least a minute.
+        Seconds without a row after which the source is reported as silent. None: the largest of ten
+        usual intervals of its rows, twice its longest silence so far, and a minute.
     strict
-        A sample that the identifier cannot use ends the run with its `DataError`; otherwise it is
-        an event.
+        Whether a sample that the identifier cannot use ends the run with its `DataError`; otherwise
+        it is recorded as an event.
     begun, irregular
-        Samples that the feed has delivered already, and remarks on irregular rows until then.
+        Samples that the feed has already delivered, and the remarks on irregular rows so far.
     waits
-        Whether the feed may wait for samples: all that was taken is then committed before.
+        Whether the feed may wait for samples; then the run commits before each wait.
     patient
-        Whether to wait for a journal that cannot be written (a full disk), with the run not well
-        meanwhile; else the journal's `RunError` ends the run.
+        Whether to wait while the journal cannot be written (a full disk) and report the run as
+        unhealthy; otherwise the journal's `RunError` ends the run.
     stopping
-        Event that ends the run when it is set; it may be set already.
+        Event that ends the run; it may already be set.
     clock
         Function that returns the time in seconds.
 
@@ -115,7 +114,7 @@ class Live:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.identifier = identifier
-        # A journal without an intact checkpoint is taken again from this state.
+        # Without an intact checkpoint, all samples are processed again from this state.
         self._begun = identifier.dump()
         self.feed = feed
         self.journal = journal
@@ -128,33 +127,33 @@ class Live:
         self.stopping = stopping or threading.Event()
         self._clock = clock
         self.ailments = Ailments(feed, journal, lambda: self.result.last, silence, clock)
-        self._group: deque[Ready] = deque()  # to be acknowledged once they are committed
-        # Of the group, to be stored at its end: number of the sample, and whether with its fields.
+        self._group: deque[Ready] = deque()  # samples to acknowledge after the next commit
+        # Estimates of the group, stored at its end: sample number, estimate, whether to keep fields
         self._unread: deque[tuple[int, Estimate, bool]] = deque()
-        self._untold: deque[Estimate] = deque()  # for the sinks, once they are committed
+        self._untold: deque[Estimate] = deque()  # estimates for the sinks after the next commit
         self._committed = clock()
-        self._one_by_one = journal.accepted + GROUP  # the last sample that has its own commit
-        self._put_last = -math.inf  # time of the last estimate that sinks were given
+        self._one_by_one = journal.accepted + GROUP  # number of the last sample with its own commit
+        self._put_last = -math.inf  # time of the last estimate that sinks have received
         self._waiting = deque(begun)
         self._counts = Counter(journal.counts)
         self._uncounted: deque[Remark] = deque()
         self._events: deque[Event] = deque(maxlen=RECENT)
         self._steps = 0
-        self._stopped_at = math.inf  # when a step first saw that the run is to stop
+        self._stopped_at = math.inf  # time at which a step first found `stopping` set
         self._kept_at = self._cost = 0.0  # `_seconds` at the last checkpoint, and its duration
-        self._wild = False  # whether wild readings have been reported
-        self._replay = (0, 0)  # samples taken again so far, and their number
+        self._wild = False  # whether outliers have been reported
+        self._replay = (0, 0)  # number of replayed samples, and of samples to replay
         self.looks = Looks.stored(journal.verdict)
-        self._seconds = 0.0  # spent in steps
+        self._seconds = 0.0  # time spent in steps
         self.fields_every = fields_every
         self.result = self._read()
         self._count(irregular)
 
     def resume(self) -> int:
-        """Take again the samples after the journal's last checkpoint; return their number.
+        """Replay the samples after the journal's last checkpoint; return their number.
 
-        A sample in whose step the process has ended three times is set aside. If `stopping` is set
-        meanwhile, the state so far is kept, and the rest is taken again the next time.
+        A sample whose step has crashed the process three times is skipped. If `stopping` is set
+        during the replay, a checkpoint is written, and the next session replays the other samples.
         """
         try:
             again = self._again(self.journal.estimated)
@@ -165,14 +164,14 @@ class Live:
         return again
 
     def _mend(self, error: RunError) -> int:
-        """Wait until the journal can be written again; return the number of samples taken again.
+        """Wait until the journal can be written again; return the number of replayed samples.
 
-        Lost records are written again: estimates are recomputed from the last checkpoint on, counts
-        and events are still in memory. Raises the error if it has no remedy, or the run is not
-        patient.
+        Lost records are restored: estimates are recomputed from the last checkpoint on, counts and
+        events are still in memory. Raises the error if it has no remedy, the run is not patient, or
+        `stopping` is set.
         """
         begun, again = self._clock(), None
-        self._put_back()  # the journal has rolled back what was not committed
+        self._put_back()  # the journal has rolled back uncommitted samples
         while again is None:
             if not (self.patient and self.journal.remedy):
                 raise error
@@ -185,10 +184,10 @@ class Live:
                 raise error
             try:
                 self.journal.reopen()
-                # A write comes first: if it fails, no steps are taken again in vain.
+                # This write comes first: if it fails, the replay would be wasted.
                 self.journal.say_health(why)
                 again = self._recover()
-                # This is a write, too: the disk may be away again.
+                # This write may fail too, if the disk has become unavailable again.
                 away = f"{self._clock() - begun:.1f} s ({error.__cause__})"
                 self._tell("disk", f"the disk was not writable for {away}")
             except RunError as still:
@@ -197,53 +196,53 @@ class Live:
         return again
 
     def _one_at_a_time(self) -> None:
-        """Go back to the last commit, and take the samples of the group again one by one."""
+        """Return to the last commit, and process the samples of the group again one by one."""
         self._put_back()
         self.journal.rollback()
         self._one_by_one = self.journal.accepted + GROUP
         self._recover()
 
     def _put_back(self) -> None:
-        """Put the samples that are not committed back among those to be taken."""
+        """Put uncommitted samples back at the start of the queue."""
         self._waiting.extendleft(reversed(self._group))
         self._group.clear()
         self._unread.clear()
 
     def _recover(self) -> int:
-        """Go on from the last commit; return the number of samples taken again."""
-        # The tries of samples are not counted: it was not the process that has ended.
+        """Continue from the last commit; return the number of replayed samples."""
+        # The tries of samples are not counted, since the process has not crashed.
         again = self._again(math.inf)
         self.journal.commit()
         self._restore()
-        # What was committed is still to be told; the other samples are taken once more.
+        # Sinks still receive committed estimates. The other samples are processed again.
         self._untold = deque(one for one in self._untold if one.t <= self.identifier.t)
         return again
 
     def _restore(self) -> None:
-        """Write again the events and counts that the journal has lost."""
+        """Restore the events and counts that the journal has lost."""
         for event in self._events:
             self.journal.note(event)
         self._keep_verdict(self.looks)
         written = Counter(self.journal.counts)
-        # Committed counts have survived, so only the difference is written again.
+        # Committed counts have survived, so only the difference is added.
         lost = self._counts - written
-        lost.pop(("aside", ""), None)  # counted when it was set aside again
+        lost.pop(("aside", ""), None)  # counted in the replay, where samples are skipped again
         self._counts = written + lost
         for key, number in lost.items():
             self.journal.count(*key, number)
         self._count(())
         while self._waiting:
             if self._waiting[0].t > self.journal.last:
-                return  # the next sample is kept together with this
+                return  # the next sample commits the counts and the position
             # The sample was committed although its write was reported as failed.
             self.feed.acknowledge(self._waiting.popleft())
         if not self._waiting:
             self.journal.commit(self.feed.position(()))
 
     def _again(self, reached: float) -> int:
-        """Go back to the last checkpoint and take again all samples after it; return their number.
+        """Restore the last checkpoint and replay all samples after it; return their number.
 
-        Samples with numbers above `reached` have no estimate yet: their tries are counted.
+        Tries are counted for samples with numbers above `reached`, which have no estimate yet.
         """
         state = self.journal.rewind()
         self.identifier.restore(self._begun if state is None else state, str(self.journal.path))
@@ -261,9 +260,9 @@ class Live:
         return again
 
     def _taken_again(self, taken: Taken, new: bool) -> bool:
-        """Take a sample again; return whether its step has ended.
+        """Replay a sample; return whether its step was completed, not interrupted.
 
-        `new`: the sample has no estimate yet, and its tries are counted.
+        `new`: whether the sample has no estimate yet, so that its tries are counted.
         """
         if new and self.journal.mark() > TRIES:
             self._set_aside(taken.t, f"processing it ended the program {TRIES + 1} times")
@@ -275,18 +274,18 @@ class Live:
                 self.journal.unmark()
             return False
         if new:
-            # The step has ended, so a later crash must not count as one of its tries.
+            # The step is complete, so that a later crash must not count as one of its tries.
             self.journal.commit()
         return True
 
     def _read(self) -> Result:
-        """Return the result that reads estimates from the journal."""
+        """Return a result that reads estimates from the journal."""
         who, kept = self.identifier, self.journal
         parts = who.model, who.observed, who.validation
         return Result(*parts, self.fields_every, kept, layout=kept.layout, count=kept.estimated)
 
     def run(self) -> None:
-        """Run until the source ends or `stopping` is set, and keep a final checkpoint."""
+        """Run until the source ends or `stopping` is set, then write a final checkpoint."""
         try:
             self._run()
         except Interrupted:
@@ -294,7 +293,7 @@ class Live:
             self._keep_state()
             return
         except BaseException:
-            # The first error is the one to report, not one that follows from it.
+            # The first error is reported, not an error that follows from it.
             with suppress(LivepdeError):
                 self._conclude()
             raise
@@ -303,7 +302,7 @@ class Live:
     def _conclude(self) -> None:
         self._commit()
         if self.journal.accepted > self.journal.estimated:
-            return  # stopped within a step: from the checkpoint before, it is taken again
+            return  # interrupted in a step: the next session replays from an earlier checkpoint
         notes: list[str] = []
         attempted("The final fit", self._settled, None, notes)
         for note in notes:
@@ -311,10 +310,10 @@ class Live:
         self._keep_state()
 
     def _settled(self) -> None:
-        """Keep the verdict and the fields of the final estimate."""
+        """Store the verdict and the fields of the final estimate."""
         if not self.journal.estimated:
             return
-        # A session without samples ends like the one before it, which may not have come so far.
+        # A session without samples does this too, since an earlier session may have been killed.
         last = self.result.last or self.identifier.estimate()
         try:
             with interruptible(self._check):
@@ -335,7 +334,7 @@ class Live:
                 ended = True
             except RunError as error:
                 self._mend(error)
-                # Steps that are taken again reach no sink, but the last estimate is news to them.
+                # Sinks receive no estimates of replayed samples, except the last if it is new.
                 last = self.result.last
                 known = self._untold[-1].t if self._untold else self._put_last
                 if last is not None and last.t > known:
@@ -343,16 +342,16 @@ class Live:
             except Exception:  # laws and sensors of a user may raise anything
                 if not self._unread:
                     raise
-                # Processed one by one, the error is that of a single sample, which is skipped.
+                # If samples are processed one by one, only the sample with the error is skipped.
                 self._one_at_a_time()
 
     def _go_on(self) -> None:
-        """Take samples until the source ends or `stopping` is set."""
+        """Process samples until the source ends or `stopping` is set."""
         while not self.stopping.is_set():
             if self.waits and not self._waiting:
                 self._settle()  # readers see all estimates before the run waits for rows
             if self.backlog.has_room(self._waiting):
-                # Samples at hand must not wait for the source; an idle run still checks `stopping`.
+                # Waiting samples must not wait for the source. An idle run still checks `stopping`.
                 self._waiting.extend(self.feed.poll(0.0 if self._waiting else LOOK))
                 ended = self.ailments.listen(self.feed.heard())
                 if ended:
@@ -367,14 +366,14 @@ class Live:
 
     def _settle(self) -> None:
         """Commit the counts of irregular rows, and the position of the source."""
-        # The position moves in the transaction of the counts, since a crash between the two would
-        # let the same rows be read and counted again.
+        # The position is committed with the counts: after a crash between two transactions, the
+        # same rows would be read and counted again.
         remarks = self.feed.remarks(self._waiting)
         self._count(remarks)
         self._commit(self.feed.position(self._waiting) if remarks else None)
 
     def _commit(self, position: str | None = None) -> None:
-        """Commit, then acknowledge the samples of the group and hand their estimates to sinks."""
+        """Commit, then acknowledge the samples of the group and pass their estimates to sinks."""
         self._record()
         self.journal.commit(position)
         self._committed = self._clock()
@@ -395,7 +394,7 @@ class Live:
             self.ailments.busy = before
 
     def _tell_wild(self, estimate: Estimate) -> None:
-        """Report the first readings that a law without a covariance has refused."""
+        """Report the first readings that were rejected by a law without a covariance."""
         if self._wild or self.identifier.law.weighs_readings():
             return
         refused = estimate.diagnostics.refused
@@ -408,7 +407,7 @@ class Live:
             self._tell("wild", text)
 
     def _is_due(self, taken: Taken) -> bool:
-        """Return whether a sample must be committed before its step; see the class."""
+        """Return whether a sample must be committed before its step, see the class."""
         return (
             taken.id <= self._one_by_one
             or (self.waits and not self._waiting)
@@ -421,13 +420,13 @@ class Live:
         if relieved:
             self._counts[self.backlog.overflow, ""] += len(relieved)
             self.journal.count(self.backlog.overflow, "", len(relieved))
-        # A merged sample has the tokens of all its rows, which are acknowledged with it.
+        # Merged samples are acknowledged with the sample that has the tokens of all their rows.
         if self.backlog.overflow == "drop":
             for ready in relieved:
                 self.feed.acknowledge(ready)
 
     def _count(self, remarks: Iterable[Remark]) -> None:
-        """Count remarks; the first of each kind and channel becomes an event with its message."""
+        """Count remarks; the first of each kind and channel is also recorded as an event."""
         self._uncounted.extend(remarks)
         while self._uncounted:
             remark = self._uncounted.popleft()
@@ -452,7 +451,7 @@ class Live:
     def health(self) -> dict[str, Any]:
         """State of the run for a watchdog: "ok", the reason if not, and counters."""
         last = self.result.last
-        counts = self._counts.copy()  # requests come from other threads
+        counts = self._counts.copy()  # other threads call this
         (ailment, why), verdict = self.ailments.ill, self.looks.verdict
         return {
             "ok": not why,
@@ -472,12 +471,12 @@ class Live:
 
     @property
     def replaying(self) -> str:
-        """Progress of the replay of samples since the checkpoint; empty without one."""
+        """Progress of the replay of samples since the checkpoint, or an empty string."""
         again, total = self._replay
         return f"replaying {again} of {total} since the checkpoint" if total else ""
 
     def _look(self) -> None:
-        """Log a change of the run's health, and store it for readers of the journal."""
+        """Log a change of the run's health, and store it for the readers of the journal."""
         event = self.ailments.look()
         if event is not None:
             self.journal.say_health(self.ailments.ill[1])
@@ -485,10 +484,10 @@ class Live:
                 self._tell(*event)
 
     def _take(self) -> None:
-        """Take the first waiting sample; it stays in the queue if the journal cannot keep it."""
+        """Process the first waiting sample; it remains in the queue if it cannot be stored."""
         ready = self._waiting.popleft()
         try:
-            # Counts, position and sample are one transaction, so that a crash keeps all or none.
+            # Counts, position and sample are one transaction, so that a crash loses all or none.
             position = self.feed.position(self._waiting)
             self._count(self.feed.remarks(self._waiting))
             taken = self.journal.accept(ready.t, ready.values, position)
@@ -511,7 +510,7 @@ class Live:
             self.ailments.busy = False
 
     def _check(self) -> None:
-        """Raise `Interrupted` once the run was to stop a while ago; called between substeps."""
+        """Raise `Interrupted` if `stopping` was set a while ago; called between substeps."""
         if self.stopping.is_set():
             now = self._clock()
             self._stopped_at = min(self._stopped_at, now)
@@ -519,7 +518,7 @@ class Live:
                 raise Interrupted
 
     def _estimate(self, taken: Taken) -> Estimate | None:
-        """Take a step; return None if the sample was rejected or skipped."""
+        """Take a step and return the estimate, or None if the sample was rejected or skipped."""
         before, begun = self.identifier._place, time.monotonic()
         self._tell_pause(taken.t)
         try:
@@ -536,16 +535,16 @@ class Live:
             self._tell("refused", str(error))
             self.ailments.refused(str(error))
             self._withdraw()
-        except RunError:  # of the journal
+        except RunError:  # from the journal
             raise
         except Interrupted:
             self.identifier._return_to(before)
             raise
         except Exception as error:
-            # A failure of the numerics belongs to this sample; any other is an error in the code.
+            # A numerical failure is due to this sample, any other failure to the code.
             if self.strict and numerical(error) is None:
                 raise
-            # A step that fails midway may have changed a part of the identifier.
+            # A step that failed midway may have changed a part of the identifier.
             self.identifier._return_to(before)
             self._set_aside(taken.t, f"{type(error).__name__}: {error}")
         else:
@@ -553,7 +552,7 @@ class Live:
         return None
 
     def _tell_pause(self, t: float) -> None:
-        """Report an interval of so many substeps that they are longer than `dt_max`."""
+        """Report an interval so long that its substeps are longer than `dt_max`."""
         control, length = self.identifier.problem.control, t - self.identifier.t
         if control.stretches(length):
             text = (
@@ -564,13 +563,13 @@ class Live:
             self._tell("pause", text)
 
     def _withdraw(self) -> None:
-        """Withdraw the last sample; waiting samples are later, and taken in their turn."""
+        """Withdraw the last sample; samples in the queue are later and not affected."""
         self._record()
         self.journal.withdraw()
         self.feed.withdraw(self._waiting[-1].t if self._waiting else self.journal.last)
 
     def _set_aside(self, t: float, why: str) -> None:
-        """Withdraw a sample whose step fails, and report it; the run continues."""
+        """Withdraw and report a sample whose step failed; the run continues."""
         failure = f"the sample at t = {t:g} was skipped: {why}"
         self.ailments.failed(failure)
         self._tell("aside", failure)
@@ -579,7 +578,7 @@ class Live:
         self._withdraw()
 
     def _hand_on(self, estimate: Estimate, again: bool) -> None:
-        """Hand an estimate to the sinks, and judge it at intervals."""
+        """Queue an estimate for the sinks, and update the verdict at intervals."""
         if self.sinks and not again:
             self._untold.append(estimate)
         self.ailments.stepped(estimate)
@@ -587,15 +586,15 @@ class Live:
             self._tell(estimate.status.code, str(estimate.status))
         self._tell_wild(estimate)
         self._steps += 1
-        # Counted from the start of the run, so that a resumed run judges the same samples.
+        # Samples count from the start of the run, so that a resumed run judges the same samples.
         look, others = divmod(len(self.result), JUDGED)
-        # A run of finished data ends with a verdict: it is looked at seldom before.
+        # A batch run ends with a verdict and is rarely judged before.
         if not others and (self.waits or is_due(look)):
             self._judge(estimate)
         self._checkpoint(estimate)
 
     def _checkpoint(self, estimate: Estimate) -> None:
-        """Keep a checkpoint at intervals, and thin the journal."""
+        """Write a checkpoint at intervals, and thin the journal."""
         by_count = self._steps % CHECKPOINT == 0
         if by_count or self._seconds - self._kept_at >= max(APART, self._cost / COST):
             self._record()
@@ -604,33 +603,33 @@ class Live:
                 self.journal.thin(estimate.t - self.retention.span, self.retention.every)
 
     def _keep_state(self) -> None:
-        """Keep a checkpoint of the state after the last estimated sample."""
+        """Write a checkpoint of the state after the last estimated sample."""
         begun = time.monotonic()
         self.journal.checkpoint(self.identifier.dump())
         self._cost, self._kept_at = time.monotonic() - begun, self._seconds
 
     def _judge(self, estimate: Estimate) -> None:
-        """Look at the verdict, and report another level."""
+        """Update the verdict, and report a change of its level."""
         before = self.looks
         looked = before.after(self.identifier, estimate, len(self.result), live=self.waits)
-        if looked is None:  # samples that are taken again have been judged
+        if looked is None:  # replayed samples have already been judged
             return
         self._keep_verdict(looked)
         level, verdict = looked.level, looked.verdict
         if level != before.level:
             first = verdict.sentences[0] if verdict.sentences else "no problems detected"
             message = f"{level}: {first.removeprefix('Not judged: ')}"
-            # Each sound run begins as not judged, and is trusted then: that is no warning. Finished
-            # data end with another verdict, on all of them.
+            # The change from not judged to trusted is normal, thus not a warning. A batch run ends
+            # with another verdict, on all data.
             self._tell("verdict", message, harmless=level == LEVELS[0] or not self.waits)
 
     def _keep_verdict(self, looked: Looks) -> None:
-        """Make a verdict the current one, which all readers see."""
+        """Set the current verdict, and store it for the readers of the journal."""
         self.looks = looked
         self.journal.judge(looked.to_dict())
 
     def _put(self, estimate: Estimate) -> None:
-        """Hand an estimate to all sinks; a sink that fails is removed, and the run continues."""
+        """Pass an estimate to all sinks; a sink that fails is removed, and the run continues."""
         self._put_last = estimate.t
         for sink in list(self.sinks):
             try:

@@ -1,4 +1,4 @@
-"""The verdict that a run reports: it changes its level once two looks agree."""
+"""The reported verdict of a run, whose level changes if two consecutive looks agree."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from livepde.identifier import Identifier
 from livepde.verdict import LEVELS, NOT_JUDGED, ModelErrors, Verdict
 
 JUDGED = 50  # samples between two looks at the verdict
-SELDOM = 128  # looks of which one computes errors of the model, beside those at doublings
-# Keys of a stored verdict: the level that was reported last, the samples at the last look, another
-# level that this look was the first to find, and the errors of the model as they were computed.
+SELDOM = 128  # looks between two that compute model errors, in addition to looks at doublings
+# Keys of a stored verdict: reported level, samples at the last look, a different level that only
+# the last look has found, and the model errors of the last computation.
 TOLD, LOOKED, NEXT, ERRORS = "told", "looked", "next", "computed_errors"
 
 
 @dataclass(frozen=True)
 class Looks:
-    """The verdict that is reported, and the last look at that of the law."""
+    """The reported verdict, and the last look at the verdict of the law."""
 
     verdict: Verdict
-    level: str = NOT_JUDGED  # that was reported last
-    samples: int = 0  # at the last look
-    other: str = ""  # level that this look was the first to find
-    errors: ModelErrors | None = None  # as they were computed last
+    level: str = NOT_JUDGED  # reported level
+    samples: int = 0  # number of samples at the last look
+    other: str = ""  # a different level that only the last look has found
+    errors: ModelErrors | None = None  # model errors of the last computation
 
     @classmethod
     def stored(cls, text: str) -> Looks:
-        """Return the value that `to_dict` has stored as JSON; that before any if it is empty."""
+        """Return the looks that `to_dict` stored as JSON, or initial looks for an empty text."""
         found = json.loads(text) if text else Verdict.unjudged().to_dict()
         return cls(
             Verdict.from_dict(found),
@@ -40,7 +40,7 @@ class Looks:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the value as JSON can hold it."""
+        """Return the looks as a JSON object."""
         errors = None if self.errors is None else self.errors.to_dict()
         look = {TOLD: self.level, LOOKED: self.samples, NEXT: self.other, ERRORS: errors}
         return {**self.verdict.to_dict(), **look}
@@ -48,16 +48,16 @@ class Looks:
     def after(
         self, identifier: Identifier, estimate: Estimate, samples: int, *, live: bool
     ) -> Looks | None:
-        """Return the value after a look at an estimate; None if these samples were looked at.
+        """Return the looks after an estimate; None if its samples have been judged already.
 
-        Another level counts once two looks in a row differ in one way: both are worse than the
-        reported level, or both are better. Findings that alternate between two levels must not keep
-        a better one. The first one that is judged counts at once.
+        The reported level changes if two consecutive looks are both worse or both better than it,
+        even if they alternate between two levels, which must not preserve a better one. The first
+        level other than "not judged" is reported at once.
         """
         if samples <= self.samples:
             return None
         errors = self.errors
-        # The end of a run of finished data is near, and has the errors of the model.
+        # A batch run computes model errors at its end.
         if live and is_due(samples // JUDGED):
             errors = identifier._settled(estimate, columns=False).verdict.errors or errors
         verdict = estimate.verdict
@@ -74,10 +74,10 @@ class Looks:
 
 
 def is_due(look: int) -> bool:
-    """Return whether a look is at a doubling, or one of `SELDOM`.
+    """Return whether the number of a look is a power of two or a multiple of `SELDOM`.
 
-    Such a look computes errors of the model in a live run, and is the only kind in a batch run. In
-    between an interval is as much wider than the plain one as it was then.
+    A live run computes model errors at these looks, and a batch run has no others. In between,
+    intervals keep the widening by model errors that was computed last.
     """
     return look > 1 and (look & (look - 1) == 0 or look % SELDOM == 0)
 
@@ -87,7 +87,7 @@ def _worse(level: str, than: str) -> bool:
 
 
 def _ends(estimate: Estimate) -> dict[str, tuple[float, float, float]]:
-    """Return label -> value, and ends of the plain interval."""
+    """Return the median and the ends of the plain interval of each unknown, by label."""
     found = {}
     for label in estimate.space.labels:
         unknown = estimate[label]
