@@ -13,8 +13,8 @@ from filelock import FileLock, Timeout
 
 from livepde.errors import RunError
 
-LOG_SIZE = 16 * 2**20  # bytes of the write-ahead log that are kept when it was longer
-MOMENT = 0.5  # seconds for which who only asks whether a journal is written may hold its lock
+LOG_SIZE = 16 * 2**20  # bytes to which a longer write-ahead log is truncated
+MOMENT = 0.5  # seconds to wait for the lock, which `in_use` holds for a moment
 # Exceptions that decoding the content of a damaged or hostile file may raise.
 DAMAGE = (
     ArithmeticError,
@@ -59,16 +59,16 @@ SCHEMA = (
 
 
 def writer(path: Path) -> sqlite3.Connection:
-    """Open a file to write it."""
+    """Open a file for writing."""
     connection = _connect(path, "mode=rw")
     connection.execute("PRAGMA journal_mode = WAL")
-    connection.execute("PRAGMA synchronous = NORMAL")  # no sync for each commit, see the journal
+    connection.execute("PRAGMA synchronous = NORMAL")  # no sync at each commit: see `journal`
     connection.execute(f"PRAGMA journal_size_limit = {LOG_SIZE}")
     return connection
 
 
 def reader(path: Path) -> sqlite3.Connection:
-    """Open a file to read it, while another process may write."""
+    """Open a file for reading, while another process may write."""
     connection = _connect(path, "mode=ro")
     try:
         connection.execute("SELECT 1 FROM sqlite_schema").close()
@@ -77,17 +77,17 @@ def reader(path: Path) -> sqlite3.Connection:
         busy = error.sqlite_errorcode & 0xFF in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
         if busy or (log.exists() and log.stat().st_size):
             raise
-        # A folder in which nothing can be made, and nobody writes.
+        # The folder is read-only, and no process writes the file.
         connection.close()
         connection = _connect(path, "immutable=1")
     return connection
 
 
 def check_file(path: Path, connection: sqlite3.Connection) -> None:
-    """Raise `RunError` if SQLite finds the pages of a file damaged.
+    """Raise `RunError` if SQLite finds damaged pages in a file.
 
-    A changed byte in a page may hide rows; their checksums do not show that. The check reads the
-    file once, in about a third of the time that reading its rows takes.
+    A changed byte in a page may hide rows, which checksums of rows cannot detect. The check reads
+    the file once and takes about a third of the time of reading all rows.
     """
     try:
         (found,), *_ = connection.execute("PRAGMA quick_check(1)").fetchall()
@@ -98,10 +98,10 @@ def check_file(path: Path, connection: sqlite3.Connection) -> None:
 
 
 class Connection(sqlite3.Connection):
-    """A connection that closes on garbage collection; Python 3.13 warns of unclosed ones."""
+    """Connection that closes on garbage collection; Python 3.13 warns about unclosed ones."""
 
     def __del__(self) -> None:
-        with suppress(sqlite3.Error):  # of another thread
+        with suppress(sqlite3.Error):  # raised if another thread has made the connection
             self.close()
 
 
@@ -123,13 +123,13 @@ def written(path: Path) -> float:
     """Return the time of the last write to a journal, in seconds since 1970; 0 if there is none."""
     times = [0.0]
     for file in (path, log_of(path)):
-        with suppress(OSError):  # the log goes away with its writer
+        with suppress(OSError):  # the writer deletes its log when it closes
             times.append(file.stat().st_mtime)
     return max(times)
 
 
 def in_use(path: Path) -> bool:
-    """Return whether a process holds a journal to write it."""
+    """Return whether a process has a journal open for writing."""
     lock = _lock_of(path)
     try:
         lock.acquire(timeout=0)
@@ -144,7 +144,7 @@ def _lock_of(path: Path) -> FileLock:
 
 
 def locked(path: Path) -> FileLock:
-    """Acquire the lock of the single writer of a file; raise `RunError` if it is held."""
+    """Acquire the lock of the single writer of a file; raise `RunError` if it is taken."""
     lock = _lock_of(path)
     try:
         lock.acquire(timeout=MOMENT)
@@ -159,7 +159,7 @@ def locked(path: Path) -> FileLock:
 
 @contextmanager
 def released(path: Path, lock: FileLock | None) -> Iterator[None]:
-    """Release the lock of a journal that cannot be opened, and raise `RunError` with the reason."""
+    """Release the lock and raise `RunError` with the reason if a journal cannot be opened."""
     try:
         yield
     except (OSError, sqlite3.Error, UnicodeDecodeError, RunError) as error:
@@ -174,7 +174,7 @@ def released(path: Path, lock: FileLock | None) -> Iterator[None]:
 
 @contextmanager
 def sound(path: Path) -> Iterator[None]:
-    """Turn exceptions from decoding a damaged or hostile file into a `RunError` of one sentence."""
+    """Convert exceptions from decoding a damaged or hostile file to a `RunError`."""
     try:
         yield
     except DAMAGE as error:
@@ -183,7 +183,7 @@ def sound(path: Path) -> Iterator[None]:
 
 
 def told(path: Path, error: sqlite3.Error | UnicodeDecodeError) -> str:
-    """Return a sentence on a failure, with its remedy."""
+    """Return a message with the remedy for an error of SQLite."""
     code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
     if code & 0xFF in CORRUPT:
         return damaged(path, str(error))
@@ -192,30 +192,30 @@ def told(path: Path, error: sqlite3.Error | UnicodeDecodeError) -> str:
 
 
 def remedy_of(error: Exception) -> str:
-    """Return the remedy for an error of an intact file; empty if none is known."""
+    """Return the remedy for an error of an intact file, or an empty string."""
     return REMEDIES.get(getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & 0xFF, "")
 
 
 def damaged(path: Path, why: str) -> str:
-    """Return a sentence on a damaged journal, with its remedy."""
+    """Return a message with the remedy for a damaged journal."""
     return f"{path} is damaged ({why}): restore it from a copy, or {AGAIN}."
 
 
 def checksum(table: str, *values: Any) -> int:
-    """Return the CRC-32 checksum of a record: its table, its number and all its values."""
+    """Return the CRC-32 checksum of a record: the name of its table and all its values."""
     total = zlib.crc32(table.encode())
     for value in values:
         if not isinstance(value, bytes):
-            # SQLite keeps no sign of a zero.
+            # SQLite does not store the sign of a zero.
             value = repr(value + 0.0 if isinstance(value, float) else value).encode()
         total = zlib.crc32(value, zlib.crc32(b"\0", total))
     return total
 
 
 def fill(connection: sqlite3.Connection, meta: Mapping[str, str]) -> None:
-    """Make the tables of a new journal."""
+    """Create the tables of a new journal, with its header `meta`, in one transaction."""
     with connection:
-        connection.execute("BEGIN")  # one commit for all
+        connection.execute("BEGIN")
         for command in SCHEMA:
             connection.execute(command)
         rows = [(key, value, checksum("meta", key, value)) for key, value in meta.items()]

@@ -1,19 +1,19 @@
 """The journal of a run: samples, estimates and checkpoints in one file that survives a kill.
 
 The file is an SQLite database in write-ahead mode. Samples, each with the position of its source,
-and estimates are committed in the groups that the run decides on (`Live`), a checkpoint of the
-identifier from time to time. After a crash at any moment the last checkpoint, the samples after it
-and the rows from the last position on give the same numbers as if nothing had happened. One process
-writes; any number of processes may read at the same time.
+and estimates are committed in groups, which the run determines (`Live`). Checkpoints store the
+state of the identifier at intervals. After a crash at any time, the last checkpoint, the samples
+after it and the rows from the last position on reproduce the same numbers. One process writes, and
+any number of processes may read at the same time.
 
-The journal is append-only: only `thin` and withdrawals remove samples and estimates. A process that
-is killed loses nothing. A power cut leaves the file intact, but may lose the most recent samples: a
-sync to disk for each sample would cost more than its step.
+The journal is append-only: only `thin` and withdrawals remove samples and estimates. If the process
+is killed, no record is lost. A power cut leaves the file intact, but may lose the most recent
+samples: a sync to disk for each sample would take longer than its step.
 
 Each record has a checksum, which is verified on each read. SQLite checks the pages of the file when
 a writer opens it, and when estimates are read from the first one on. Damage raises `RunError`.
 After a failed write (a full disk) a journal accepts no further records, so that no checkpoint can
-skip lost samples; `reopen`, or a new writer, continues from those committed before.
+skip lost samples; `reopen` or a new writer continues from the last commit.
 """
 
 from __future__ import annotations
@@ -62,10 +62,10 @@ FORMAT = 4
 MEMORY = Path(":memory:")
 KEPT_CHECKPOINTS = 2
 KEPT_EVENTS = 10_000
-FEW = 64  # samples that are compared to recognise a repeated row
-TOGETHER = 1000  # estimates that are read at once: a slow reader must not hold up the writer
+FEW = 64  # largest number of samples that are compared to recognise a repeated row
+TOGETHER = 1000  # records per query: a slow reader must not block the writer
 LONGEST = 2000  # characters of the message of an event
-UNLESS_KNOWN = "INSERT OR IGNORE"  # a record with the same key stays as it is
+UNLESS_KNOWN = "INSERT OR IGNORE"  # keeps an existing record with the same key
 
 ESTIMATES = (
     "SELECT id, t, status, steps, numbers, notes, estimates.crc, last, content, fields.crc "
@@ -77,7 +77,7 @@ ESTIMATES = (
 class Taken:
     """An accepted sample: its number, its time and the values of all channels (NaN: missing).
 
-    The noise of its readings, if they have any, is held under the names of `noise_channel`.
+    If its readings have a noise, `values` also contains it, under the names of `noise_channel`.
     """
 
     id: int
@@ -87,7 +87,7 @@ class Taken:
 
 @dataclass(frozen=True)
 class Event:
-    """An event of a run: model time, kind, channel ('' for none) and message."""
+    """An event of a run: model time, kind, channel (may be empty) and message."""
 
     t: float
     kind: str
@@ -96,23 +96,23 @@ class Event:
 
 
 class Journal:
-    """The journal of one run; `create` makes a new one, `open` opens an existing one.
+    """The journal of a run; `create` makes a new journal, `open` opens an existing one.
 
     Attributes
     ----------
     path
         The SQLite file.
     channels
-        Names of all channels of a sample, in the order in which they are kept.
+        Names of all channels of a sample, in storage order.
     noise
-        Names of the noise of each channel; samples with noise hold it after `channels`.
+        Names of the noise of each channel; samples with noise store it after their channels.
     layout
         Names, units and coordinates of the numbers of the records.
 
     Raises
     ------
     RunError
-        Another process writes; the file is of another run, damaged, or cannot be written.
+        Another process writes the file; it is of another version, damaged, or not writable.
     """
 
     def __init__(self, path: Path, connection: sqlite3.Connection, lock: FileLock | None) -> None:
@@ -127,13 +127,13 @@ class Journal:
         self.noise = tuple(map(noise_channel, self.channels))
         self._vertices = max(map(len, self.layout.coordinates.values()), default=0)
         self._thinned = 0
-        # Device and inode identify the file, whatever its name.
+        # Device and inode identify the file independently of its name.
         found = None if path is MEMORY else path.stat()
         self._file = None if found is None else (found.st_dev, found.st_ino)
         self._stand()
 
     def _stand(self) -> None:
-        """Read the numbers of the last estimate and sample."""
+        """Reload the numbers of the last estimate and sample."""
         self._last = self._current = self._highest("estimates")
         self._newest = self.accepted
 
@@ -141,9 +141,9 @@ class Journal:
 
     @classmethod
     def create(cls, path: Path | None, channels: Sequence[str], layout: Layout) -> Journal:
-        """Make a new journal and be its writer; without a path in memory only.
+        """Create a journal and return its writer; without a path, it is in memory only.
 
-        The file is written atomically: if it exists, `open` can continue it.
+        The file is created atomically: if it exists, `open` can continue it.
         """
         meta = {
             "format": str(FORMAT),
@@ -162,13 +162,13 @@ class Journal:
                     "another folder."
                 )
             with replacing(path) as partial, closing(sqlite3.connect(partial)) as new:
-                new.execute("PRAGMA journal_mode = MEMORY")  # no second file beside it
+                new.execute("PRAGMA journal_mode = MEMORY")  # no temporary second file
                 fill(new, meta)
             return cls(path, writer(path), lock)
 
     @classmethod
     def open(cls, path: Path, *, write: bool = False) -> Journal:
-        """Open a journal, to continue it or to read it while another process writes."""
+        """Open a journal to continue it (`write`), or to read it while another process writes."""
         if not path.is_file():
             raise RunError(f"{path}: there is no journal.")
         lock = locked(path) if write else None
@@ -213,7 +213,7 @@ class Journal:
 
     @property
     def remedy(self) -> str:
-        """Remedy after which `reopen` may succeed; empty without a failure or a known one."""
+        """Remedy after which `reopen` may succeed; empty if there is no failure or no remedy."""
         return self._remedy if self._failure and self.in_place else ""
 
     def reopen(self) -> None:
@@ -225,8 +225,8 @@ class Journal:
             self._db.close()
         try:
             self._db = writer(self.path)
-            # An immediate transaction takes the write lock, so a file that cannot be locked fails
-            # here, and not with the next sample.
+            # An immediate transaction acquires the write lock, so that a file that cannot be locked
+            # raises an error here, not at the next sample.
             self._db.execute("BEGIN IMMEDIATE")
             self._db.rollback()
         except sqlite3.Error as error:
@@ -241,17 +241,17 @@ class Journal:
     def _read(self, command: str, *values: Any) -> list[Any]:
         try:
             return self._db.execute(command, values).fetchall()
-        except (sqlite3.Error, UnicodeDecodeError) as error:  # the latter of a damaged file
+        except (sqlite3.Error, UnicodeDecodeError) as error:  # latter: damaged file
             disk = self._lock is not None and remedy_of(error)
             if disk and isinstance(error, sqlite3.OperationalError):
-                self._fail(error)  # SQLite may have rolled back what was not committed
+                self._fail(error)  # SQLite may have rolled back uncommitted records
             raise RunError(told(self.path, error)) from error
 
     def _one(self, command: str, *values: Any) -> Any:
         return self._read(command, *values)[0][0]
 
     def _highest(self, table: str) -> int:
-        """Return the largest number of a record in a table, 0 without records."""
+        """Return the largest number of a record in a table, 0 if the table is empty."""
         return int(self._one(f"SELECT COALESCE(MAX(id), 0) FROM {table}"))
 
     # --- writing -------------------------------------------------------------------------------
@@ -259,10 +259,10 @@ class Journal:
     def accept(self, t: float, values: Mapping[str, float], position: str = "") -> Taken:
         """Insert a sample, which survives a kill of the process from the next commit on.
 
-        A value that is NaN or absent is missing. The run resumes from the `position` of the source
-        after the sample.
+        Values that are NaN or absent are missing. `position` is the position of the source after
+        the sample, from which the run resumes.
         """
-        # Most samples have no noise; the length of a row tells readers whether it has.
+        # Most samples have no noise. Readers recognise noise by the length of the row.
         names = self.channels
         if not values.keys().isdisjoint(self.noise):
             names += self.noise
@@ -281,9 +281,9 @@ class Journal:
         self._execute(command, *values, checksum(table, *values))
 
     def extend(self, rows: Iterable[tuple[Array, Record]], state: bytes) -> None:
-        """Insert samples with their estimates and the state after them, in one transaction.
+        """Insert samples, their estimates and the final state in one transaction.
 
-        A row has the values of the channels, with or without their noise after them.
+        A row contains the values of all channels, and may contain their noise after them.
         """
         for row, record in rows:
             self._enter(record.t, row.tobytes(), "")
@@ -291,17 +291,17 @@ class Journal:
         self.checkpoint(state)  # commits
 
     def withdraw(self) -> None:
-        """Withdraw the last sample, which the identifier could not use."""
+        """Delete the last sample, which the identifier could not use."""
         for table in ("samples", "estimates", "fields", "checkpoints", "tries"):
             self._execute(f"DELETE FROM {table} WHERE id = ?", self._current)
-        # The newest number is used again; before later samples a gap remains.
+        # The number of the newest sample is reused. An older sample leaves a gap.
         if self._current == self._newest:
             self._newest -= 1
         self._write(self._db.commit)
         self._current = self._last
 
     def mark(self) -> int:
-        """Count and commit one more try of the last sample; return the number of tries."""
+        """Increment and commit the number of tries of the last sample, and return it."""
         self._execute(
             "INSERT INTO tries VALUES (?, 1) ON CONFLICT (id) DO UPDATE SET number = number + 1",
             self._current,
@@ -310,14 +310,14 @@ class Journal:
         return int(self._one("SELECT number FROM tries WHERE id = ?", self._current))
 
     def unmark(self) -> None:
-        """Count one try of the last sample less: it was interrupted, and the process is well."""
+        """Decrement the tries of the last sample: its step was interrupted, without a crash."""
         self._execute("UPDATE tries SET number = number - 1 WHERE id = ?", self._current)
         self._write(self._db.commit)
 
     def append(self, record: Record, /, number: int | None = None) -> None:
-        """Keep the estimate of a sample; default the last that `accept` or `samples` has returned.
+        """Store the estimate of a sample; default: the last sample of `accept` or `samples`.
 
-        An estimate that was kept before a crash is left unchanged.
+        An estimate that was stored before a crash is left unchanged.
         """
         number = self._current if number is None else number
         found = (record.numbers, record.innovation, record.validation_error)
@@ -336,15 +336,15 @@ class Journal:
         self._last = number
 
     def keep(self, snapshot: Snapshot, number: int | None = None) -> None:
-        """Keep the fields of a sample; those of the last one (None) until `rewind` deletes them."""
+        """Store the fields of a sample; without a number, of the last one, until `rewind`."""
         last, number = number is None, self._last if number is None else number
-        # Fields that are kept for good must not become temporary because they are the last, too.
+        # Permanent fields must not become temporary because they are also the last fields.
         conflict = "ON CONFLICT (id) DO UPDATE SET last = excluded.last, "
         conflict += "content = excluded.content, crc = excluded.crc WHERE last > excluded.last"
         self._insert("fields", number, int(last), snapshot.to_bytes(), conflict=conflict)
 
     def checkpoint(self, state: bytes) -> None:
-        """Keep the identifier's state after the last estimated sample, and commit."""
+        """Store the identifier's state after the last estimated sample, and commit."""
         self._insert("checkpoints", self._last, state, verb=UNLESS_KNOWN)
         # The older checkpoint is kept because `rewind` needs it if the newer one is damaged.
         self._execute(
@@ -355,17 +355,17 @@ class Journal:
         self._write(self._db.commit)
 
     def commit(self, position: str | None = None) -> None:
-        """Commit: readers see all records until now, and they survive a kill of the process.
+        """Commit, so that readers see all records and these survive a kill of the process.
 
-        `position` is that of the source now, if it has delivered unusable rows since then.
+        `position`: position of the source, if it has delivered unusable rows since the last sample.
         """
         if position is not None:
-            # With the number of the sample, since the position of any later sample supersedes it.
+            # The number of the sample is stored too, since a later sample supersedes the position.
             self._say("position", json.dumps([self.accepted, position]))
         self._write(self._db.commit)
 
     def rollback(self) -> None:
-        """Forget all records since the last commit."""
+        """Discard all records since the last commit."""
         self._write(self._db.rollback)
         self._stand()
 
@@ -374,32 +374,32 @@ class Journal:
         self._insert("meta", key, value, verb="REPLACE")
 
     def say_health(self, why: str) -> None:
-        """Store and commit the reason why the run is not well; empty if it is."""
+        """Store and commit the reason why the run is unhealthy; empty if it is healthy."""
         self._say("health", why[:LONGEST].encode(errors="replace").decode())
         self._write(self._db.commit)
 
     def judge(self, verdict: Mapping[str, Any]) -> None:
-        """Store the verdict on the run so far, as `Verdict.to_dict` returns it."""
+        """Store the verdict on the run so far, see `Verdict.to_dict`."""
         self._insert("verdicts", 1, json.dumps(verdict), verb="REPLACE")
 
     @property
     def verdict(self) -> str:
-        """The verdict that was kept last, as JSON; empty before any."""
+        """The last stored verdict as JSON, or an empty string."""
         rows = self._sound("verdicts", self._read("SELECT * FROM verdicts"))
         return str(rows[0][1]) if rows else ""
 
     def note(self, event: Event) -> None:
-        """Keep an event; one that was kept before a crash is not kept twice."""
+        """Store an event unless it was stored before a crash."""
         message = event.message[:LONGEST].encode(errors="replace").decode()
-        told = (float(event.t), event.kind, event.channel, message)
+        row = (float(event.t), event.kind, event.channel, message)
         self._execute(
             f"{UNLESS_KNOWN} INTO events (t, kind, channel, message, crc) VALUES (?, ?, ?, ?, ?)",
-            *told,
-            checksum("events", *told),
+            *row,
+            checksum("events", *row),
         )
 
     def count(self, kind: str, channel: str = "", number: int = 1) -> None:
-        """Add to the count of a kind of remark that does not deserve an event each time."""
+        """Increase the count of a kind of remark that is too frequent for an event each time."""
         known = "SELECT number FROM counts WHERE kind = ? AND channel = ?"
         before = self._read(known, kind, channel)
         total = number + (int(before[0][0]) if before else 0)
@@ -417,7 +417,7 @@ class Journal:
         raise RunError(f"{self.path} is not a journal of this version of livepde: {AGAIN}.")
 
     def _sound(self, table: str, rows: Iterable[Sequence[Any]]) -> list[Any]:
-        """Verify the checksums of records, and return the records without them."""
+        """Verify the checksums of records; return the records without their checksums."""
         found = []
         for *values, crc in rows:
             if checksum(table, *values) != crc:
@@ -427,12 +427,12 @@ class Journal:
 
     @property
     def health(self) -> str:
-        """Reason why the run is not well, as last stored by its writer; empty if it is."""
+        """Reason why the run is unhealthy, as last stored by its writer; empty if healthy."""
         return self._meta().get("health", "")
 
     @property
     def in_place(self) -> bool:
-        """Whether the path still names the opened file, not a deleted or replaced one."""
+        """Whether the path still refers to the opened file, which was not deleted or replaced."""
         if self._file is None:
             return True
         try:
@@ -443,7 +443,7 @@ class Journal:
 
     @property
     def accepted(self) -> int:
-        """Number of the last accepted sample, 0 before any."""
+        """Number of the last accepted sample, or 0."""
         return self._highest("samples")
 
     @property
@@ -453,26 +453,26 @@ class Journal:
 
     @property
     def pending(self) -> int:
-        """Number of accepted samples after the last estimated one."""
+        """Number of accepted samples after the last estimated sample."""
         return int(self._one("SELECT COUNT(*) FROM samples WHERE id > ?", self._last))
 
     @property
     def first(self) -> Taken | None:
-        """The first accepted sample, from which the run begins; None before any."""
+        """The first accepted sample, with which the run begins, or None."""
         return next(self._samples("ORDER BY id LIMIT 1"), None)
 
     @property
     def last(self) -> float:
-        """Time of the last accepted sample, -inf before any."""
+        """Time of the last accepted sample, or -inf."""
         last = next(self._samples("ORDER BY id DESC LIMIT 1"), None)
         return -np.inf if last is None else last.t
 
     def recent(self, count: int) -> list[Taken]:
-        """Return the last accepted samples, oldest first."""
+        """Return the last `count` accepted samples, oldest first."""
         return [*self._samples("ORDER BY id DESC LIMIT ?", count)][::-1]
 
     def between(self, low: float, high: float) -> list[tuple[float, dict[str, float]]]:
-        """Return the first few samples between two times."""
+        """Return times and values of the samples between two times, at most `FEW`."""
         start = self._number_at(low)
         found = self._samples("WHERE id >= ? ORDER BY id LIMIT ?", start, FEW)
         return [(one.t, one.values) for one in found if one.t <= high]
@@ -484,13 +484,13 @@ class Journal:
         return np.array([one.t for one in found]), values.reshape(len(found), len(names))
 
     def values(self, first: int, last: int) -> Iterator[tuple[int, dict[str, float]]]:
-        """Iterate over numbers and values of the samples from one to another."""
+        """Iterate over the samples numbered `first` to `last`, with their numbers and values."""
         for one in self._samples("WHERE id BETWEEN ? AND ? ORDER BY id", first, last):
             yield one.id, one.values
 
     def _number_at(self, t: float) -> int:
         """Return the number of the first sample not earlier than a time, by bisection."""
-        # Times are sorted but have no index, so bisection by the primary key is the short way.
+        # Times are sorted but have no index, so bisection over the primary key is fastest.
         low, high = 0, self._newest + 1
         while low < high:
             middle = (low + high) // 2
@@ -503,7 +503,7 @@ class Journal:
 
     @property
     def position(self) -> str:
-        """Position of the source after the last accepted sample and the unusable rows after it."""
+        """Position of the source after the last accepted sample and any unusable rows after it."""
         rows = self._sound("samples", self._read("SELECT * FROM samples ORDER BY id DESC LIMIT 1"))
         last, _, _, position = rows[0] if rows else (0, 0.0, b"", "")
         with sound(self.path):
@@ -511,30 +511,30 @@ class Journal:
             return str(later if after == last else position)
 
     def rewind(self) -> bytes | None:
-        """Return the last intact checkpoint, None if there is none.
+        """Return the state of the last intact checkpoint, or None.
 
-        `samples` then yields the samples after it, which have to be taken again.
+        `samples` then yields the samples after the checkpoint, which have to be processed again.
         """
         numbers = [n for (n,) in self._read("SELECT id FROM checkpoints ORDER BY id DESC")]
-        number, state = 0, None  # without a checkpoint all samples are taken again
+        number, state = 0, None  # defaults: all samples are processed again
         for one in numbers:
             state = self._state(one)
             if state is not None:
                 number = one
                 break
-            # A damaged one is deleted, since its number may be needed for a new checkpoint.
+            # A damaged checkpoint is deleted, since its number may be needed for a new one.
             self._execute("DELETE FROM checkpoints WHERE id = ?", one)
         if state is None and numbers and ("thinned" in self._meta() or self.first is None):
             raise RunError(damaged(self.path, "no checkpoint is as it was"))
         if numbers and number < numbers[0]:
             LOG.warning("%s: the newest checkpoint is damaged: went back further", self.path)
-        self._execute("DELETE FROM fields WHERE last")  # later samples will have others
+        self._execute("DELETE FROM fields WHERE last")  # fields of the last sample
         self._write(self._db.commit)
         self._last = self._current = int(number)
         return state
 
     def _state(self, number: int) -> bytes | None:
-        """Return the state of a checkpoint, None if it is damaged."""
+        """Return the state of a checkpoint, or None if it is damaged."""
         try:
             rows = self._read("SELECT * FROM checkpoints WHERE id = ?", number)
             ((_, state),) = self._sound("checkpoints", rows)
@@ -544,7 +544,7 @@ class Journal:
 
     def samples(self) -> Iterator[Taken]:
         """Iterate over the samples after the last estimated one."""
-        # One query for each sample: between two of them the caller writes estimates, and may
+        # One query for each sample, since the caller writes estimates between two samples, and may
         # withdraw a sample.
         next_one = "WHERE id > ? ORDER BY id LIMIT 1"
         while found := next(self._samples(next_one, self._current), None):
@@ -552,7 +552,7 @@ class Journal:
             yield found
 
     def taken(self) -> Iterator[Taken]:
-        """Iterate over all accepted samples that are kept."""
+        """Iterate over all stored samples."""
         number = 0
         while found := [*self._samples("WHERE id > ? ORDER BY id LIMIT ?", number, TOGETHER)]:
             yield from found
@@ -569,7 +569,7 @@ class Journal:
             yield taken
 
     def _named(self, row: Sequence[float]) -> dict[str, float]:
-        """Return the values of a sample by name: all channels, and the noise of some."""
+        """Return the values of a sample by name: of all channels, and noise where it is known."""
         values = dict(zip(self.channels, row, strict=False))
         noise = zip(self.noise, row[len(self.channels) :], strict=False)
         return values | {name: std for name, std in noise if not math.isnan(std)}
@@ -581,7 +581,7 @@ class Journal:
         return (record for _, record in self.after(0))
 
     def after(self, number: int) -> Iterator[tuple[int, Record]]:
-        """Iterate over the estimates of the samples after one, with their numbers."""
+        """Iterate over the estimates after the sample `number`, with the numbers of samples."""
         if not number:
             check_file(self.path, self._db)
         while True:
@@ -593,7 +593,7 @@ class Journal:
                 return
 
     def _estimate(self, row: Sequence[Any]) -> Record:
-        """Return an estimate with its fields, after verifying both checksums."""
+        """Return an estimate with its fields, after verification of both checksums."""
         ((number, t, status, steps, numbers, notes),) = self._sound("estimates", [row[:7]])
         content = None
         if row[9] is not None:
@@ -619,7 +619,7 @@ class Journal:
             )
 
     def dataset(self) -> xr.Dataset:
-        """Return the estimates as a dataset; see `Result.to_xarray`."""
+        """Return the estimates as a dataset, see `Result.to_xarray`."""
         records = RecordArrays.of(self)
         with sound(self.path):
             data = self.layout.dataset(records)
@@ -629,14 +629,14 @@ class Journal:
 
     @property
     def events(self) -> list[Event]:
-        """All events, in the order in which they happened."""
+        """All events in chronological order."""
         rows = self._read("SELECT t, kind, channel, message, crc FROM events ORDER BY id")
         with sound(self.path):
             return [Event(float(t), *map(str, words)) for t, *words in self._sound("events", rows)]
 
     @property
     def counts(self) -> dict[tuple[str, str], int]:
-        """(kind, channel) -> number of remarks."""
+        """Number of remarks for each (kind, channel)."""
         rows = self._sound("counts", self._read("SELECT * FROM counts ORDER BY kind, channel"))
         with sound(self.path):
             return {(str(kind), str(channel)): int(number) for kind, channel, number in rows}
@@ -644,12 +644,12 @@ class Journal:
     # --- bounded growth ------------------------------------------------------------------------
 
     def thin(self, before: float, every: int) -> None:
-        """Keep one in `every` of the estimates before a time, and none of its samples and fields.
+        """Delete old samples and fields, and keep one in `every` estimates before a time.
 
-        All records needed for recovery after a crash are kept: the first sample, and all from the
-        older checkpoint on. Of events the last 10 000 are kept.
+        All records needed for recovery after a crash are kept: the first sample, and all records
+        from the older checkpoint on. The last 10 000 events are kept.
         """
-        # If the newer checkpoint is damaged, samples are taken again from the older one on.
+        # If the newer checkpoint is damaged, the run restarts from the older one.
         safe = self._one("SELECT COALESCE(MIN(id), 0) FROM checkpoints")
         recent = self._read("SELECT id FROM samples WHERE t >= ? ORDER BY id LIMIT 1", before)
         end = min(safe, recent[0][0]) if recent else safe
@@ -663,7 +663,7 @@ class Journal:
         self._execute(
             "DELETE FROM events WHERE id <= (SELECT MAX(id) FROM events) - ?", KEPT_EVENTS
         )
-        if end:  # without a whole checkpoint the run cannot begin again from its first sample
+        if end:  # the run cannot be repeated from its first sample: it needs an intact checkpoint
             self._say("thinned", str(end))
         self._write(self._db.commit)
         self._thinned = max(self._thinned, end)
