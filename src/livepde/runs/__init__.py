@@ -1,4 +1,4 @@
-"""Runs: the loop that executes them, their outcomes, journals and run directories."""
+"""Runs: the run loop, outcomes, journals and run directories."""
 
 from livepde.diagnostics.check_report import Check, Table
 from livepde.runs.backlog import Backlog, Retention, Sink

@@ -1,10 +1,10 @@
-"""The run directory: the outcome of a run, its files, their writer and their reader.
+"""The run directory: outcome of a run, and writer and reader of its files.
 
 ::
 
     RUN/run.json          version, command, status, checks, hash of the case
     RUN/case.toml         a copy of the case
-    RUN/journal.sqlite    samples and estimates as they arrive; survives a kill
+    RUN/journal.sqlite    samples and estimates, written during the run; survives a kill
     RUN/estimates.nc      the dataset (netCDF 3: any netCDF reader opens it)
     RUN/checkpoint.bin    the identifier's state
     RUN/report.md         tables
@@ -47,18 +47,18 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 FigureFactory: TypeAlias = Callable[[], Any]
-"""Returns a matplotlib Figure; called only when somebody wants to see it."""
+"""Function that returns a matplotlib Figure; called only when the figure is needed."""
 FORMAT = 2
-RUNS = "runs"  # where the command line puts them
+RUNS = "runs"  # folder in which the command line creates run directories
 RECORD, CASE, ESTIMATES = "run.json", "case.toml", "estimates.nc"
 CHECKPOINT, REPORT = "checkpoint.bin", "report.md"
 JOURNAL = "journal.sqlite"
-LONGEST = 10_000_000  # bytes of a record
-# Digests of what is read back: of the record itself, of the copy of the case, and of the estimates.
-# The last are several while the file is replaced, so that a kill leaves a file with its digest.
+LONGEST = 10_000_000  # largest size of a record in bytes
+# Keys of the digests of the record itself, of the copy of the case and of the estimates. While the
+# estimates are replaced, the record has the digests of both files: after a kill, one of them fits.
 OWN, COPY, CONTENT = "sha256", "case_copy_sha256", "estimates_sha256"
-MARKUP = re.compile("<(?=[A-Za-z/!?])")  # of HTML: titles and notes bring none along
-WRITTEN_LATER = (".md", ".png")  # by who looks at a run, which need not be his own
+MARKUP = re.compile("<(?=[A-Za-z/!?])")  # start of HTML markup, escaped in reports
+WRITTEN_LATER = (".md", ".png")  # files that a reader of another user's run may write
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class Outcome:
     tables, checks, notes
         Printed parts, in this order.
     dataset
-        The run, as `Result.to_xarray()` gives it.
+        Dataset of the run, see `Result.to_xarray`.
     figures
         File name without suffix -> function that draws a matplotlib figure.
     """
@@ -83,7 +83,7 @@ class Outcome:
 
     @property
     def ok(self) -> bool:
-        """True if every check is."""
+        """True if all checks pass."""
         return all(check.ok for check in self.checks)
 
     def to_dict(self) -> dict[str, Any]:
@@ -96,16 +96,16 @@ class Outcome:
 
 
 def attempted(what: str, compute: Callable[[], T], otherwise: T, notes: list[str]) -> T:
-    """Return the value of a computation, or `otherwise` and a note with the reason if it fails.
+    """Return the value of a computation; if it fails, return `otherwise` and add a note.
 
-    A run keeps its data even if one of its diagnostics fails. `OSError`, and so `RunError`
-    (a directory that cannot be written), is raised.
+    A run keeps its data even if one of its diagnostics fails. `OSError` is raised, and so is its
+    subclass `RunError`, for a directory that cannot be written.
     """
     try:
         return compute()
     except OSError:
         raise
-    except Exception as error:  # noqa: BLE001  whatever it is, it is told
+    except Exception as error:  # noqa: BLE001  the note reports it
         reason = str(error).split("\n", 1)[0].rstrip(".") or "no reason given"
         notes.append(
             f"{what} failed ({type(error).__name__}: {reason[:200]}); everything else is complete."
@@ -114,7 +114,7 @@ def attempted(what: str, compute: Callable[[], T], otherwise: T, notes: list[str
 
 
 def free_path(wanted: Path) -> Path:
-    """Return a path that does not exist yet: the wanted one, or with a number appended."""
+    """Return the wanted path, with a number appended if that path exists."""
     path, number = wanted, 2
     while path.exists():
         path = wanted.with_name(f"{wanted.name}-{number}")
@@ -123,7 +123,7 @@ def free_path(wanted: Path) -> Path:
 
 
 def refuse_taken(path: Path) -> None:
-    """Raise `RunError` unless a run may be written here: a folder that is new or empty."""
+    """Raise `RunError` unless the path is free or an empty folder."""
     if not path.exists():
         return
     if not path.is_dir():
@@ -134,7 +134,7 @@ def refuse_taken(path: Path) -> None:
 
 
 def _only_begun(path: Path, case: str) -> bool:
-    """Return whether a kill or a full disk has interrupted the creation of this run directory."""
+    """Return whether a kill or a full disk interrupted the creation of this run directory."""
     names = {item.name for item in path.iterdir()} if path.is_dir() else set()
     names = {name for name in names if not name.endswith(PARTIAL)}
     if names != {CASE}:
@@ -143,8 +143,8 @@ def _only_begun(path: Path, case: str) -> bool:
 
 
 def _nearest(folder: Path) -> str:
-    """Return a hint on the nearest run directory: below the folder, next to it, or in runs/."""
-    if folder.is_file():  # a case, or a file of a run
+    """Return a hint at the nearest run directory: below the folder, next to it, or in runs/."""
+    if folder.is_file():  # a case, or a file in a run directory
         folder = folder.parent
     near = difflib.get_close_matches(folder.name, run_names(folder.parent), n=1)
     likely = [folder.parent / name for name in near]
@@ -162,7 +162,7 @@ def run_names(folder: Path) -> list[str]:
 
 @contextmanager
 def _room_to_write(folder: Path) -> Iterator[None]:
-    """Turn an `OSError` of writing into a folder into a `RunError` with the remedy."""
+    """Convert an `OSError` from writing into a folder to a `RunError` with the remedy."""
     try:
         yield
     except RunError:
@@ -174,7 +174,7 @@ def _room_to_write(folder: Path) -> Iterator[None]:
 
 @dataclass(eq=False, repr=False)
 class RunWriter:
-    """Writer of a run directory: a new or empty folder, or that of a run to resume."""
+    """Writer of a run directory: a new or empty folder, or the folder of a run to resume."""
 
     path: Path
     record: dict[str, Any]
@@ -191,23 +191,23 @@ class RunWriter:
         settings: Sequence[str] = (),
         original: str | None = None,
     ) -> RunWriter:
-        """Make the directory with its record and a copy of the case.
+        """Create the directory with its record and a copy of the case.
 
         Parameters
         ----------
         path, version, command, title
             The directory, and the entries of its record.
         case
-            The case as it is run.
+            Text of the case, which is copied.
         settings
             Overrides of keys of the case, 'key=value'.
         original
-            The case file as it stands, if that is another text.
+            Content of the case file, if it differs from `case`.
 
         Raises
         ------
         RunError
-            The directory exists and is not empty, or cannot be made.
+            The directory exists and is not empty, or cannot be created.
         """
         try:
             if not _only_begun(path, case or ""):
@@ -225,7 +225,7 @@ class RunWriter:
                 record |= _written_case(path, case, original or case)
             if settings:
                 record["settings"] = list(settings)
-            # The record comes last: a folder without one has only begun to be made.
+            # The record is written last: a folder without a record is incomplete.
             writer = cls(path, record)
             writer._save_record()
         except RunError:
@@ -245,18 +245,18 @@ class RunWriter:
         settings: Sequence[str],
         original: str | None = None,
     ) -> RunWriter:
-        """Return the writer of a run that ended early, to go on with it.
+        """Return the writer of a run that ended early, to resume it.
 
-        The case may have another `intake.shift` than before, which is kept from now on.
+        The case may have a different `intake.shift`, which then replaces the stored value.
 
-        Raises `RunError`: there is no such run, or it was of another case.
+        Raises `RunError`: there is no such run, or its case, settings or data differ.
         """
         run = open_run(path)
         for item in path.iterdir():
             if item.is_symlink():
                 raise RunError(f"{item} is a link: a run is resumed in regular files only.")
         run.refuse_other(command, case, settings)
-        for left in filter(Path.is_file, path.glob(f"*{PARTIAL}")):  # by one that was killed
+        for left in filter(Path.is_file, path.glob(f"*{PARTIAL}")):  # of a killed process
             left.unlink(missing_ok=True)
         begun = {"at": _now(), "livepde": version}
         changed: dict[str, Any] = {}
@@ -281,7 +281,7 @@ class RunWriter:
         notes: Iterable[str] = (),
         figures: Mapping[str, FigureFactory] | None = None,
     ) -> None:
-        """Write the results of a run: dataset, checkpoint, report and record; figures last."""
+        """Write the results of a run: dataset, checkpoint, report and record, then figures."""
         shown, checks, notes = list(shown), list(checks), list(notes)
         title = str(self.record["title"])
         with _room_to_write(self.path):
@@ -297,7 +297,7 @@ class RunWriter:
                 self._report(markdown(title, shown, checks, notes, drawn), checks, notes)
 
     def _write_estimates(self, dataset: xr.Dataset) -> None:
-        """Write the dataset, and its digest before it takes its place and after."""
+        """Write the dataset, with its digest in the record before the old file is replaced."""
         with replacing(self.path / ESTIMATES) as partial:
             _to_netcdf(with_epoch(dataset), partial)
             new = hashlib.sha256(partial.read_bytes()).hexdigest()
@@ -319,14 +319,14 @@ class RunWriter:
 
 @dataclass(eq=False, repr=False)
 class Run:
-    """A run that was written; open one with `livepde.runs.open(path)`."""
+    """Reader of a run directory; `livepde.runs.open(path)` returns one."""
 
     path: Path
     record: dict[str, Any]
 
     @property
     def status(self) -> str:
-        """running, finished, interrupted or failed."""
+        """Status of the run: running, finished, interrupted or failed."""
         return str(self.record.get("status", ""))
 
     @property
@@ -341,7 +341,7 @@ class Run:
 
     @property
     def checks(self) -> list[Check]:
-        """Checks as they were when the run ended."""
+        """Checks of the run, evaluated when it ended."""
         found = []
         try:
             for item in self.record.get("checks", []):
@@ -354,16 +354,16 @@ class Run:
 
     @cached_property
     def dataset(self) -> xr.Dataset:
-        """Estimates over time, as `Result.to_xarray` gave them."""
+        """Estimates over time, see `Result.to_xarray`."""
         path = self.path / ESTIMATES
         journal = self.path / JOURNAL
         if journal.is_file() and (self.status == "running" or not path.is_file()):
             with Journal.open(journal) as kept:
                 return kept.dataset()
         if not path.is_file():
-            told = "".join(f" {note}" for note in self.notes)
+            notes = "".join(f" {note}" for note in self.notes)
             raise RunError(
-                f"{self.path} contains no estimates; its status is '{self.status}'.{told}"
+                f"{self.path} contains no estimates; its status is '{self.status}'.{notes}"
             )
         import xarray as xr
 
@@ -371,7 +371,7 @@ class Run:
             content = path.read_bytes()
             if hashlib.sha256(content).hexdigest() not in self.record.get(CONTENT, []):
                 raise ValueError("its content has changed since it was written")
-            # What is written here decodes in silence: a warning tells of bytes that changed.
+            # Files of `write_dataset` decode without warnings: a warning indicates changed bytes.
             with warnings.catch_warnings(action="error", category=xr.SerializationWarning):
                 raw = io.BytesIO(content)
                 return without_epoch(xr.load_dataset(raw, engine="scipy", decode_times=False))
@@ -393,10 +393,10 @@ class Run:
     def case_file(self) -> Path:
         """Return the case file to run again: the original if it is unchanged, else the copy.
 
-        Data files are named relative to the case, so the copy in the run directory serves only if
-        the original is gone or has changed; then the data must be given.
+        Data files are named relative to the case. If the original is missing or has changed, the
+        copy in the run directory is used, and the user has to specify the data.
 
-        Raises `RunError`: the run was not made from a case (a reproduction), or its case is gone.
+        Raises `RunError`: the run has no case (a reproduction), or the copy of the case is changed.
         """
         copy = self.path / CASE
         if not copy.is_file():
@@ -418,12 +418,12 @@ class Run:
 
     @property
     def settings(self) -> list[str]:
-        """Overrides of keys of the case, 'key=value'."""
+        """Overrides of keys of the case, each 'key=value'."""
         return [str(item) for item in self.record.get("settings", [])]
 
     @property
     def data_file(self) -> str | None:
-        """The file that --data named for the run; None: the case's own, or standard input."""
+        """Data file of the option --data; None for the data of the case or standard input."""
         return _data_of(self.record.get("command", []))
 
     def refuse_other(self, command: Sequence[str], case: str, settings: Sequence[str]) -> None:
@@ -432,7 +432,7 @@ class Run:
         if not (self.path / CASE).is_file() or not begun:
             raise RunError(f"{self.path} has no case and journal: it cannot be resumed.")
         kept = (self.path / CASE).read_text(encoding="utf-8", errors="replace")
-        # The correction of a clock may be another one.
+        # The correction of a clock may change.
         begun_with, now = (
             [one for one in given if one.partition("=")[0].strip() != "intake.shift"]
             for given in (self.settings, settings)
@@ -455,12 +455,12 @@ class Run:
             )
 
     def arrivals(self) -> list[Table]:
-        """Return the table of rows that were irregular, if any; of a run with a journal."""
+        """Return the table of irregular rows of a run with a journal, if there are any."""
         with self.reading() as journal:
             return [] if journal is None else arrivals(journal)
 
     def summary(self) -> list[Table]:
-        """Return its tables: verdict, estimates ± standard deviation, errors of each channel."""
+        """Return tables of the verdict, the estimates, the errors of each channel, and others."""
         data = self.dataset
         judged = [verdict_table(verdict(data))] if data.sizes["time"] else []
         return [*judged, *tables(data)]
@@ -469,8 +469,7 @@ class Run:
 def open_run(path: str | os.PathLike[str]) -> Run:
     """Open a run directory.
 
-    Raises `RunError`: there is no run, its record is damaged, or its report is a link to another
-    file.
+    Raises `RunError`: there is no run, its record is damaged, or a report or figure is a link.
     """
     folder = Path(path)
     for page in folder.glob("*"):
@@ -503,7 +502,7 @@ def _stored_record(folder: Path) -> Any:
 
 
 def drawn_into(folder: Path, figures: Mapping[str, FigureFactory], notes: list[str]) -> list[str]:
-    """Draw figures into a folder; return their file names. A failure becomes a note."""
+    """Draw figures into a folder and return their file names; add a note for each failure."""
     drawn = []
     for name, draw in figures.items():
         file = f"{name}.png"
@@ -518,18 +517,18 @@ def drawn_into(folder: Path, figures: Mapping[str, FigureFactory], notes: list[s
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file; it appears whole or not at all, and replaces a link."""
+    """Write a text file atomically; a link at the path is replaced."""
     write_bytes(path, text.encode())
 
 
 def write_dataset(data: xr.Dataset, path: Path) -> None:
-    """Write a dataset as netCDF 3; the file appears whole or not at all."""
+    """Write a dataset as netCDF 3, atomically."""
     with replacing(path) as partial:
         _to_netcdf(data, partial)
 
 
 def _to_netcdf(data: xr.Dataset, path: Path) -> None:
-    # netCDF 3 knows no dimension without members.
+    # netCDF 3 has no fixed dimension of size zero.
     empty = [name for name, size in data.sizes.items() if size == 0 and name != "time"]
     kept = data.drop_dims(empty)
     kept.attrs = {key: plain(value) for key, value in data.attrs.items()}
@@ -542,7 +541,7 @@ def _digest(record: Mapping[str, Any]) -> str:
 
 
 def _written_case(path: Path, case: str, original: str) -> dict[str, str]:
-    """Write the copy of the case; return its digest and that of the original for the record."""
+    """Write the copy of the case; return its digest and the digest of the original."""
     write_text(path / CASE, case)
     texts = {"case_sha256": original, COPY: case}
     return {key: hashlib.sha256(text.encode()).hexdigest() for key, text in texts.items()}
@@ -580,7 +579,7 @@ def markdown(
 
 
 def plain(value: Any) -> Any:
-    """Return a value for JSON: NaN and infinity become null, NumPy numbers plain ones."""
+    """Return a value for JSON: NaN and infinity become None, NumPy scalars become numbers."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -606,7 +605,7 @@ def _now() -> str:
 
 
 def _data_of(command: Sequence[Any]) -> str | None:
-    """Return the file that --data names in a command; None for standard input, too."""
+    """Return the file of the option --data in a command; None without one or for '-'."""
     words = [str(word) for word in command]
     for k, word in enumerate(words):
         if word.startswith("--data="):

@@ -1,4 +1,4 @@
-"""The loop of a run: every sample through the identifier, until the stream or the user ends it."""
+"""Run an identifier on a stream until the stream ends or the user interrupts it."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class Driven:
     result
         Estimates so far.
     journal
-        The journal that holds samples and estimates.
+        Journal of the samples and estimates.
     status
         "finished", "interrupted" (Ctrl-C) or "failed" (a sample that cannot be used).
     error
-        Reason of the failure.
+        Error that made the run fail.
     """
 
     result: Result
@@ -45,11 +45,11 @@ class Driven:
 
 @contextmanager
 def stopped_by_signals(stopping: threading.Event, busy: Callable[[], bool]) -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM set an event; when idle, or the second time, raise at once.
+    """Set an event on Ctrl-C or SIGTERM, so that the current step is completed.
 
-    Raises `KeyboardInterrupt`: while no step is computed, or at the second signal.
+    Raises `KeyboardInterrupt`: at a signal while `busy()` is false, or at the second signal.
     """
-    # Python allows handlers of signals in the main thread only.
+    # Python allows signal handlers in the main thread only.
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -68,12 +68,12 @@ def stopped_by_signals(stopping: threading.Event, busy: Callable[[], bool]) -> I
 
 
 def conduct(live: Live, *, patient: bool = False) -> Driven:
-    """Run until the source or a signal ends it; samples and estimates are kept in any case.
+    """Run until the source ends or a signal arrives; samples and estimates are kept in any case.
 
     Parameters
     ----------
     patient
-        The source never blocks for long: a signal is heard when it has answered.
+        The source never blocks for long, so a signal may wait until a poll of it has ended.
     """
     driven = Driven(live.result, live.journal)
     with stopped_by_signals(live.stopping, lambda: patient or live.ailments.busy):
@@ -99,18 +99,18 @@ def drive(
     fields_every: int = 1,
     journal: Journal | None = None,
 ) -> Driven:
-    """Run an identifier on a stream; return the estimates so far also if it ends early.
+    """Run an identifier on a stream; estimates are returned even if the run ends early.
 
     Parameters
     ----------
     progress
-        Show a bar with rate and time left, on a terminal.
+        Show a progress bar with rate and remaining time on a terminal.
     total
-        Number of samples, for the time left.
+        Number of samples, from which the remaining time is estimated.
     fields_every
-        Keep fields of every so many samples.
+        Interval, in samples, at which fields are kept.
     journal
-        The journal to write, and to continue if it holds samples; default: a new one in memory.
+        Journal to write, continued if it contains samples; default: a new journal in memory.
     """
     from livepde.progress import watched
 
@@ -127,16 +127,16 @@ def drive(
 
 
 def journal_of(identifier: Identifier, path: Path | None = None) -> Journal:
-    """Return a new journal for the samples and estimates of an identifier; no path: in memory."""
+    """Return a new journal for an identifier, in a file or, without a path, in memory."""
     model, observed = identifier.model, identifier.observed
     layout = layout_of(model, observed, identifier.validation, identifier.ignored)
     return Journal.create(path, identifier.channels, layout)
 
 
 def _ends(stream: Any) -> bool:
-    """Return whether a stream is finite: a live one has no length."""
+    """Return whether a stream is finite: a live stream has no length."""
     try:
         len(stream)
-    except TypeError:  # of it, or of a stream that it wraps
+    except TypeError:  # raised by the stream, or by a stream that it wraps
         return False
     return True

@@ -1,7 +1,7 @@
-"""A run in the formats of other programs: netCDF, Zarr, CSV, Parquet, XDMF and VTK.
+"""Export of a run to the formats of other programs: netCDF, Zarr, CSV, Parquet, XDMF and VTK.
 
-A run's dataset has the names and units of the model. An exported one follows the CF conventions
-(units that UDUNITS reads, times with their date, ancillary variables) and UGRID for the mesh.
+The dataset of a run has the names and units of the model. An exported dataset follows the CF
+conventions (units for UDUNITS, times with a date, ancillary variables), and UGRID for the mesh.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from livepde.runs.directory import Run, plain, write_dataset
 from livepde.units import NOT_A_UNIT, parsed_unit, pint_registry
 
 CONVENTIONS = "CF-1.11"
-BESIDE = {  # end of a name -> what such a variable says of the one without it
+BESIDE = {  # suffix of a name -> long name of the variable, given the name without the suffix
     "_std": "standard deviation of {}",
     "_low": "lower end of the 95 % interval of {}",
     "_high": "upper end of the 95 % interval of {}",
@@ -49,7 +49,7 @@ LONG_NAMES = {
 DIFFERENCES = ("innovation", "validation_error")
 CLOCKS = ("time", "snapshot")
 NO_LEAPS = "leap_seconds: none"
-SYMBOLS = {  # of pint -> of UDUNITS, where they differ
+SYMBOLS = {  # unit symbol of pint -> symbol of UDUNITS, if they differ
     "°C": "degC",
     "°F": "degF",
     "Δ°C": "K",
@@ -58,7 +58,7 @@ SYMBOLS = {  # of pint -> of UDUNITS, where they differ
     "a": "year",
     "deg": "degree",
 }
-SCALES = ("degC", "degF")  # their zero is not zero
+SCALES = ("degC", "degF")  # units whose zero is not absolute zero
 Writer: TypeAlias = Callable[[Run, Path, float | None], object]
 NEEDS = {
     ".parquet": ["pyarrow"],
@@ -74,12 +74,11 @@ AT_ONE_TIME = (".vtu", ".vtk")
 class Kind:
     """A kind of mesh cell."""
 
-    # dimension, role: dimension of the mesh, and name of such a cell in UGRID
-    dimension: int
-    role: str
-    # Corners to which the edges lead from the first one, in an order that turns right-handed
+    dimension: int  # of the mesh
+    role: str  # name of such a cell in UGRID
+    # Corners that share an edge with the first corner, in right-handed order.
     edges: tuple[int, ...]
-    turned: tuple[int, ...]  # order of the corners that corrects a cell of the opposite orientation
+    turned: tuple[int, ...]  # permutation of the corners that reverses the orientation of a cell
 
 
 KINDS = {
@@ -92,7 +91,7 @@ KINDS = {
 
 @cache
 def udunits(unit: str) -> str | None:
-    """Return a unit as UDUNITS writes it; None for one that it has not, such as a root.
+    """Return a unit in the notation of UDUNITS; None if it has no such unit, such as a root.
 
     >>> udunits("m^2/s"), udunits("J/(m^3 K)"), udunits("degC"), udunits("")
     ('m2 s-1', 'J m-3 K-1', 'degC', '1')
@@ -108,7 +107,7 @@ def udunits(unit: str) -> str | None:
     if not all(power.is_integer() for power in parts.values()):
         return None
     words = []
-    # Positive powers come first: m2 s-1.
+    # Positive powers come first, as in m2 s-1.
     for name, power in sorted(parts.items(), key=lambda part: part[1] < 0.0):
         symbol = registry.get_symbol(name)
         symbol = SYMBOLS.get(symbol, symbol.replace("µ", "u"))
@@ -119,28 +118,28 @@ def udunits(unit: str) -> str | None:
 def cf(
     data: xr.Dataset, *, title: str = "", source: str = "livepde", history: str = ""
 ) -> xr.Dataset:
-    """Return a run's dataset with names, units and relations after the CF conventions.
+    """Return a run's dataset with names, units and relations that follow the CF conventions.
 
     Parameters
     ----------
     data
-        As `Result.to_xarray` gives it.
+        Dataset of the run, see `Result.to_xarray`.
     title, source, history
-        Global attributes; a title that the dataset has comes first.
+        Global attributes; the title of the dataset takes precedence over `title`.
 
     Returns
     -------
     Dataset
-        `time` and `snapshot` count from a date where the run has one, so that xarray opens them as
-        dates; units are as UDUNITS reads them; names consist of letters, digits and underscores,
-        and `long_name` holds the original name; standard deviations and ends of intervals are
-        `ancillary_variables`; a mesh in two or three dimensions follows UGRID. Of standard names
-        only those of the times: the others are of sea and air.
+        If the run has a date, `time` and `snapshot` count from it, so that xarray decodes them as
+        dates. Units have the notation of UDUNITS. Names consist of letters, digits and underscores;
+        `long_name` is the original name. Standard deviations and ends of intervals are
+        `ancillary_variables`. A mesh in two or three dimensions follows UGRID. Only times have
+        standard names, since CF defines the others for the atmosphere and the ocean.
     """
     found = bounded(data)
     names = free_names(map(str, found.variables))
     clock = str(data["time"].attrs.get("units", ""))
-    # Without a date, times are no time coordinate of CF, which counts from one: only the unit.
+    # A time coordinate of CF requires a date. Without a date, times have a unit only.
     counted = since(clock, data.attrs.get("origin"))
     about = _unit_attrs("time", clock)
     if counted:
@@ -175,11 +174,11 @@ def bounded(data: xr.Dataset) -> xr.Dataset:
 
 
 def free_names(wanted: Iterable[str]) -> dict[str, str]:
-    """Return name -> a unique name of letters, digits and underscores."""
+    """Map each name to a unique name of letters, digits and underscores."""
     found: dict[str, str] = {}
     for name in wanted:
         stem = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
-        # In CF a name begins with a letter.
+        # CF requires that a name begins with a letter.
         stem = stem if stem[:1].isalpha() else f"v{stem}"
         free, number = stem, 2
         while free in found.values():
@@ -189,7 +188,7 @@ def free_names(wanted: Iterable[str]) -> dict[str, str]:
 
 
 def _unit_attrs(name: str, own: str) -> dict[str, str]:
-    """Return the CF attributes of a variable in this unit."""
+    """Return the CF attributes of a variable with the unit `own`."""
     unit = udunits(own)
     if unit is None:
         return {"comment": f"unit: {own}"}
@@ -201,7 +200,7 @@ def _unit_attrs(name: str, own: str) -> dict[str, str]:
 
 
 def _relate(data: xr.Dataset, name: str, names: Mapping[str, str]) -> None:
-    """Name the variables beside a variable, such as its standard deviation, in its attributes."""
+    """List the ancillary variables of a variable, such as its standard deviation, as attribute."""
     beside = [names[other] for end in BESIDE if (other := f"{name}{end}") in data]
     if beside:
         data[name].attrs["ancillary_variables"] = " ".join(beside)
@@ -210,7 +209,7 @@ def _relate(data: xr.Dataset, name: str, names: Mapping[str, str]) -> None:
 def _describe(data: xr.Dataset, name: str, clock: Mapping[str, str]) -> None:
     """Set the CF attributes of a variable: long name, unit, axis and type of flags.
 
-    `clock`: attributes of times.
+    `clock`: attributes of time variables.
     """
     variable = data[name]
     attrs = variable.attrs
@@ -221,7 +220,7 @@ def _describe(data: xr.Dataset, name: str, clock: Mapping[str, str]) -> None:
             attrs["long_name"] = text.format(base)
             attrs.setdefault("units", "")
     if name in data.coords:
-        variable.encoding["_FillValue"] = None  # a coordinate is never missing
+        variable.encoding["_FillValue"] = None  # coordinates have no missing values
     own = attrs.pop("units", None)
     if name in CLOCKS:
         attrs |= clock
@@ -232,12 +231,12 @@ def _describe(data: xr.Dataset, name: str, clock: Mapping[str, str]) -> None:
 
 
 def kinds_of(data: xr.Dataset) -> list[str]:
-    """Return the kinds of cells that a dataset has."""
+    """Return the kinds of the cells in a dataset."""
     return [kind for kind in KINDS if kind in data and data[kind].dims == ("cell", "corner")]
 
 
 def oriented(data: xr.Dataset, kind: str) -> Any:
-    """Return the corners of each cell with positive orientation, which other programs expect."""
+    """Return the corners of each cell in positive orientation, which other programs expect."""
     corners = np.array(data[kind].values)
     about = KINDS[kind]
     axes = "xyz"[: about.dimension]
@@ -249,7 +248,7 @@ def oriented(data: xr.Dataset, kind: str) -> Any:
 
 
 def _add_topology(data: xr.Dataset, kind: str) -> None:
-    """Add the mesh topology of vertices and cells after UGRID."""
+    """Add the mesh topology of vertices and cells according to UGRID."""
     dimension, cell = KINDS[kind].dimension, KINDS[kind].role
     name = "mesh"
     while name in data:
@@ -276,14 +275,14 @@ def _add_topology(data: xr.Dataset, kind: str) -> None:
 
 
 def export(run: Run, target: Path, *, at: float | None = None, force: bool = False) -> None:
-    """Write a run in the format that the ending of a file names: see `FORMATS`.
+    """Write a run to a file atomically; its suffix determines the format, see `FORMATS`.
 
-    A run that is still in progress is exported up to now. The file is written atomically.
+    A run that is still in progress is exported up to now.
 
     Parameters
     ----------
     at
-        For formats of one time (`AT_ONE_TIME`): the fields nearest to this time; default the last.
+        Time at which fields are written in a format of one time (`AT_ONE_TIME`); default the last.
     force
         Replace an existing file.
 
@@ -292,7 +291,7 @@ def export(run: Run, target: Path, *, at: float | None = None, force: bool = Fal
     RunError
         The target exists; it cannot be written; there is nothing to write.
     ConfigurationError
-        There is no such format, or it needs a package that is not installed.
+        The format is unknown, or requires a package that is not installed.
     """
     check_target(target, FORMATS)
     ending = target.suffix.lower()
@@ -306,7 +305,7 @@ def export(run: Run, target: Path, *, at: float | None = None, force: bool = Fal
 
 
 def check_target(target: Path, known: Collection[str]) -> None:
-    """Raise `ConfigurationError` if a format is unknown, or needs a package that is missing."""
+    """Raise `ConfigurationError` if a format is unknown or its package is not installed."""
     ending = target.suffix.lower()
     if ending not in known:
         raise ConfigurationError(
@@ -316,7 +315,7 @@ def check_target(target: Path, known: Collection[str]) -> None:
 
 
 def need(target: Path, packages: Iterable[str], extra: str = "formats") -> None:
-    """Raise `ConfigurationError` if a package is missing that writes such a file."""
+    """Raise `ConfigurationError` if a required package is not installed."""
     import importlib.util
 
     for name in packages:
@@ -327,10 +326,10 @@ def need(target: Path, packages: Iterable[str], extra: str = "formats") -> None:
 
 
 def into_place(target: Path, write: Callable[[Path], object], *, force: bool = False) -> None:
-    """Write a file or folder next to its target, and move it there when it is complete.
+    """Write a file or folder in a temporary folder, and move it to the target when complete.
 
-    `write`: called with a temporary path of the same name; files written beside it are moved, too.
-    Raises `RunError`: something is there already and `force` is not set; it cannot be written.
+    `write`: called with a temporary path of the same name; other files next to it are also moved.
+    Raises `RunError`: the target exists and `force` is not set; the target cannot be written.
     """
     try:
         refuse_file(target, force)
@@ -351,7 +350,7 @@ def into_place(target: Path, write: Callable[[Path], object], *, force: bool = F
 
 
 def refuse_file(target: Path, force: bool) -> None:
-    """Raise `RunError` if there is something, unless it may go; a folder only as a Zarr store."""
+    """Raise `RunError` if a target must not be replaced; a folder may be, if a Zarr store."""
     if not target.exists():
         return
     if target.is_dir() and not {".zgroup", "zarr.json"} & {path.name for path in target.iterdir()}:
@@ -372,7 +371,7 @@ def _conventional(run: Run) -> xr.Dataset:
 
 
 def _over_time(run: Run) -> pd.DataFrame:
-    """Return all variables over time, one row for each sample, with units in the names."""
+    """Return all variables over time, one row for each sample, with units in column names."""
     data = bounded(run.dataset)
     times = data["time"].values
     columns: dict[str, Any] = {}
@@ -396,12 +395,12 @@ def _over_time(run: Run) -> pd.DataFrame:
 
 
 def _series(run: Run, path: Path, at: float | None) -> None:
-    """Write the fields of all times as XDMF, with their numbers in an HDF5 file next to it."""
+    """Write the fields of all times as XDMF, with their values in an HDF5 file next to it."""
     import h5py  # type: ignore[import-untyped]
     from meshio.xdmf import TimeSeriesWriter
 
     class Writer(TimeSeriesWriter):  # type: ignore[misc]
-        """Keeps the HDF5 file next to the XDMF file, not in the current folder."""
+        """Writer that puts the HDF5 file next to the XDMF file, not into the current folder."""
 
         def __enter__(self) -> Any:
             self.h5_filename = str(self.filename.with_suffix(".h5"))
@@ -416,7 +415,7 @@ def _series(run: Run, path: Path, at: float | None) -> None:
 
 
 def _vtk(run: Run, path: Path, at: float | None) -> None:
-    """Write the fields of one time."""
+    """Write the fields of one time in a VTK format."""
     import meshio
 
     data = _with_fields(run)
@@ -439,7 +438,7 @@ def _with_fields(run: Run) -> xr.Dataset:
 
 
 def _mesh(data: xr.Dataset) -> tuple[Any, list[tuple[str, Any]]]:
-    """Return points, shape (vertices, 3), and cells; those of an interval join its neighbours."""
+    """Return points, shape (vertices, 3), and cells; in 1D, lines between adjacent vertices."""
     count = data.sizes["vertex"]
     axes = [data[axis].values if axis in data.coords else np.zeros(count) for axis in "xyz"]
     cells = [(kind, oriented(data, kind)) for kind in kinds_of(data)]
@@ -457,7 +456,7 @@ def _fields(data: xr.Dataset, k: int) -> dict[str, Any]:
 
 FORMATS: dict[str, Writer] = {
     ".nc": lambda run, path, at: write_dataset(_conventional(run), path),
-    # The second format has text of fixed length, which the third has not settled yet.
+    # Version 3 of Zarr has no standard for text of fixed length yet.
     ".zarr": lambda run, path, at: _conventional(run).to_zarr(
         path, zarr_format=2, consolidated=True
     ),

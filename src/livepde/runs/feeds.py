@@ -1,4 +1,4 @@
-"""Feeds of samples into a run: put in order, as they are, or at the pace of their times."""
+"""Feeds of samples into a run: rows of a source, sorted samples, or replay in real time."""
 
 from __future__ import annotations
 
@@ -15,51 +15,51 @@ from livepde.streams.sources import RowSource
 
 
 class Feed(Protocol):
-    """Brings samples in time order, complete and checked.
+    """Source of complete, checked samples in time order.
 
-    Other methods than `done` and `poll` are those of a feed that is never silent, refuses no row
-    and has nothing to go back to, acknowledge or close.
+    The defaults of all methods except `done` and `poll` suit a feed that is never silent, refuses
+    no row, and has no position to return to, rows to acknowledge or resources to release.
     """
 
     @property
     def done(self) -> bool:
-        """True if no more samples will come."""
+        """True if there will be no more samples."""
 
     def poll(self, wait: float) -> Sequence[Ready]:
-        """Return available samples, waiting for them at most `wait` seconds; may be empty."""
+        """Return the available samples, possibly none, after at most `wait` seconds."""
 
     def heard(self) -> bool:
-        """Return whether any row has come since the last call, usable or not."""
+        """Return whether a row, usable or not, has arrived since the last call."""
         return True
 
     @property
     def interval(self) -> float:
-        """Seconds between two samples as they usually come; infinite if that is not known."""
+        """Usual interval between two samples in seconds; infinite if it is not known."""
         return math.inf
 
     @property
     def doubt(self) -> str:
-        """Reason to doubt the times of rows, in one sentence; empty if there is none."""
+        """Reason to doubt the times of rows, in one sentence, or an empty string."""
         return ""
 
     def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
-        """Return the counts of remarks since the last call.
+        """Return the remarks since the last call, merged with their counts.
 
-        Only remarks on rows before `position(waiting)`: later rows are read again after a crash,
-        and their remarks would be counted twice.
+        Only remarks on rows before `position(waiting)` are returned: later rows are read again
+        after a crash, and their remarks would be counted twice.
         """
         return ()
 
     def position(self, waiting: Sequence[Ready]) -> str:
-        """Return the position of the source before these samples, which are still to be taken."""
+        """Return the position of the source before the `waiting` samples, not yet processed."""
         return ""
 
     def acknowledge(self, ready: Ready) -> None:
-        """Acknowledge a sample that has been kept for good, or dropped."""
+        """Acknowledge a sample that was committed or dropped."""
         return
 
     def withdraw(self, last: float) -> None:
-        """Accept samples later than this time again: those taken since then were withdrawn."""
+        """Accept samples later than the time `last` again, after later ones were withdrawn."""
         return
 
     def close(self) -> None:
@@ -69,14 +69,14 @@ class Feed(Protocol):
 
 @dataclass(eq=False)
 class Gathered(Feed):
-    """Samples from the rows of a source, as an `Intake` puts them in order."""
+    """Feed of the rows of a source, sorted and merged into samples by an `Intake`."""
 
     source: RowSource
     intake: Intake
     done: bool = field(default=False, init=False)
     _heard: bool = field(default=False, init=False)
     _remarks: list[Remark] = field(default_factory=list, init=False)
-    # Number of rows so far; a token is the number of the row, and what the source gave with it.
+    # Number of rows so far. A token here is the number of a row and the token of the source.
     _rows: int = field(default=0, init=False)
 
     def poll(self, wait: float) -> Sequence[Ready]:
@@ -104,7 +104,7 @@ class Gathered(Feed):
         return outcome.ready
 
     def _waiting(self, waiting: Sequence[Ready]) -> list[Any]:
-        """Return the tokens of all rows that are still to be taken."""
+        """Return the tokens of all rows that are not yet processed."""
         return [*(token for ready in waiting for token in ready.tokens), *self.intake.waiting]
 
     def heard(self) -> bool:
@@ -147,18 +147,18 @@ class Gathered(Feed):
 
 
 def _given(tokens: Iterable[Any]) -> list[Any]:
-    """Return the tokens of the source, without the numbers of their rows."""
+    """Return the tokens of the source without the row numbers."""
     return [token for _, token in tokens]
 
 
 @dataclass(eq=False)
 class SampleFeed(Feed):
-    """Feed of samples that are in order already: a table, or any iterable of samples."""
+    """Feed of samples in time order: a table, or any iterable of samples."""
 
     samples: Iterable[Sample]
-    names: Sequence[str] = ()  # sensors whose values an array z holds
-    after: float = -math.inf  # time of the last sample taken before; samples up to it are skipped
-    irregular: Sequence[Remark] = ()  # what was found as the samples were read
+    names: Sequence[str] = ()  # names of the sensors, in the order of their values in an array z
+    after: float = -math.inf  # samples up to this time are skipped, since an earlier run took them
+    irregular: Sequence[Remark] = ()  # remarks from reading the samples
     done: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
@@ -179,13 +179,13 @@ class SampleFeed(Feed):
 
 @dataclass(eq=False)
 class Paced(Feed):
-    """Samples of the past, replayed at the pace of their times."""
+    """Feed that replays past samples at the pace of their times."""
 
-    feed: Feed  # whose samples are replayed
-    pace: float  # model time that passes in one second
+    feed: Feed  # feed of the samples
+    pace: float  # model time per second
     clock: Callable[[], float] = time.monotonic
     sleep: Callable[[float], None] = time.sleep
-    _held: deque[Ready] = field(default_factory=deque, init=False)  # until they are due
+    _held: deque[Ready] = field(default_factory=deque, init=False)  # samples that are not due yet
     _begun: tuple[float, float] | None = field(default=None, init=False)
 
     @property
@@ -200,7 +200,7 @@ class Paced(Feed):
         now, first = self.clock(), self._held[0].t
         begun = self._begun or (now, first)
         self._begun = begun
-        # A sample of time t is due (t - t_0) / pace seconds after the first one.
+        # A sample at time t is due (t - t_0) / pace seconds after the first sample.
         due = begun[0] + (first - begun[1]) / self.pace
         if due > now:
             self.sleep(min(wait, due - now))
