@@ -1,4 +1,4 @@
-"""Outputs of a live run for others: /health, /metrics for Prometheus, its log, JSON lines."""
+"""Outputs of a live run: log, JSON lines, /health, and /metrics for Prometheus."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
 
 def configure(kind: str = "text", level: int = logging.INFO) -> None:
-    """Configure logging to standard error: messages of livepde, and warnings of other libraries.
+    """Configure logging of messages of livepde and warnings of other libraries to standard error.
 
-    The loggers are livepde.run, livepde.mqtt and livepde.opcua. An event of the run has the fields
-    kind, channel and t in JSON.
+    The loggers are livepde.run, livepde.mqtt and livepde.opcua. In JSON, an event of the run has
+    the fields kind, channel and t.
 
-    `kind`: "text", or "json": one object for each line, with the time in UTC.
+    `kind`: "text", or "json" for one object per line, with the time in UTC.
     `level`: lowest level of the messages of livepde.
     Raises `RunError`: the package python-json-logger is not installed.
     """
@@ -54,20 +54,20 @@ def configure(kind: str = "text", level: int = logging.INFO) -> None:
 
 @dataclass(eq=False)
 class JsonLinesSink(Sink):
-    """Each estimate as a line of JSON, as `Estimate.to_dict` has it."""
+    """Sink that writes each estimate as a line of JSON, see `Estimate.to_dict`."""
 
     stream: TextIO
 
     def put(self, estimate: Estimate) -> None:
-        """Write one estimate.
+        """Write an estimate.
 
-        Raises `OSError`: nobody reads the stream any more, or its disk is full.
+        Raises `OSError`: the reader has closed the stream, or its disk is full.
         """
         line = json.dumps(estimate.to_dict(), allow_nan=False)
         try:
             print(line, file=self.stream, flush=True)
         except OSError:
-            # To the null device from now on: flushing the buffer at exit would fail again.
+            # Redirect the stream to the null device: flushing its buffer at exit would fail again.
             nowhere = os.open(os.devnull, os.O_WRONLY)
             with suppress(OSError):
                 os.dup2(nowhere, self.stream.fileno())
@@ -149,7 +149,7 @@ class _Health:
             text = ", ".join(f"{number} {level}" for level, number in NUMBERS.items())
             level = float(NUMBERS[found["verdict"]])
             yield GaugeMetricFamily("livepde_verdict", text, level)
-        # A sentence would make a new series of each event.
+        # The kind is the label: each sentence would start a new time series.
         about = "1 with the kind of the reason, if any; /health has the sentence"
         unwell = GaugeMetricFamily("livepde_unwell", about, labels=["why"])
         if ailment := str(found.get("ailment", "")):
@@ -166,14 +166,14 @@ class _Health:
 
 
 class Monitor(Server):
-    """Serves /livez, /readyz, /health and /metrics from its own threads.
+    """Server of /livez, /readyz, /health and /metrics, in its own threads.
 
-    /livez answers 200 as long as the process does, /readyz and /health while the run goes well,
-    else 503. /readyz also answers 503 while a resumed run takes samples again. A verdict changes
-    none of these codes: it is in the content of /health, and a metric.
+    /livez returns 200 while the process runs. /readyz and /health return 200 while the run is
+    healthy, else 503. /readyz also returns 503 while a resumed run replays samples. The verdict
+    does not affect these codes: it is in the content of /health, and a metric.
 
-    `health`: returns the content of /health as JSON; its "ok" decides between the codes 200 and
-    503, and its "why" is what /readyz says.
+    `health`: function that returns the content of /health; its "ok" determines the code, 200 or
+    503, and its "why" is the content of /readyz.
     Raises `RunError`: the port is taken.
     """
 

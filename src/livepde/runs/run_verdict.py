@@ -1,4 +1,4 @@
-"""Verdict of a run: findings from its dataset and its journal, with the findings of its law."""
+"""Verdict of a run: findings of its law, and findings from its dataset and its journal."""
 
 from __future__ import annotations
 
@@ -44,21 +44,21 @@ if TYPE_CHECKING:
 
     from livepde.runs.journal import Journal
 
-MODEL_ERROR = 4.0  # ratio of squared innovations to their expected square: twice as large
-MOST_JUMPS = 5  # that get a sentence of their own
-SHIFTED = 3  # times that a clock is set back for good, from which intervals are wrong as a rule
-WANDERS = 0.3  # scatter of an estimate over its change since the first: it follows the noise
-SHORTEST = 20  # values at least to tell whether an estimate wanders
-LEFT_OUT = 0.25  # of a field's mean variance is that of modes that the law leaves out
-RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
+MODEL_ERROR = 4.0  # ratio of squared innovations to their expected square: innovations are doubled
+MOST_JUMPS = 5  # largest number of jumps with separate sentences
+SHIFTED = 3  # permanent setbacks of a clock, from which on intervals are usually wrong
+WANDERS = 0.3  # scatter of an estimate over its change since the start: above, it follows the noise
+SHORTEST = 20  # smallest number of values to judge whether an estimate wanders
+LEFT_OUT = 0.25  # share of a field's mean variance due to modes that the law leaves out
+RESTS = 0.1  # scatter of an estimate over its size: up to this ratio, it is steady
 AFTER = " The state is re-estimated from there on. The unknowns are kept."
 HOUR = 3600.0  # seconds by which clocks are set forward in spring
 ZONE = (
     "If the times are local and clocks were set forward here, set `data.zone`, such as "
     "'Europe/Berlin'. "
 )
-OF_SENSORS = "start", "early"  # kinds of remarks that matter for sensors, too
-# Kind of a gap -> its sentence, the first that applies; else that of "".
+OF_SENSORS = "start", "early"  # kinds of remarks that also concern sensors
+# Kind of a gap -> key of its sentence. The first kind that occurs counts, with "" as default.
 SENTENCES = {"bridged": "input, bridged", "ended": "input, ended", "": "input, counts"}
 INPUT_KINDS = {
     "start": "first values were outliers and count as missing",
@@ -73,9 +73,9 @@ INPUT_KINDS = {
 
 
 def findings_of(data: xr.Dataset, *, judged: bool) -> list[Finding]:
-    """Return the findings from the dataset of a run; each function below describes its own.
+    """Return the findings from the dataset of a run.
 
-    `judged`: whether the law has judged innovations and refused readings itself.
+    `judged`: whether the law itself has judged innovations and refused readings.
     """
     gradient = note(data, "residual") is not None
     own = [] if judged else [*_model_error(data), *_each("refused", "caution", _refused(data))]
@@ -93,15 +93,15 @@ def findings_of(data: xr.Dataset, *, judged: bool) -> list[Finding]:
 
 
 def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
-    """Return gaps and spikes of the channels that drive the model, if any.
+    """Return findings on gaps and spikes of the channels that drive the model.
 
-    Notes: where more than 2 % of the values were held, the verdict of the estimate has a caution.
+    They are notes. If more than 2 % of the values were held, the law's verdict has a caution.
     """
     found, driving = [], dict.fromkeys(channels)
     counted: defaultdict[str, Counter[str]] = defaultdict(Counter)
     for (kind, name), count in journal.counts.items():
-        # What is left out at the start matters for sensors, too: the initial state may be made of
-        # it.
+        # Values that are left out at the start also concern sensors, from which the initial state
+        # may be computed.
         if kind in OF_SENSORS or name in driving:
             counted[name][kind] = count
     for name in {**driving, **dict.fromkeys(counted)}:
@@ -112,14 +112,14 @@ def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
         held = (counts["missing"] + counts["ended"]) / max(len(journal), 1)
         sentence = SENTENCES[next(filter(counts.get, SENTENCES), "")]
         skip = channel_setting(name, "missing", '"skip"')
-        told = {"kind": "Input" if name in driving else "Sensor", "name": name, "skip": skip}
-        text, remedy = FINDINGS[sentence].filled(**told, counts=", ".join(parts))
+        words = {"kind": "Input" if name in driving else "Sensor", "name": name, "skip": skip}
+        text, remedy = FINDINGS[sentence].filled(**words, counts=", ".join(parts))
         found.append(Finding("input", "note", text, name, held, remedy=remedy))
     return found
 
 
 def clock_findings(journal: Journal) -> list[Finding]:
-    """Return that times went back, if they did: estimates rest on the times as they came."""
+    """Return a finding if times went back: estimates use the times as they were received."""
     count = journal.counts.get(("clock", ""), 0)
     if not count:
         return []
@@ -136,10 +136,10 @@ def clock_findings(journal: Journal) -> list[Finding]:
 def sampling_findings(
     data: xr.Dataset, readings: Callable[[], tuple[Array, Array]] | None = None
 ) -> list[Finding]:
-    """Return findings on the times of a run: changed units, clocks that leapt, and pauses.
+    """Return findings on the times of a run: changed units, leaps of the clock, and pauses.
 
-    `readings`: returns times and values of the channels, shapes (samples,) and (samples, channels).
-    It is called if there is a pause. Without it a leap of the clock is called a pause.
+    `readings`: function that returns times, shape (samples,), and values of the channels, shape
+    (samples, channels). Without it, a leap of the clock is reported as a pause.
     """
     t, found = data["time"].values, list[Finding]()
     leaps, breaks = list[float](), pauses(t)
@@ -154,7 +154,7 @@ def sampling_findings(
         later = float(np.median(np.diff(t[k:]))) if k + 1 < len(t) else math.nan
         if factor := unit_factor(float(t[k - 1]), float(t[k]), usual, later):
             found.append(_unit_changed(k, at, factor))
-            break  # of later steps nothing is known
+            break  # later intervals cannot be judged
         after = AFTER if anchors else ""
         if float(t[k]) in leaps:
             found.append(_leapt(data, k, at, length - usual, after))
@@ -165,7 +165,7 @@ def sampling_findings(
 
 
 def _unit_changed(k: int, at: str, factor: float) -> Finding:
-    """Return that times count in another unit from a sample on."""
+    """Return the finding that times have a different unit from a sample on."""
     text, remedy = FINDINGS["clock, unit"].filled(
         sample=k + 1, at=at, factor=factor, unit=FACTORS[factor]
     )
@@ -175,9 +175,9 @@ def _unit_changed(k: int, at: str, factor: float) -> Finding:
 
 
 def _leapt(data: xr.Dataset, k: int, at: str, by: float, after: str) -> Finding:
-    """Return that a clock leapt forward before a sample, `by` more than a usual interval."""
+    """Return the finding that a clock leapt forward before a sample, `by` its excess interval."""
     times = f"{by:.6g} {data['time'].attrs.get('units', '')}".rstrip()
-    # In spring, a local time without its zone leaps by an hour.
+    # In spring, a local time without a zone leaps by an hour.
     dates = dated(data)
     summer = dates is not None and abs(by * dates[1] - HOUR) < 0.1 * HOUR
     text, remedy = FINDINGS["clock, leap"].filled(
@@ -193,7 +193,7 @@ def _each(what: str, severity: Severity, sentences: Iterable[Sentence]) -> list[
 
 
 def _model_error(data: xr.Dataset) -> list[Finding]:
-    """Return whether innovations are too large, for runs whose law has not judged them itself."""
+    """Return a finding if innovations are too large, for a law that has not judged them."""
     ratio = _last(data, "innovation_ratio")
     if not ratio > MODEL_ERROR:
         return []
@@ -204,7 +204,7 @@ def _model_error(data: xr.Dataset) -> list[Finding]:
 
 
 def _refused(data: xr.Dataset) -> list[Sentence]:
-    """Return whether the gate refused more than a share `REFUSED` of the readings."""
+    """Return a sentence if the gate refused more than a share `REFUSED` of the readings."""
     values = note(data, "refused")
     if values is None:
         return []
@@ -216,7 +216,7 @@ def _refused(data: xr.Dataset) -> list[Sentence]:
 
 
 def _unknowns(data: xr.Dataset) -> list[Finding]:
-    """Return unknowns at a bound, and those of which the data told little more than the prior."""
+    """Return findings on unknowns at a bound, and on those the data barely determine."""
     found = []
     for label in scalars(data):
         attrs: dict[Any, Any] = data[label].attrs
@@ -230,16 +230,16 @@ def _unknowns(data: xr.Dataset) -> list[Finding]:
 
 
 def _held(data: xr.Dataset) -> list[Sentence]:
-    """Return whether latent values were held at `within` prior standard deviations."""
+    """Return a sentence if latent values were held at `within` prior standard deviations."""
     at = _times(data, "bounded")
-    # Where a last fit has converged, what counts is where it ended.
+    # If a last fit has converged, only its final values count.
     if not len(at) or not data.attrs.get("bounded_at_end", 1.0):
         return []
     return [FINDINGS["held"].filled(count=len(at), at=when(data, at[-1]))]
 
 
 def _left_out(data: xr.Dataset) -> list[Sentence]:
-    """Return fields whose variance is to a large part that of modes the law leaves out."""
+    """Return a sentence for each field with a large share of variance in left-out modes."""
     found = []
     for name in field_names(data):
         if f"{name}_left_out" not in data:
@@ -278,7 +278,7 @@ def _jumps(data: xr.Dataset) -> list[Sentence]:
 
 
 def _guards(data: xr.Dataset) -> list[Sentence]:
-    """Return whether guards gave up samples, or restarted the law."""
+    """Return sentences on samples that guards tempered or skipped, and on restarts of the law."""
     tempered, held = _times(data, "tempered"), _times(data, "held")
     restarted, runaway = _times(data, "restarted"), _times(data, "runaway")
     found = list[Sentence]()
@@ -292,14 +292,14 @@ def _guards(data: xr.Dataset) -> list[Sentence]:
 
 
 def _rests(data: xr.Dataset) -> list[Finding]:
-    """Return when the gradient law held the unknowns because nothing excited them."""
+    """Return a finding if the gradient law held the unknowns because of missing excitation."""
     times, at = data["time"].values, _times(data, "at_rest")
     if not len(at):
         return []
     found = rested(len(at), f", last at {when(data, at[-1])}")
     if at[-1] < times[-1]:
         return [found]
-    # The first sample of each period in which the unknowns were held.
+    # Time of the first sample of each period in which the unknowns were held.
     held = np.isin(times, at)
     begin = times[held & ~np.append(False, held[:-1])]
     since = when(data, begin[-1])
@@ -319,7 +319,7 @@ def _discretised(data: xr.Dataset) -> list[Finding]:
 
 
 def _last(data: xr.Dataset, name: str) -> float:
-    """Return the last value of a diagnostic, NaN without."""
+    """Return the last value of a diagnostic, or NaN."""
     values = note(data, name)
     return math.nan if values is None else float(values[-1])
 
@@ -332,7 +332,7 @@ def _times(data: xr.Dataset, name: str) -> Array:
 
 
 def _gain(data: xr.Dataset) -> list[Sentence]:
-    """Return the estimates that wander, of a law with a fixed gain, which has no covariance."""
+    """Return a sentence on estimates that wander, for a law with a fixed gain."""
     if note(data, "residual") is None or note(data, "gain") is not None:
         return []
     names = [*scalars(data), *field_names(data)]
@@ -343,11 +343,11 @@ def _gain(data: xr.Dataset) -> list[Sentence]:
 
 
 def _wanders(values: np.ndarray[Any, Any]) -> bool:
-    """Return whether values over time, shape (times, ...), scatter about a line in the end."""
+    """Return whether the later half of values, shape (times, ...), scatters about a line."""
     late = values[len(values) // 2 :].reshape(len(values) - len(values) // 2, -1)
     if len(late) < SHORTEST or not np.isfinite(late).all():
         return False
-    # Scatter about a straight line: an estimate that still learns does not wander.
+    # A straight line is subtracted, since an estimate that still learns does not wander.
     line = np.vander(np.linspace(-1.0, 1.0, len(late)), 2)
     left = late - line @ np.linalg.lstsq(line, late, rcond=None)[0]
     learned = np.linalg.norm(late.mean(axis=0) - values[0].ravel())
@@ -357,13 +357,13 @@ def _wanders(values: np.ndarray[Any, Any]) -> bool:
 
 
 def verdict(data: xr.Dataset) -> Verdict:
-    """Return the verdict of a run: of its law (`Estimate.verdict`), and findings of its dataset.
+    """Return the verdict of a run: its law's verdict with the findings from its dataset.
 
-    The law's verdict is read from the attribute `verdict` of the dataset. Without it the run is not
-    judged.
+    The law's verdict is read from the attribute `verdict` of the dataset. Without this attribute,
+    the run is not judged.
     """
     stored = data.attrs.get("verdict")
-    # A stored verdict counts the steps of all samples, of which a dataset may hold a part.
+    # A stored verdict counts the steps of all samples; a dataset may contain only some of them.
     if stored:
         own = Verdict.from_dict(json.loads(stored))
     else:
@@ -396,7 +396,7 @@ def verdict_table(found: Verdict) -> Table:
 
 
 def doubts(data: xr.Dataset) -> list[str]:
-    """Return all findings against the estimates as sentences, each once."""
+    """Return all findings against the estimates as distinct sentences."""
     return verdict(data).every_sentence
 
 
@@ -406,5 +406,5 @@ def severities(data: xr.Dataset) -> dict[str, Severity]:
 
 
 def unexplained(data: xr.Dataset) -> bool:
-    """Return whether a run has found a model misfit."""
+    """Return whether the verdict of a run has found a model misfit."""
     return any(finding.what == "misfit" for finding in verdict(data).findings)

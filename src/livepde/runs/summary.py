@@ -1,4 +1,4 @@
-"""Summary of a run: estimates, resistance of a wall, errors of each channel, checks."""
+"""Summary of a run: estimates, thermal resistance of a wall, errors of each channel, checks."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from livepde.showing import in_percent
 if TYPE_CHECKING:
     import xarray as xr
 
-# Attributes of a dataset: layers as JSON, label of a conductivity -> thickness in m; and the sum of
-# the surface resistances in m^2 K/W, if they are stated.
+# Attributes of a dataset: the layers as JSON, label of a conductivity -> thickness in m, and the
+# sum of the surface resistances in m^2 K/W, which is optional.
 LAYERS, SURFACES = "wall_layers", "surface_resistance"
 MOST_ROWS = 40
-DIGITS = 15  # of a number
-FINEST = 1000.0  # parts of the width of an interval to which its ends are shown, at most
-MOST = 10.0  # times its value that an error is shown as a share
+DIGITS = 15  # largest number of digits shown
+FINEST = 1000.0  # width of an interval over the finest resolution of its ends
+MOST = 10.0  # relative error from which on a dash is shown
 TOTALS = ("rmse", "innovation_ratio", "jumps", "failed_steps")  # numbers of a run as a whole
-ROLES = ("assimilated", "validation")  # of channels, of which there are totals, too
-IGNORED = "ignored"  # role of channels that are shown and count in no total
-MOVED = 3.0  # deviations by which an unknown has moved after an alarm
-JUMP = "jump"  # what the law notes of each sample
+ROLES = ("assimilated", "validation")  # roles of channels that have totals
+IGNORED = "ignored"  # role of channels that are shown but not included in totals
+MOVED = 3.0  # standard deviations by which an unknown has moved after an alarm
+JUMP = "jump"  # name of the law's note on alarms
 STATES = {
     "pinned": "well determined",
     "partly": "partly determined",
@@ -43,25 +43,24 @@ STATES = {
     "at its bound": "at its bound",
     "moves": "changes with time",
 }
-"""How well the data determine a number, as `determination` returns it -> words."""
+"""How well the data determine a number: value of `determination` -> words."""
 
 
 @dataclass(frozen=True)
 class Resistance:
-    """R = sum of thickness/k of a wall, without its surfaces."""
+    """Thermal resistance of a wall, R = sum of thickness/k, without surface resistances."""
 
     R: float  # value in m^2 K/W
-    relative: float  # standard deviation of ln R, to first order in those of ln k
-    # Sum of the surface resistances in m^2 K/W; None if they are not stated
-    surfaces: float | None = None
-    # R if each conductivity is at the upper or lower end of its interval with model errors; NaN if
-    # these are not known
+    relative: float  # standard deviation of ln R, to first order in the errors of ln k
+    surfaces: float | None = None  # sum of the surface resistances in m^2 K/W; None: not stated
+    # R with each conductivity at the upper or lower end of its interval with model errors; NaN if
+    # model errors are not known.
     low: float = math.nan
     high: float = math.nan
 
     @property
     def U(self) -> float:
-        """Transmittance 1/(R + surface resistances) in W/(m^2 K)."""
+        """Thermal transmittance 1/(R + surface resistances) in W/(m^2 K)."""
         return 1.0 / (self.R + (self.surfaces or 0.0))
 
     @property
@@ -71,7 +70,7 @@ class Resistance:
 
 
 def resistance(data: xr.Dataset) -> Resistance | None:
-    """Return the resistance of the wall of a run at its end; None if the run is of no wall."""
+    """Return the final resistance of the wall of a run, or None if it has no wall."""
     layers: Mapping[str, float] = json.loads(data.attrs.get(LAYERS, "{}"))
     if not layers or not data.sizes["time"]:
         return None
@@ -86,7 +85,7 @@ def resistance(data: xr.Dataset) -> Resistance | None:
     errors = model_errors(data)
     each = {one.label: (one.high, one.low) for one in (errors.unknowns if errors else ())}
     ends = np.array([each.get(label, (math.nan, math.nan)) for label in layers])
-    # A lower end at zero, or below, is none of a conductivity.
+    # A conductivity is positive, so that a lower end up to zero counts as unknown.
     low, high = np.array([*layers.values()]) / np.where(ends > 0.0, ends, math.nan).T
     return Resistance(
         R,
@@ -98,7 +97,7 @@ def resistance(data: xr.Dataset) -> Resistance | None:
 
 
 def _correlation(data: xr.Dataset, labels: Sequence[str]) -> Array:
-    """Return the correlations of some unknowns of a run at its end; of one there are none."""
+    """Return the final correlation matrix of unknowns; the identity if it is not known."""
     if len(labels) == 1 or "correlation" not in data:
         return np.eye(len(labels))
     names = [str(name) for name in data["unknown"].values]
@@ -107,7 +106,7 @@ def _correlation(data: xr.Dataset, labels: Sequence[str]) -> Array:
 
 
 def digits(value: float, std: float) -> tuple[str, str]:
-    """Return value and standard deviation as text, both to the second digit of the latter.
+    """Return value and standard deviation as text, to the second digit of the deviation.
 
     >>> digits(2.7344, 0.0261)
     ('2.734', '0.026')
@@ -122,16 +121,16 @@ def digits(value: float, std: float) -> tuple[str, str]:
     if value and not 1e-3 <= abs(value) < 1e5:
         power = math.floor(math.log10(abs(value)))
     scale = 10.0**power
-    # The first digit of std stands at 10^floor(log10 std); one more is shown.
+    # The first digit of std has the weight 10^floor(log10 std). One more digit is shown.
     places = max(0, 1 + power - math.floor(math.log10(std)))
-    if places > DIGITS or std / scale > 10.0**DIGITS:  # no digits of one in the other
+    if places > DIGITS or std / scale > 10.0**DIGITS:  # no common digits
         return f"{value:.5g}", f"{std:.2g}"
     exponent = f"e{power:+03d}" if power else ""
     return f"{value / scale:.{places}f}{exponent}", f"{std / scale:.{places}f}{exponent}"
 
 
 def shown(value: float, form: str = ".3g", unit: str = "") -> str:
-    """Return a number with its unit as text, a dash for one that is not finite.
+    """Return a number with its unit as text, or a dash if it is not finite.
 
     >>> shown(2.5, ".2g", " %"), shown(float("nan"), ".2g", " %")
     ('2.5 %', '–')
@@ -140,9 +139,9 @@ def shown(value: float, form: str = ".3g", unit: str = "") -> str:
 
 
 class ChannelErrors(NamedTuple):
-    """Errors of a channel: its role, those of all samples, and those of the second half.
+    """Role of a channel, its errors in all samples and in the second half of the samples.
 
-    Readings that the gate refused are not among them: `refused` is their number.
+    Readings that the gate refused are excluded, and `refused` is their number.
     """
 
     role: str
@@ -152,7 +151,7 @@ class ChannelErrors(NamedTuple):
 
 
 def channel_errors(data: xr.Dataset) -> dict[str, ChannelErrors]:
-    """Return the errors of each channel from the start of the assimilation on."""
+    """Return the errors of each channel since the start of the assimilation."""
     start = float(data.attrs.get("assimilate_from", -math.inf))
     kept = data["time"].values >= start
     found, refused = {}, refused_readings(data)
@@ -170,7 +169,7 @@ def channel_errors(data: xr.Dataset) -> dict[str, ChannelErrors]:
 
 
 def _grouped(channels: Mapping[str, ChannelErrors]) -> dict[str, ChannelErrors]:
-    """Return the errors of all channels, pooled by role if there are too many for a table."""
+    """Return the errors by channel, or by role if there are too many channels for a table."""
     if len(channels) <= MOST_ROWS:
         return dict(channels)
     found = {}
@@ -183,7 +182,7 @@ def _grouped(channels: Mapping[str, ChannelErrors]) -> dict[str, ChannelErrors]:
 
 
 def rmse(errors: np.ndarray[Any, Any]) -> float:
-    """Return the root mean square, NaN of nothing."""
+    """Return the root mean square, or NaN without errors."""
     return float(np.sqrt(np.mean(errors**2))) if len(errors) else math.nan
 
 
@@ -194,10 +193,10 @@ class Jump:
     Attributes
     ----------
     t
-        Time of the sample that raised it.
+        Time of the sample that raised the alarm.
     moved
-        Numbers that have moved by more than three standard deviations between this alarm and the
-        next one, or the end: label -> value before and after, and the standard deviation after.
+        Unknowns that have moved by more than three standard deviations between this alarm and the
+        next one or the end: label -> (value before, value after, standard deviation after).
     """
 
     t: float
@@ -205,7 +204,7 @@ class Jump:
 
 
 def jumps(data: xr.Dataset) -> list[Jump]:
-    """Return the alarms of a run, in time order; none without the test for jumps."""
+    """Return the alarms of a run in time order; empty if the law does not test for jumps."""
     alarms = note(data, JUMP)
     if alarms is None:
         return []
@@ -226,7 +225,7 @@ def jumps(data: xr.Dataset) -> list[Jump]:
 
 
 def interval(low: float, high: float, std: float) -> str:
-    """Return an interval as text, a dash where it or the standard deviation is not known."""
+    """Return an interval as text, or a dash if its ends or standard deviation are not finite."""
     if not math.isfinite(std + high - low):
         return "–"
     size = max(std, (high - low) / FINEST)
@@ -236,12 +235,11 @@ def interval(low: float, high: float, std: float) -> str:
 def measures(data: xr.Dataset) -> dict[str, float]:
     """Return the numbers of a run for which a case may state expected bounds, by name.
 
-    Each scalar unknown by its label; with `.std` its standard deviation, and if it has a
-    reference, with `.error` the relative error and with `.deviations` the distance from the
-    reference in standard deviations;
-    `rmse` one-step, of all sensors, also those for validation; `rmse.assimilated`,
-    `rmse.validation`, `rmse.CHANNEL`; `innovation_ratio` at the end, of squared innovations to
-    their expected square; `jumps`, the number of alarms, if the law tests for them; `failed_steps`.
+    `LABEL`, `LABEL.std`: value and standard deviation of a scalar unknown. With a reference, also
+    `LABEL.error`, the relative error, and `LABEL.deviations`, the error in standard deviations.
+    `rmse`, `rmse.assimilated`, `rmse.validation`, `rmse.CHANNEL`: one-step errors of all sensors
+    including validation sensors, of each role, and of each channel. `innovation_ratio`: final ratio
+    of squared innovations to their expected square. `jumps`: number of alarms. `failed_steps`.
     """
     found: dict[str, float] = {}
     for label in scalars(data) if data.sizes["time"] else ():
@@ -262,7 +260,7 @@ def measures(data: xr.Dataset) -> dict[str, float]:
 
 
 def _channel_measures(data: xr.Dataset) -> dict[str, float]:
-    """Return the one-step root mean square errors: of all channels, of each role, of each one."""
+    """Return root mean square one-step errors: of all channels, each role and each channel."""
     channels = channel_errors(data)
     pools = {"rmse": ROLES} | {f"rmse.{role}": (role,) for role in ROLES}
     found = {}
@@ -274,7 +272,7 @@ def _channel_measures(data: xr.Dataset) -> dict[str, float]:
 
 
 def checks_of(expected: Mapping[str, tuple[Sense, Bound]], data: xr.Dataset) -> list[Check]:
-    """Return a check for each expected number; a number that does not exist is NaN, and fails."""
+    """Return a check for each expected number; the check of a missing number fails."""
     found = measures(data)
     return [
         Check(name, found.get(name, math.nan), bound, sense)
@@ -285,9 +283,9 @@ def checks_of(expected: Mapping[str, tuple[Sense, Bound]], data: xr.Dataset) -> 
 def tables(data: xr.Dataset) -> list[Table]:
     """Return the tables of a run.
 
-    Estimates with references, the resistance of a wall, estimated fields, errors of each channel,
-    information gained from the data, and jumps. Errors over all samples include the initial
-    transient of learning; those of the second half can be compared with the noise.
+    The tables are: estimates with references, resistance of a wall, estimated fields, errors of
+    each channel, identifiability, and jumps. Errors over all samples include the initial transient
+    of learning; errors over the second half can be compared with the noise.
     """
     labels = scalars(data) if data.sizes["time"] else []
     channels = _channels(data)
@@ -303,7 +301,7 @@ def tables(data: xr.Dataset) -> list[Table]:
 
 
 def _estimates(data: xr.Dataset, labels: Sequence[str]) -> Table:
-    """Return the table of the last estimates, with references where any is given."""
+    """Return the table of the final estimates, with their references if there are any."""
     errors, known = model_errors(data), estimates(data)
     differ = errors is not None and errors.differ
     rows: list[tuple[Any, ...]] = []
@@ -311,8 +309,8 @@ def _estimates(data: xr.Dataset, labels: Sequence[str]) -> Table:
         value, deviation = digits(row["value"], row["std"])
         plain = interval(row["low"], row["high"], row["std"])
         allowed = interval(row["model_low"], row["model_high"], row["std"])
-        # The wider interval comes first. The plain one tells the standard deviation, too.
-        # Relative to zero an error says nothing.
+        # The wider interval comes first. The plain interval makes the standard deviation redundant.
+        # A relative error is not shown if the interval contains zero.
         zero = row["model_low"] <= 0.0 <= row["model_high"]
         off = in_percent(row["effect"]) if not zero and row["effect"] < MOST else "–"
         wide = (allowed, off) if differ else (deviation,)
@@ -331,7 +329,7 @@ def _estimates(data: xr.Dataset, labels: Sequence[str]) -> Table:
 
 
 def _wall(data: xr.Dataset) -> Table:
-    """Return the table of R and U of a wall, with their 95 % intervals; empty for other runs."""
+    """Return the table of R and U of a wall with 95 % intervals; empty if there is no wall."""
     found, rows = resistance(data), list[tuple[Any, ...]]()
     errors = model_errors(data)
     differ = errors is not None and errors.differ
@@ -355,7 +353,7 @@ def _wall(data: xr.Dataset) -> Table:
 
 
 def _first_order(data: xr.Dataset, names: Sequence[str]) -> str:
-    """Return the part of a title that names values which are medians; empty if none is."""
+    """Return the part of a title that lists the values that are medians, or an empty string."""
     found = [name for name in names if "comment" in data[name].attrs]
     if not found:
         return ""
@@ -364,7 +362,7 @@ def _first_order(data: xr.Dataset, names: Sequence[str]) -> str:
 
 
 def _fields(data: xr.Dataset) -> Table:
-    """Return the table of the last snapshots of the unknown fields."""
+    """Return the table of the final snapshots of the unknown fields."""
     rows: list[tuple[Any, ...]] = []
     names = [name for name in field_names(data) if name in data]
     for name in names:
@@ -380,7 +378,7 @@ def _fields(data: xr.Dataset) -> Table:
 
 
 def _channels(data: xr.Dataset) -> Table:
-    """Return the table of one-step errors of each channel, with the readings that were refused."""
+    """Return the table of one-step errors of each channel and its number of refused readings."""
     channels = _grouped(channel_errors(data))
     refuses = any(item.refused for item in channels.values())
     errors = model_errors(data)
@@ -407,7 +405,7 @@ def _channels(data: xr.Dataset) -> Table:
 
 
 def _channel_units(data: xr.Dataset) -> defaultdict[str, str]:
-    """Return the unit of each channel: its own, or that of all innovations."""
+    """Return the unit of each channel; default: the unit of the innovations."""
     common = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
     found: defaultdict[str, str] = defaultdict(lambda: common)
     for _, dimension in ERRORS:
@@ -418,7 +416,7 @@ def _channel_units(data: xr.Dataset) -> defaultdict[str, str]:
 
 
 def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:
-    """Return the table of remaining shares of the prior standard deviation of each unknown."""
+    """Return the table of posterior over prior standard deviations of all unknowns."""
     rows: list[tuple[Any, ...]] = []
     for label in labels:
         left = prior_left(data, label)
@@ -431,8 +429,8 @@ def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:
         rows.append((label, in_percent(left), words))
     for name in field_names(data):
         if f"{name}_modes" in data:
-            told, count, left = modes_told(data, name)
-            rows.append((name, in_percent(left), f"{told:.1f} of {count} modes determined"))
+            known, count, left = modes_told(data, name)
+            rows.append((name, in_percent(left), f"{known:.1f} of {count} modes determined"))
     return Table("Identifiability", ("unknown", "std. dev. / prior", "state"), rows)
 
 
@@ -440,17 +438,17 @@ def determination(attrs: Mapping[Any, Any], value: float, left: float) -> str:
     """Return how well the data determine a number: a verdict of `InformationGain`, or "moves".
 
     `attrs`: attributes of the number in the dataset.
-    `value`, `left`: its value, and the share of its prior standard deviation that is left.
+    `value`, `left`: its value, and its posterior over prior standard deviation.
     """
     # Laws clip to the bounds, so a number at its bound has exactly the value of the bound.
     bounds = [attrs[end] for end in ("lower_bound", "upper_bound") if attrs.get(end) == value]
-    moves = "prior_std" not in attrs  # only numbers without an evolution have one prior to compare
+    moves = "prior_std" not in attrs  # a number with an evolution has no fixed prior
     known = InformationGain("", left, bound=bounds[0] if bounds else math.nan, moves=moves)
     return "moves" if moves and known.verdict == "partly" else known.verdict
 
 
 def _traded(data: xr.Dataset, label: str) -> list[str]:
-    """Return the unknowns of which the data determine only a combination with this one."""
+    """Return the unknowns that the data determine only in combination with this unknown."""
     if "correlation" not in data or data["correlation"].dims != ("unknown", "other"):
         return []
     names = [str(name) for name in data["unknown"].values]
@@ -470,7 +468,7 @@ def _jumped(data: xr.Dataset) -> Table:
 
 
 def arrivals(journal: Journal) -> list[Table]:
-    """Return the table of rows and values that were refused, missing or out of order, if any."""
+    """Return the table of refused, missing and unordered rows and values, if there are any."""
     rows = [(kind, channel or "(row)", n) for (kind, channel), n in journal.counts.items()]
     if not rows:
         return []

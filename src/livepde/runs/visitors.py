@@ -1,4 +1,4 @@
-"""Deadlines for the connections of a web server (waitress), which holds a thread only to answer."""
+"""Web server (waitress) with deadlines for connections, which use threads only for answers."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from waitress.server import TcpWSGIServer
 if TYPE_CHECKING:
     from wsgiref.types import WSGIApplication
 
-Refusal: TypeAlias = Callable[[Mapping[str, Any]], str]  # of a header, as WSGI has it
+Refusal: TypeAlias = Callable[[Mapping[str, Any]], str]  # the argument is a header, as in WSGI
 
-THREADS = 16  # answers that are computed at a time
-ROOM = 256  # connections at a time; of more the oldest idle one is closed
+THREADS = 16  # concurrent answers
+ROOM = 256  # concurrent connections; for a new one beyond these, the oldest idle one is closed
 LONGEST_HEADER = 16_384  # bytes
 LONGEST_BODY = 1_000_000  # bytes
-IN_MEMORY = 65_536  # bytes of a body; the rest of it is in a temporary file
-DEADLINE = 10  # seconds within which a request has to be there as a whole
-LONGEST = 30  # seconds within which its answer has to be taken
+IN_MEMORY = 65_536  # bytes up to which a body is kept in memory; a longer one is in a file
+DEADLINE = 10  # seconds until a request must be complete
+LONGEST = 30  # seconds since the start of the request until its answer must be read
 
 
 class Discarded(io.BytesIO):
-    """A body that is not kept."""
+    """A request body that is not stored."""
 
     def append(self, data: bytes) -> None:
         return
@@ -42,7 +42,7 @@ class Discarded(io.BytesIO):
 
 
 class Request(HTTPRequestParser):  # type: ignore[misc]
-    """A request whose body is not stored if its header is refused: unknown clients fill no disk."""
+    """A request that stores no body if its header is refused, so that no client fills the disk."""
 
     def __init__(self, adj: Any, refusal: Refusal) -> None:
         super().__init__(adj)
@@ -57,7 +57,7 @@ class Request(HTTPRequestParser):  # type: ignore[misc]
 
 
 class Visitor(HTTPChannel):  # type: ignore[misc]
-    """A connection that remembers when its last request began."""
+    """A connection that records when its last request began."""
 
     begun = 0.0
 
@@ -65,34 +65,34 @@ class Visitor(HTTPChannel):  # type: ignore[misc]
         return Request(adj, self.server.refusal)
 
     def received(self, data: bytes) -> Any:
-        """Take received bytes; bytes that come one by one do not move the deadline."""
+        """Process received bytes; only the first bytes of a request set its deadline."""
         if self.request is None:
             self.begun = time.time()
         return super().received(data)
 
     def handle_close(self) -> None:
-        """Close the connection, and the file that holds a part of its request."""
+        """Close the connection, and the temporary file of an incomplete request."""
         if self.request is not None:
             self.request.close()
         super().handle_close()
 
 
 class Listener(TcpWSGIServer):  # type: ignore[misc]
-    """A server that closes connections after a deadline, and the oldest idle ones for new ones."""
+    """A server that closes connections at a deadline, and the oldest idle one for a new one."""
 
     channel_class = Visitor
     refusal: Refusal
 
     def maintenance(self, now: float) -> None:
-        """Close connections that are idle, ask too slowly, or take their answer too slowly."""
+        """Close connections that are idle, or too slow to send a request or to read its answer."""
         super().maintenance(now)
         for visitor in [*self.active_channels.values()]:
             since = now - visitor.begun
             asking, answered = visitor.request is not None, visitor.total_outbufs_len > 0
             if (asking and since > DEADLINE) or (answered and since > LONGEST):
-                # With `will_close` it would be closed only once it has taken more of its answer. A
-                # socket that is closed here is polled once more, when a new connection may have
-                # its number already and would be closed in its place.
+                # With `will_close` the connection would be closed only after it reads more of its
+                # answer. If the socket were closed here, it would be polled once more, and a new
+                # connection with the same file descriptor would be closed instead.
                 with suppress(OSError):
                     visitor.socket.shutdown(socket.SHUT_RDWR)
 
@@ -105,7 +105,7 @@ class Listener(TcpWSGIServer):  # type: ignore[misc]
         super().handle_accept()
 
     def stop(self) -> None:
-        """Close all sockets in the thread that polls them, which ends without any."""
+        """Close all sockets in the thread that polls them, which ends that thread."""
 
         def end() -> None:
             for visitor in [*self.active_channels.values()]:
@@ -116,21 +116,21 @@ class Listener(TcpWSGIServer):  # type: ignore[misc]
         self.trigger.pull_trigger(end)
 
     def close(self) -> None:
-        """Close the listening socket; the trigger stays open for those who may be pulling it."""
+        """Close the listening socket, but not the trigger, which threads may still pull."""
         wasyncore.dispatcher.close(self)
 
     def release(self) -> None:
-        """End the threads that answer, and close the trigger that they pull; after `run`."""
+        """End the threads that answer, and close their trigger; to be called after `run`."""
         self.task_dispatcher.shutdown()
         if not self.task_dispatcher.threads:
             self.trigger.close()
 
 
 def listener(application: WSGIApplication, place: socket.socket, refusal: Refusal) -> Listener:
-    """Return a server that listens at a bound socket; its `run` serves.
+    """Return a server that listens at a bound socket; its method `run` serves.
 
-    `refusal`: function of a header that returns why the application will refuse it; empty if it
-    will not.
+    `refusal`: function that returns why the application refuses a request with this header, or an
+    empty string.
     """
     server = Listener(
         application,

@@ -1,4 +1,4 @@
-"""Pages and endpoints of a run: served on this machine only, or to whoever knows a token."""
+"""Web server of a run, for clients on this machine or clients with a token."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
 
 COOKIE = "livepde_token"
-SHORTEST_TOKEN = 16  # characters, where anyone may try
+SHORTEST_TOKEN = 16  # characters of a token if other machines can reach the server
 NOT_HERE = "this page is for this machine only: use localhost"
 NO_TOKEN = "add the ?token=... that was printed when the server started"
 HEADERS = [
     ("X-Content-Type-Options", "nosniff"),
     ("X-Frame-Options", "DENY"),
-    ("Referrer-Policy", "no-referrer"),  # an address may hold a token
+    ("Referrer-Policy", "no-referrer"),  # an address may contain a token
 ]
 
 
@@ -42,21 +42,21 @@ def _loopback(host: str) -> bool:
 
 @dataclass(frozen=True)
 class Address:
-    """Where to listen, and who may ask.
+    """Address of a server, and the token that its clients must have.
 
-    A client sends the token as `?token=...` once, or in the header `Authorization: Bearer ...`. On
-    a loopback address none is required unless one is given; on any other address one is generated
-    if none is given.
+    A client sends the token as `?token=...` once, or in the header `Authorization: Bearer ...`. The
+    token is optional on a loopback address. On any other address, a token is generated if none is
+    specified.
     """
 
     host: str = "127.0.0.1"
-    port: int = 0  # 0: a free one
+    port: int = 0  # 0: any free port
     token: str = field(default="", repr=False)
     made: bool = field(default=False, init=False)  # whether the token was generated
 
     def __post_init__(self) -> None:
         alone = _loopback(self.host)
-        # Whoever reaches another interface than loopback could ask, so that a token is needed.
+        # Other machines can reach any interface but loopback, so that a token is required.
         if not self.token and not alone:
             object.__setattr__(self, "token", secrets.token_urlsafe(24))
             object.__setattr__(self, "made", True)
@@ -70,9 +70,9 @@ class Address:
 
     @classmethod
     def read(cls, text: str, port: int, token: str = "") -> Address:
-        """Return the address that a user wrote: HOST, HOST:PORT, PORT or nothing at all."""
+        """Parse the address of a user: HOST, HOST:PORT, PORT or an empty string."""
         host, _, number = text.rpartition(":") if ":" in text else ("", "", text)
-        # The last part of a name or of an IPv6 address is no port.
+        # The last part of a name or of an IPv6 address is not a port.
         if number and not number.isdigit():
             host, number = text, ""
         if number and (len(number) > 5 or int(number) > 65535):
@@ -81,12 +81,12 @@ class Address:
 
 
 class Server:
-    """A WSGI application, served from its own threads.
+    """Server of a WSGI application, in its own threads.
 
     `url`: address of the server, with the token.
-    `shown`: address to print or log: with the token only if it was generated here, since the user
-    cannot know it otherwise.
-    Raises `RunError`: the port is taken, or the package that serves it is not installed.
+    `shown`: address to print or log. It contains the token only if it was generated here, since the
+    user cannot know it otherwise.
+    Raises `RunError`: the port is taken, or waitress is not installed.
     """
 
     def __init__(self, application: WSGIApplication, address: Address) -> None:
@@ -101,11 +101,11 @@ class Server:
             raise RunError(
                 f"Cannot listen on {host}:{port}: {reason}; choose another port."
             ) from error
-        # It warns of each request that waits for one of the threads.
+        # waitress warns of each request that waits for a thread.
         logging.getLogger("waitress.queue").setLevel(logging.ERROR)
         served = _headed(application, address)
         self._server = listener(served, place, lambda header: _why_not(header, address))
-        # What a daemon starts is one: no thread that serves keeps a program from its end.
+        # Threads started by a daemon thread are daemons too: none prevents the program from ending.
         self._thread = threading.Thread(target=self._server.run, daemon=True)
         self._thread.start()
         self.port = int(place.getsockname()[1])
@@ -115,11 +115,11 @@ class Server:
         self.shown = self.url if address.made else plain
 
     def wait(self) -> None:
-        """Serve until it is closed."""
+        """Block until the server is closed."""
         self._thread.join()
 
     def close(self) -> None:
-        """Stop listening."""
+        """Stop the server and its threads."""
         if self._thread.is_alive():
             self._server.stop()
             self._thread.join()
@@ -127,7 +127,7 @@ class Server:
 
 
 def _headed(application: WSGIApplication, address: Address) -> WSGIApplication:
-    """Return an application with our headers, and a cookie for clients with the token."""
+    """Wrap an application: check tokens, add headers, and set a cookie for the token."""
 
     def answer(environ: WSGIEnvironment, begin: StartResponse) -> Iterable[bytes]:
         if why := _why_not(environ, address):
@@ -143,9 +143,9 @@ def _headed(application: WSGIApplication, address: Address) -> WSGIApplication:
 
 
 def _why_not(environ: Mapping[str, Any], address: Address) -> str:
-    """Return why a request is refused, by its header; empty if it is not."""
+    """Return why a request with this header is refused, or an empty string."""
     if not address.token:
-        # A page elsewhere must not reach this machine under a name of its own.
+        # Against DNS rebinding: a foreign page may map its own host name to this machine.
         return "" if _loopback(_host(environ)) else NOT_HERE
     tokens = [_given(environ), *_known(environ)]
     return "" if any(_same(token, address.token) for token in tokens) else NO_TOKEN
@@ -157,14 +157,14 @@ def _given(environ: Mapping[str, Any]) -> str:
 
 def _host(environ: Mapping[str, Any]) -> str:
     host = str(environ.get("HTTP_HOST") or environ.get("SERVER_NAME", ""))
-    # An IPv6 address stands in brackets, before the port.
+    # An IPv6 address is in brackets before the port.
     if host.startswith("["):
         return host.partition("]")[0].strip("[")
     return host.partition(":")[0]
 
 
 def _known(environ: Mapping[str, Any]) -> list[str]:
-    """Return the tokens that a client has sent with the request."""
+    """Return the tokens in the headers of a request: as authorization or as cookies."""
     found = [str(environ.get("HTTP_AUTHORIZATION", "")).removeprefix("Bearer ").strip()]
     try:
         cookie = SimpleCookie(str(environ.get("HTTP_COOKIE", "")))
@@ -178,7 +178,7 @@ def _same(given: str, token: str) -> bool:
 
 
 def _adding(start: StartResponse, more: list[tuple[str, str]]) -> Any:
-    """Return a `start_response` of WSGI that adds headers."""
+    """Wrap a `start_response` of WSGI to add headers."""
 
     def begin(status: str, headers: list[tuple[str, str]], *rest: Any) -> Callable[[bytes], object]:
         return start(status, [*headers, *more], *rest)
