@@ -1,4 +1,4 @@
-"""Numbers in the cells of tables, and texts that mean a missing value."""
+"""Conversion of table cells to numbers, and texts for missing values."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from typing import Any, TypeAlias
 from livepde.errors import SampleError
 
 Missing: TypeAlias = Collection[float | str]
-"""Numbers and texts of a table that mean a missing value."""
+"""Numbers and texts in a table that stand for a missing value."""
 
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--", "---", "#n/a", "#nv"})
-LIMIT = re.compile(r"\s*[<>≤≥]\s*(.+?)\s*")  # <0.5: below or above the range of an instrument
+LIMIT = re.compile(r"\s*[<>≤≥]\s*(.+?)\s*")  # such as <0.5: outside the range of an instrument
 COMMA = "if that is a decimal comma, set decimal = ','."
 NO_POINT = "with decimal = ',', a point is not a decimal mark."
-POINT = str.maketrans(",.", ".,")  # so that a point where commas are decimals is no number
-MOST = 5  # texts that are listed
+POINT = str.maketrans(",.", ".,")  # swaps both, so that a number with a point is refused
+MOST = 5  # largest number of texts in a message
 
 
 def number_of(cell: Any, decimal: str = ".") -> float | None:
-    """Return a number or a number as text, None if it is neither."""
+    """Return a number, or a text that contains a number, as float; otherwise None."""
     try:
         if isinstance(cell, str):
-            if "_" in cell:  # which Python reads as 1000 in 1_000
+            if "_" in cell:  # Python would convert 1_000 to 1000
                 return None
             cell = cell if decimal == "." else cell.translate(POINT)
         return None if isinstance(cell, bool) else float(cell)
@@ -33,18 +33,18 @@ def number_of(cell: Any, decimal: str = ".") -> float | None:
 
 
 def has_decimal_comma(cell: Any) -> bool:
-    """Return whether a cell is a number if its comma is one of decimals."""
+    """Return whether a cell is a number with a decimal comma."""
     return isinstance(cell, str) and "," in cell and number_of(cell, ",") is not None
 
 
 def is_limit(cell: str) -> bool:
-    """Return whether a text is a limit that a reading was below or above, such as <0.5."""
+    """Return whether a text is a detection limit, such as <0.5."""
     found = LIMIT.fullmatch(cell)
     return found is not None and number_of(found[1].replace(",", ".")) is not None
 
 
 def is_missing(cell: Any, missing: Missing = ()) -> bool:
-    """Return whether a cell is empty, or a text that means a missing value.
+    """Return whether a cell is empty or stands for a missing value.
 
     >>> is_missing(" NaN"), is_missing("OVER"), is_missing("OVER", ["OVER"])
     (True, False, True)
@@ -62,10 +62,10 @@ def cell_number(
     missing: Missing = (),
     others: Iterable[Any] = (),
 ) -> float:
-    """Return a float, NaN if it is missing.
+    """Convert a cell to float, NaN if the value is missing.
 
-    `missing`: texts, and numbers, that mean a missing value. `others`: further cells of the column,
-    whose texts an error lists as well.
+    `missing`: texts and numbers that stand for a missing value. `others`: other cells of the
+    column, whose texts are also listed in an error message.
     """
     if is_missing(value, missing):
         return math.nan
@@ -81,7 +81,7 @@ def cell_number(
 
 
 def _remedy(value: Any, decimal: str, cells: Iterable[Any], missing: Missing) -> str:
-    """Return the end of a sentence about a cell that is not a number."""
+    """Return the end of the message about a cell that is not a number."""
     if decimal == "." and has_decimal_comma(value):
         return COMMA
     if decimal != "." and number_of(value) is not None:

@@ -1,8 +1,8 @@
-"""Conversion of the times of data, numbers or dates, and the times of each channel of a source.
+"""Conversion of times, given as numbers or dates, and checks of the clocks of a source.
 
-The program never changes a time of a source. A row far ahead waits until the rows that follow agree
-with it; a row that went back is not used. Both are reported, with the key that corrects a wrong
-clock.
+Times of a source are never corrected automatically. A row far ahead waits until later rows confirm
+it, and a row that goes back in time is not used. Both are reported, with the key that corrects a
+wrong clock.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from livepde.streams.cells import COMMA, NO_POINT, has_decimal_comma, number_of
 
 Instant: TypeAlias = float | str | date | datetime
 CALLED_TIME = re.compile(r"(t|time|timestamp|date|datetime|elapsed|zeit|temps)\b|.*time", re.I)
-# Formats of elapsed times, which are numbers: seconds of each part. 48:00:00 is two days.
+# Format of elapsed times -> seconds in each part. The first part may be large: 48:00:00 is two days
 ELAPSED = {"h:mm:ss": (3600.0, 60.0, 1.0), "h:mm": (3600.0, 60.0), "mm:ss": (60.0, 1.0)}
-FIRST_CELLS = 5  # of a column, in one of which a format of dates has to fit
-MOST = 0.8  # share of cells that a format of dates has to fit
+FIRST_CELLS = 5  # a format of dates must fit at least one of so many first cells of a column
+MOST = 0.8  # share of cells that a format of dates must fit
 ORDERS = ("%d-%m-%Y", "%m-%d-%Y", "%Y-%m-%d", "%d-%m-%y", "%m-%d-%y", "%y-%m-%d", "%d-%b-%Y")
-POINTED = ("%d-%m-%Y", "%d-%m-%y", "%Y-%m-%d")  # with points the day is always before the month
+POINTED = ("%d-%m-%Y", "%d-%m-%y", "%Y-%m-%d")  # with points, a month never comes first
 HOURS = ("", *(f" {h}" for h in ("%H:%M", "%H:%M:%S", "%H:%M:%S.%f")))
 HOURS += tuple(f" {h}{p}" for h in ("%I:%M", "%I:%M:%S") for p in (" %p", "%p"))
-FORMATS = tuple(  # of dates that loggers and spreadsheets write, except ISO
+FORMATS = tuple(  # formats of dates in files of loggers and spreadsheets, except ISO
     order.replace("-", mark) + hour
     for mark, hour in product("/-. ", HOURS)
     for order in (ORDERS if mark != "." else POINTED)
@@ -49,27 +49,27 @@ class Clock:
     name
         The time column: numbers, or dates and times.
     hour
-        The column of the times of day, where `name` holds days only; of CSV files.
+        In CSV files, the column of the times of day if `name` contains only days.
     factor
-        Multiplies numbers to give the model's time; dates become seconds divided by `second`.
+        Factor that converts numbers to model time.
     start, stop
-        First and last time used, in the terms of the column: a number (in the model's unit) or
-        a date in ISO format.
+        First and last time used, in the same form as the column: a number in the model's unit, or a
+        date in ISO format.
     second
-        One second in the model's unit of time.
+        One second in the model's unit of time, which converts dates.
     zone
-        Time zone of dates that name none.
+        Time zone of dates without a zone.
     format
-        Format of dates as text, as "%d.%m.%Y %H:%M"; empty: ISO format. Or a format of `ELAPSED`.
+        Format of dates as text, such as "%d.%m.%Y %H:%M", or a format of `ELAPSED`; empty: ISO.
     since
-        Date from which numbers count, so that they are dates; None: numbers are no dates.
+        Date from which numbers count, so that they are dates; None: numbers are not dates.
     decimal
         Decimal mark of numbers as text: "." or ",".
     margin
-        How much later than stop rows are read, for times that are corrected.
+        Time after `stop` up to which rows are also read, for times that are corrected later.
     doubt
-        Unit of numbers that the name of the column states, if they are to be read in another one
-        that nobody has stated. Such numbers are refused; empty: none.
+        Unit in the name of the column if it differs from the assumed unit, which was not specified.
+        Numbers are then refused. Empty: no conflict.
     """
 
     name: str
@@ -87,35 +87,35 @@ class Clock:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The columns that hold the times: one, or days and times of day."""
+        """Columns of the times: one column, or one for days and one for times of day."""
         return (self.name, self.hour) if self.hour else (self.name,)
 
     def bounds(self, dates: bool, where: str) -> tuple[float, float]:
-        """Return start and stop in model time (dates: since 1970)."""
+        """Return start and stop in model time, for dates since 1970."""
         low, high = -math.inf, math.inf
         if self.start is not None:
             low = self._bound(self.start, dates, f"{where}: start")
         if self.stop is not None:
             high = self._bound(self.stop, dates, f"{where}: stop")
             if dates and (next_day := _day_after(self.stop)) is not None:
-                # A day as stop includes its hours: up to the last number before the next day.
+                # A day as `stop` includes all its hours, up to the last float before the next day.
                 high = math.nextafter(self._bound(next_day, dates, f"{where}: stop"), low)
         return low, high + self.margin
 
     def repeated_hour(self, t: float) -> float:
-        """Return how much later the clocks show a time again, given since 1970, or 0."""
+        """Return the time until clocks show a time, given since 1970, again; 0 if they do not."""
         try:
             here = datetime.fromtimestamp(t / self.second, self.zone)
         except (ValueError, OverflowError, OSError):
             return 0.0
-        # A time that is shown twice has another offset at its second pass (fold = 1).
+        # A repeated time has a different UTC offset in the second pass (fold = 1).
         first, again = here.replace(fold=0).utcoffset(), here.replace(fold=1).utcoffset()
         if first is None or again is None:
             return 0.0
         return (first - again).total_seconds() * self.second
 
     def moment(self, cell: Any, dates: bool) -> float | None:
-        """Return a cell as a number; of dates in seconds since 1970. None if it is neither."""
+        """Return the time in a cell as a number, for dates in seconds since 1970, or None."""
         if self.format in ELAPSED:
             return elapsed(cell, self.format)
         if not dates:
@@ -130,7 +130,7 @@ class Clock:
             return None
 
     def stamp(self, value: Any, form: str = "") -> float | None:
-        """Return seconds since 1970 of a date or a date as text, None if it is neither."""
+        """Return a date, or a date as text, in seconds since 1970; None for anything else."""
         try:
             value = _parsed(value, form)
             if isinstance(value, date) and not isinstance(value, datetime):
@@ -157,11 +157,11 @@ class Clock:
 def read_times(
     cells: list[Any], clock: Clock, where: Callable[[int], str], before: bool | None = None
 ) -> tuple[Array, bool]:
-    """Return times in the model's unit, and whether they are dates.
+    """Convert cells to times in the model's unit; return the times and whether they are dates.
 
-    `where`: names a cell.
-    `before`: whether earlier ones were dates, if there were any.
-    Raises `SampleError`: a time that cannot be read, with the likely remedy.
+    `where`: function that returns the name of a cell for messages.
+    `before`: whether earlier times were dates; None: there are no earlier times.
+    Raises `SampleError`: a time cannot be read. The message contains the likely remedy.
     """
     dates = _are_dates(cells, clock, before)
     if clock.doubt and not dates and clock.format not in ELAPSED:
@@ -184,22 +184,22 @@ def read_times(
 def with_second_passes(
     times: Array, cells: Sequence[Any], clock: Clock, repeats: Callable[[int, int], bool]
 ) -> Array:
-    """Return times of dates; hours that clocks show twice are distinguished.
+    """Return the times of dates, corrected in the second pass of an hour that clocks repeat.
 
-    A date without a zone of its own that is not later than those before it belongs to the second
-    pass of such an hour, unless its row repeats an earlier one. One that follows the row before at
-    the usual interval belongs to it even then: a coarse reading may well be the same an hour later.
+    A date without a zone that is not later than all earlier dates is in the second pass of such an
+    hour, unless its row repeats an earlier row. A row at the usual interval after the row before is
+    in the second pass even then: a coarse reading may be the same an hour later.
 
-    `times`: in the model's unit since 1970, as of the first pass.
-    `cells`: the dates as they are written.
-    `repeats`: whether a row has the values of another row.
+    `times`: in the model's unit since 1970, assuming the first pass.
+    `cells`: the dates as text or date objects.
+    `repeats`: function that returns whether two rows have the same values.
     """
     steps = np.diff(times)
     if not (steps <= 0.0).any():
         return times
     found, last = times.copy(), -math.inf
     usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
-    first: dict[float, int] = {}  # row of each time of the first pass
+    first: dict[float, int] = {}  # time in the first pass -> its row
     for k, t in enumerate(times.tolist()):
         if t <= last and is_naive(cells[k], clock) and (again := clock.repeated_hour(t)):
             follows = math.isclose(t + again - last, usual, rel_tol=0.01)
@@ -212,7 +212,7 @@ def with_second_passes(
 
 
 def is_naive(cell: Any, clock: Clock) -> bool:
-    """Return whether a cell is a date without a zone."""
+    """Return whether a cell is a date and time without a zone."""
     if clock.since is not None:
         return clock.since.tzinfo is None
     try:
@@ -223,7 +223,7 @@ def is_naive(cell: Any, clock: Clock) -> bool:
 
 
 def _parsed(cell: Any, form: str) -> Any:
-    """Return the date that a text holds, and anything else as it is."""
+    """Parse a date if the cell is a text; return any other cell unchanged."""
     if not isinstance(cell, str):
         return cell
     text = cell.strip()
@@ -231,7 +231,7 @@ def _parsed(cell: Any, form: str) -> Any:
 
 
 def elapsed(cell: Any, form: str) -> float | None:
-    """Return the seconds of an elapsed time, None if it does not have the format.
+    """Return an elapsed time in seconds, or None if it does not have the format.
 
     >>> elapsed("26:00:30", "h:mm:ss"), elapsed("0:07.5", "mm:ss"), elapsed("0:75", "h:mm")
     (93630.0, 7.5, None)
@@ -248,7 +248,7 @@ def elapsed(cell: Any, form: str) -> float | None:
 
 
 def elapsed_formats(cells: Sequence[str]) -> list[str]:
-    """Return the formats of elapsed times that all cells have, if they never go back.
+    """Return the formats of elapsed times that fit all cells, such that times never decrease.
 
     >>> elapsed_formats(["0:00:00", "26:00:30"]), elapsed_formats(["0:10", "0:20"])
     (['h:mm:ss'], ['h:mm', 'mm:ss'])
@@ -260,11 +260,10 @@ def elapsed_formats(cells: Sequence[str]) -> list[str]:
 
 
 def date_formats(cells: Sequence[str]) -> list[str]:
-    """Return the formats in which the cells of a column may be dates; "" is ISO.
+    """Return the formats of dates that fit most cells of a column; "" is ISO.
 
-    A format has to fit most cells. More than one is left where the order of day, month and year
-    cannot be known: formats in which time goes back are dropped, and those with uneven steps where
-    exactly one gives even ones.
+    If the order of day, month and year is ambiguous, several formats remain. Formats are excluded
+    if times would decrease, or if they have uneven steps and exactly one format has even steps.
 
     >>> date_formats(["16/06/28 06:45", "16/06/28 07:00"])
     ['%d/%m/%y %H:%M', '%y/%m/%d %H:%M']
@@ -281,14 +280,14 @@ def date_formats(cells: Sequence[str]) -> list[str]:
 
 
 def _are_even(steps: Array) -> bool:
-    """Return whether the longest of several steps is barely longer than their median."""
+    """Return whether there are several steps, the longest at most 1.5 times their median."""
     return len(steps) > 1 and bool(0 < steps.max() <= 1.5 * np.median(steps))
 
 
 def _stamps(cells: Sequence[str], form: str) -> Array:
-    """Return the dates among cells in seconds since 1970; none unless most cells fit a format."""
+    """Return the dates in cells in seconds since 1970, or none unless the format fits most."""
     clock = Clock("")
-    # Hardly any of the formats fits the first cells; for the others, no more cells are parsed.
+    # Most formats do not fit the first cells. For these, no other cells are parsed.
     if all(clock.stamp(cell, form) is None for cell in cells[:FIRST_CELLS]):
         return np.empty(0)
     stamps = (clock.stamp(cell, form) for cell in cells)
@@ -297,7 +296,7 @@ def _stamps(cells: Sequence[str], form: str) -> Array:
 
 
 def guessed_format(text: str) -> str:
-    """Return the format in which a text may be a date; empty if none is known.
+    """Return a likely format of a date as text, or an empty string.
 
     >>> guessed_format("01.04.2025 12:00"), guessed_format("noon")
     ('%d.%m.%Y %H:%M', '')
@@ -305,13 +304,13 @@ def guessed_format(text: str) -> str:
     from pandas.tseries.api import guess_datetime_format
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it says which comes first, day or month: so do we
-        # With points the day comes first, as in 01.04.2025.
+        warnings.simplefilter("ignore")  # warnings on the order of day and month
+        # With points, the day comes first, as in 01.04.2025.
         return guess_datetime_format(text.strip(), dayfirst="." in text[:5]) or ""
 
 
 def _are_dates(cells: list[Any], clock: Clock, before: bool | None) -> bool:
-    """Return whether times are dates: by the first; if it is neither, by those before, or most."""
+    """Decide by the first time whether times are dates, else by earlier times or the majority."""
     first = cells[0]
     if clock.since is not None or clock.format in ELAPSED:
         return clock.since is not None
@@ -343,7 +342,7 @@ def _remedy(cell: Any, clock: Clock, dates: bool) -> str:
 
 
 def _other_format(text: str) -> str:
-    """Return the end of a sentence about a text that may be a time in another format."""
+    """Return the end of the message about a text that may be a time in another format."""
     if forms := elapsed_formats([text]):
         return f"; if it is an elapsed time, set time_format = {' or '.join(map(repr, forms))}."
     format = guessed_format(text)
@@ -351,7 +350,7 @@ def _other_format(text: str) -> str:
 
 
 def _day_after(value: Any) -> date | None:
-    """Return the day after one without a time, which includes its hours: 23 to 25; else None."""
+    """Return the day after a date without a time of day, or None; a day may have 23 to 25 h."""
     if isinstance(value, str) and len(value.strip()) == len("2025-04-01"):
         value = date.fromisoformat(value.strip())
     if not isinstance(value, date) or isinstance(value, datetime):
@@ -359,33 +358,34 @@ def _day_after(value: Any) -> date | None:
     return value + timedelta(days=1)
 
 
-STEPS = 16  # last steps of a channel, of which the longest but one is the usual step
-NEXT = 1.5  # usual steps up to which a time is the next one
-CALM = 1.5  # intervals between two times that went back, after which a clock is steady again
-FAR = 10.0  # usual steps: a row that is farther ahead waits. It costs a delay, and no row
+STEPS = 16  # number of last steps of a channel; the second longest is its usual step
+NEXT = 1.5  # largest step between consecutive times, in usual steps
+CALM = 1.5  # a clock is steady again after so many intervals between its last two setbacks
+FAR = 10.0  # usual steps beyond which a row waits for confirmation: a delay, but no loss of rows
 NAN = math.nan
 
 
 def usual_of(steps: Sequence[float]) -> float:
-    """Return the longest but one of several steps, NaN of none."""
-    # The longest step may be a pause of the source, which is not usual.
+    """Return the second longest step (a single step itself), or NaN without steps."""
+    # The longest step may be a pause of the source.
     return sorted(steps)[-2:][0] if steps else NAN
 
 
 @dataclass
 class _Times:
-    """Times of one channel: the newest used one, steps, and late times since then."""
+    """Times of a channel: newest used time, last steps, and late times since then."""
 
     newest: float = -math.inf
     steps: deque[float] = field(default_factory=lambda: deque(maxlen=STEPS))
     late: float = NAN
     went_back: bool = False
-    backs: deque[float] = field(default_factory=lambda: deque(maxlen=2))  # newest times then
+    # Newest times at the last two setbacks of the clock.
+    backs: deque[float] = field(default_factory=lambda: deque(maxlen=2))
 
     def use(self, t: float) -> bool:
-        """Note a time that is used; return whether it shows that the clock was set back."""
-        # Late times that lead on to this one: the clock stays as it is. Else it was wrong for a
-        # while, or a source has sent its past.
+        """Record a time that is used; return whether it shows that the clock was set back."""
+        # If late times continue up to this one, the clock was set back permanently. Otherwise it
+        # was wrong for a while, or the source has sent old rows.
         shifted = self.went_back and t - self.late <= NEXT * usual_of(self.steps)
         if 0.0 < t - self.newest < math.inf:
             self.steps.append(t - self.newest)
@@ -395,15 +395,15 @@ class _Times:
 
     @property
     def unsteady(self) -> bool:
-        """Whether the clock has gone back repeatedly, and not been right for long since then."""
+        """Whether the clock went back repeatedly and has not been steady for long since then."""
         if len(self.backs) < 2:
             return False
         return self.newest - self.backs[-1] < CALM * (self.backs[-1] - self.backs[0])
 
     def refuse(self, t: float) -> bool:
-        """Note a late time; return whether it is the first that shows that the clock went back."""
-        # One late row is a row that was delayed. Two that follow one another, with no row in order
-        # between them, show a clock that went back or a source that sends its past.
+        """Record a late time; return whether it is the first sign that the clock went back."""
+        # A single late row was delayed. Two consecutive late rows in order indicate a clock that
+        # went back, or a source that sends old rows.
         begins = t > self.late and not self.went_back
         self.went_back |= begins
         if begins:
@@ -413,7 +413,7 @@ class _Times:
 
 
 class ChannelTimes:
-    """Times of the channels of a source, each by its own steps.
+    """Times of the channels of a source, each with its own steps.
 
     `recent`: times and values of the last samples of an earlier session.
     """
@@ -424,41 +424,41 @@ class ChannelTimes:
             self.use(t, values)
 
     def usual(self, values: Mapping[str, float]) -> float:
-        """Return the usual step of the slowest channel with a value in a row; NaN if unknown."""
+        """Return the usual step of the slowest channel with a value in a row, or NaN."""
         known = (self._known[name] for name in present(values) if name in self._known)
         return max((usual_of(times.steps) for times in known if times.steps), default=NAN)
 
     @property
     def slowest(self) -> float:
-        """Usual step of the slowest channel; NaN if unknown."""
+        """Usual step of the slowest channel, or NaN."""
         return self.usual(dict.fromkeys(self._known, 0.0))
 
     def use(self, t: float, values: Mapping[str, float]) -> bool:
-        """Note the time of a row that is used; return whether its clock was set back before."""
+        """Record the time of a used row; return whether it shows that a clock was set back."""
         shown = [self._known[name].use(t) for name in present(values)]
         return any(shown)
 
     def refuse(self, t: float, values: Mapping[str, float]) -> bool:
-        """Note the time of a late row; return whether it shows first that its clock went back."""
+        """Record the time of a late row; return whether it is the first sign of a setback."""
         shown = [self._known[name].refuse(t) for name in present(values)]
         return any(shown)
 
     def withdraw(self, last: float) -> None:
-        """Forget that times later than this one were used."""
+        """Discard used times later than `last`."""
         for times in self._known.values():
             times.newest = min(times.newest, last)
 
     @property
     def unsteady(self) -> list[str]:
-        """Channels whose clock goes back again and again."""
+        """Channels whose clock goes back repeatedly."""
         return [name for name, times in self._known.items() if times.unsteady]
 
     @property
     def went_back(self) -> dict[str, float]:
-        """Channels whose clock went back, with the time of their last late row."""
+        """Channels whose clock went back -> time of their last late row."""
         return {name: times.late for name, times in self._known.items() if times.went_back}
 
 
 def present(values: Mapping[str, float]) -> list[str]:
-    """Return the channels with a value, or all channels of a row without any."""
+    """Return the channels with a value; if a row has no value, all its channels."""
     return [name for name, value in values.items() if not math.isnan(value)] or list(values)

@@ -32,15 +32,15 @@ from livepde.streams.clock import ELAPSED, Clock, date_formats, elapsed, read_ti
 
 T = TypeVar("T")
 
-UTF_8 = "utf-8-sig"  # with or without a mark at the start, as Excel writes it
+UTF_8 = "utf-8-sig"  # with or without a byte order mark, which Excel writes
 SEPARATORS = ("\t", ";", ",")  # in the order in which they are tried
-BLANK = " "  # a separator that stands for any number of blanks
-END = "end"  # of a file that is read
-LOOK = 100_000  # characters that are looked at to say how a file is written
-TOA5 = "TOA5"  # first cell of the title line of loggers by Campbell
-UNDER = 2  # most lines of labels under a header: units and kinds of values
+BLANK = " "  # separator of columns with any number of blanks between them
+END = "end"  # line appended to the lines of a file
+LOOK = 100_000  # characters from which the format of a file is detected
+TOA5 = "TOA5"  # first cell of the title line in files of Campbell loggers
+UNDER = 2  # largest number of label lines under a header: units and kinds of values
 GZIP = b"\x1f\x8b"
-BOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # how workbooks begin: .xlsx and .ods, .xls
+BOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # first bytes of workbooks: .xlsx and .ods, .xls
 
 
 @dataclass(frozen=True)
@@ -48,20 +48,20 @@ class Written:
     """The detected format of a CSV file, and the cells of its first rows.
 
     Dates that are not in ISO format have several possible formats if the order of day, month and
-    year is ambiguous.
+    year is ambiguous; `time_formats` lists them.
     """
 
     separator: str
     decimal: str
     encoding: str
-    skip: int  # lines before the header: titles
+    skip: int  # number of title lines before the header
     time_formats: tuple[str, ...]
     header: list[str]
     rows: list[list[str]]
 
     @property
     def time_format(self) -> str:
-        """The only format of its dates; empty if there are none or several."""
+        """Format of the dates; empty if there are no dates, ISO dates or several formats."""
         return self.time_formats[0] if len(self.time_formats) == 1 else ""
 
 
@@ -83,21 +83,21 @@ def read_csv(
     columns
         Channel -> its column.
     every
-        Number of rows of which one is kept.
+        Keep one in `every` rows.
     missing
-        Numbers and texts that mean a missing sample (-9999, OVER). Empty cells and NaN always do.
+        Numbers and texts for a missing value, such as -9999 or OVER, besides empty cells and NaN.
     separator
-        Field separator, as "," or ";".
+        Field separator, such as "," or ";".
     encoding
-        Text encoding, as "cp1252" or "utf-16".
+        Text encoding, such as "cp1252" or "utf-16".
     skip
-        Lines before the header.
+        Number of lines before the header.
 
     Raises
     ------
     DataError
-        No such file or column; text or infinity in a channel; times that do not increase. The
-        message names file, row (the header is row 1) and column.
+        The file or a column does not exist; a channel contains text or infinity; times do not
+        increase. The message names file, row (the header is row 1) and column.
     """
     path = Path(path)
     needed = [*clock.names, *table.decimal_marks(columns)]
@@ -117,21 +117,21 @@ def read_long_csv(
     encoding: str = UTF_8,
     skip: int = 0,
 ) -> list[table.DataTable]:
-    """Read channels from a CSV file with a row for each reading (long format), as a table each.
+    """Read a CSV file with a row for each reading (long format); return a table per channel.
 
     Parameters
     ----------
     columns
-        Channel -> its sensor, as a column with this name.
+        Channel -> its sensor, as a column with the name of the sensor.
     long
-        Columns that contain the names of the sensors, and their values.
+        Column of the names of the sensors, and column of their values.
     clock, every, missing, separator, encoding, skip
-        As for `read_csv`.
+        See `read_csv`.
 
     Raises
     ------
     DataError
-        As `read_csv`; no row of a sensor.
+        A sensor has no row; and the errors of `read_csv`.
     """
     path, (named, valued) = Path(path), long
     rows, cells = texts_of(path, [*clock.names, named, valued], separator, encoding, clock, skip)
@@ -155,7 +155,7 @@ def read_long_csv(
 def texts_of(
     path: Path, needed: Sequence[str], separator: str, encoding: str, clock: Clock, skip: int
 ) -> tuple[list[int], dict[str, tuple[str, ...]]]:
-    """Return the numbers of the rows of a CSV file, and the texts in some columns.
+    """Return the row numbers of a CSV file and the texts in the `needed` columns.
 
     Raises `DataError`.
     """
@@ -182,7 +182,7 @@ def _to_table(
     every: int,
     missing: Missing,
 ) -> table.DataTable:
-    """Return the channels in the texts of numbered rows."""
+    """Return a table of the channels from the texts of numbered rows."""
     decimals = table.decimal_marks(columns)
     stamps = [" ".join(parts) for parts in zip(*(cells[name] for name in clock.names), strict=True)]
     times, dates = read_times(stamps, clock, lambda k: f"{path}, row {rows[k]}, column")
@@ -202,7 +202,7 @@ def _to_table(
 
 
 def rows_of(lines: Iterable[str], separator: str, *, headed: bool = False) -> Iterator[list[str]]:
-    """Iterate over the rows of a text, as lists of their fields; `headed`: below their header.
+    """Yield the rows of a text as lists of fields; `headed`: the header was already read.
 
     >>> list(rows_of(["# time (d), head (m)", " 0.1  -0.040", "# end"], " "))
     [['time (d)', 'head (m)'], ['0.1', '-0.040'], ['# end']]
@@ -216,7 +216,7 @@ def rows_of(lines: Iterable[str], separator: str, *, headed: bool = False) -> It
             yield from csv.reader([text], delimiter=BLANK) if text else [[]]
         elif headed:
             yield [text]
-        else:  # a header that is a comment, whose names may have commas between them
+        else:  # a header that is a comment, perhaps with commas between names
             names = text.lstrip("# ")
             mark = next((mark for mark in SEPARATORS if mark in names), None)
             yield [name.strip() for name in names.split(mark)]
@@ -224,12 +224,12 @@ def rows_of(lines: Iterable[str], separator: str, *, headed: bool = False) -> It
 
 
 def is_title(cells: Sequence[str]) -> bool:
-    """Return whether a first line is the title that some loggers write above the header."""
+    """Return whether a line is the title that Campbell loggers write above the header."""
     return bool(cells) and cells[0].strip() == TOA5
 
 
 def are_labels(cells: Sequence[str]) -> bool:
-    """Return whether a line under the header has units or other words, and no values or dates.
+    """Return whether a line under the header contains units or other words, but no data.
 
     >>> are_labels(["TS", "RN", "Deg C"]), are_labels(["2025-01-01 00:00", "", "NAN"])
     (True, False)
@@ -245,7 +245,7 @@ def are_labels(cells: Sequence[str]) -> bool:
 
 
 def below_title(rows: Iterator[T], cells: Callable[[T], Sequence[str]]) -> Iterator[T]:
-    """Iterate over the rows of a file from its header on, without lines of labels under it."""
+    """Yield the rows of a file from its header on, without the label lines under it."""
     header = next(rows, None)
     if header is not None and is_title(cells(header)):
         header = next(rows, None)
@@ -263,7 +263,7 @@ def below_title(rows: Iterator[T], cells: Callable[[T], Sequence[str]]) -> Itera
 
 
 def header_of(path: Path, separator: str, encoding: str, skip: int) -> list[str]:
-    """Return the names of the columns of a CSV file; raises `DataError`."""
+    """Return the column names of a CSV file; raises `DataError`."""
     _check_text(path)
     try:
         with path.open(newline="", encoding=encoding) as file:
@@ -274,7 +274,7 @@ def header_of(path: Path, separator: str, encoding: str, skip: int) -> list[str]
 
 
 def _check_text(path: Path) -> None:
-    """Refuse a workbook, some of which can be taken for text, and a device, which has no end."""
+    """Refuse workbooks and compressed files, and devices, which have no end."""
     if stat.S_ISCHR(path.stat().st_mode):
         raise DataError(f"{path} is a device, not a file. Specify a file.")
     with path.open("rb") as file:
@@ -288,7 +288,7 @@ def _check_text(path: Path) -> None:
 def _check_header(
     path: Path, header: list[str], separator: str, encoding: str, clock: Clock, skip: int
 ) -> None:
-    """Refuse a header that another separator would divide, or a title in its place."""
+    """Refuse a title instead of a header, and a header that another separator would divide."""
     if not header:
         raise csv.Error("it is empty")
     if len(header) > 1:
@@ -309,9 +309,9 @@ def _check_header(
 
 
 def how_written(path: str | Path, encoding: str = "", skip: int | None = None) -> Written:
-    """Return how a CSV file seems to be written, by its first rows.
+    """Detect the format of a CSV file from its first rows.
 
-    `encoding` and `skip` are used if they are known.
+    `encoding` and `skip` are not detected if they are given.
     """
     path = Path(path)
     try:
@@ -323,9 +323,9 @@ def how_written(path: str | Path, encoding: str = "", skip: int | None = None) -
         raise table.no_file(path) from None
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}.") from error
-    # The last line may be cut off.
+    # The last line may be incomplete.
     whole = text if len(text) < LOOK else text.rpartition("\n")[0]
-    # Not `splitlines`, which also splits at form feeds and at separators of Unicode in a cell.
+    # `splitlines` would also split at form feeds and Unicode line separators in a cell.
     lines = [line.rstrip("\n") for line in io.StringIO(whole, newline=None)]
     separator = _separator(lines[skip:])
     if skip is None:
@@ -340,7 +340,7 @@ def how_written(path: str | Path, encoding: str = "", skip: int | None = None) -
 def _time_formats(
     header: Sequence[str], rows: Sequence[Sequence[str]], decimal: str
 ) -> tuple[str, ...]:
-    """Return the formats of the first named column that may hold dates; none without one."""
+    """Return the date formats of the first named column with dates that are not in ISO format."""
 
     def is_dated(text: str) -> bool:
         timed = any(elapsed(text, form) is not None for form in ELAPSED)
@@ -351,14 +351,14 @@ def _time_formats(
         texts = list(filterfalse(is_missing, cells))
         if not texts or not is_dated(texts[0]):
             continue
-        if formats := tuple(filter(None, date_formats(texts))):  # not of ISO dates
+        if formats := tuple(filter(None, date_formats(texts))):  # "" is ISO
             return formats
     return ()
 
 
 def _separator(lines: Sequence[str]) -> str:
-    """Return the separator of most lines: a tab or a semicolon, or else a comma."""
-    # Tabs and semicolons come first, because commas may also be marks of decimals.
+    """Return the separator of most lines: tab, semicolon, comma, or blanks between numbers."""
+    # Tabs and semicolons come first, because commas may also be decimal marks.
     for mark in SEPARATORS:
         if max(multimode(line.count(mark) for line in lines if line.strip()), default=0):
             return mark
@@ -372,16 +372,16 @@ def _all_numbers(cells: Sequence[str]) -> bool:
 
 
 def _titles(lines: Sequence[str], separator: str) -> int:
-    """Return how many lines at the start have fewer cells than most, and are no header."""
+    """Return the number of title lines at the start, which have fewer cells than most lines."""
     rows = [next(rows_of([line], separator), []) for line in lines]
     widths = list(map(_width, rows))
-    # A title has fewer cells than most lines; of equally frequent widths the smaller one counts.
+    # If several widths are equally frequent, the smallest one counts.
     usual = min(multimode(filter(None, widths)), default=0)
     start = next((k for k, found in enumerate(widths) if found >= usual), 0)
     names = rows[start] if rows else []
     titled = all(found <= 1 for found in widths[:start])
     if not titled or any(number_of(name.strip(), ",") is not None for name in names):
-        return 0  # it is the header that is short
+        return 0  # the header itself is short
     # A comment with as many cells as a row is a title, too, if names follow.
     names_follow = start + 1 < len(rows) and not any(map(_is_number, rows[start + 1]))
     return start + (lines[start].startswith("#") and names_follow)
@@ -392,12 +392,12 @@ def _is_number(cell: str) -> bool:
 
 
 def _likely(content: bytes, encoding: str) -> str:
-    """Return an encoding in which a text can be read, the given one if it can."""
+    """Return an encoding that can decode a text: the given one if possible."""
     try:
         content.decode(encoding)
         return encoding
     except UnicodeError:
-        # Text that is not UTF-8 mostly comes from Windows; cp1252 reads almost any bytes.
+        # Text that is not UTF-8 is usually from Windows; cp1252 decodes almost any bytes.
         wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         return "utf-16" if wide else "cp1252" if encoding == UTF_8 else "utf-8"
 
@@ -405,7 +405,7 @@ def _likely(content: bytes, encoding: str) -> str:
 def _as_written(
     path: Path, separator: str, encoding: str, clock: Clock, known: str, skip: int
 ) -> str:
-    """Return the options that a file seems to need, as text: the known one, and further ones."""
+    """Return the options that a file seems to require as text, beginning with a `known` option."""
     seems = how_written(path, encoding)
     divided = "separator" not in known and len(seems.header) > 1
     unlike = seems.separator != separator and separator not in "".join(seems.header)
@@ -421,15 +421,15 @@ def _as_written(
 
 
 def _width(cells: Sequence[str]) -> int:
-    """Return the number of cells up to the last one that is not empty."""
+    """Return the number of cells up to the last nonempty cell."""
     return max((k for k, cell in enumerate(cells, start=1) if cell.strip()), default=0)
 
 
 def unlike(cells: list[str], header: list[str], separator: str) -> bool:
-    """Return whether a row is longer than the header, and not only by empty fields.
+    """Return whether the number of fields in a row does not fit the header.
 
-    A separator at the end of each row, or of the header, is no field. Between blanks no field is
-    empty: a shorter row lacks a field there, or a name has blanks.
+    Empty fields at the end do not count. Fields between blanks cannot be empty, so that a shorter
+    row lacks a field, or a name contains blanks.
     """
     if separator == BLANK and len(cells) < len(header):
         return True
@@ -439,9 +439,9 @@ def unlike(cells: list[str], header: list[str], separator: str) -> bool:
 def _cells(
     path: Path, needed: list[str], separator: str, encoding: str, clock: Clock, skip: int
 ) -> tuple[list[int], dict[str, tuple[str, ...]]]:
-    """Return the numbers of the rows that are not blank, and the text in the needed columns.
+    """Return the numbers of the nonempty rows, and the texts in the needed columns.
 
-    Refuses a name that stands twice, more fields than names, and a quote that does not end.
+    Refuses repeated column names, rows with more fields than names, and unclosed quotes.
     """
     with path.open(newline="", encoding=encoding) as file:
         whole = chain(islice(file, skip, None), [f"{END}\n"])
@@ -462,7 +462,7 @@ def _cells(
                     f"{len(header)}; decimals need a point, and fields with a "
                     f"{'blank' if separator == BLANK else 'comma'} in them quotes."
                 )
-            # Cells that a row lacks at its end are empty.
+            # Cells that are absent at the end of a row are empty.
             row += [""] * (len(header) - len(row))
             texts = [row[place] for place in places]
             if any(texts):
@@ -472,7 +472,7 @@ def _cells(
 
 
 def _check_names(path: Path, header: list[str], needed: list[str]) -> None:
-    """Refuse a header without a needed column, or with two of its name."""
+    """Refuse a header that lacks a needed column or contains it twice."""
     table.check_columns(str(path), needed, header, told=path.suffix.lower() in table.SHOWN)
     for name in needed:
         if header.count(name) > 1:
@@ -480,9 +480,9 @@ def _check_names(path: Path, header: list[str], needed: list[str]) -> None:
 
 
 def _whole(lines: Iterable[list[str]], begin: int) -> Iterator[tuple[int, list[str]]]:
-    """Iterate over rows and their numbers, without the END that follows the last line.
+    """Yield row numbers and rows, without the line END that follows the last line.
 
-    Where a quote is still open there, END is part of it, and `csv.Error` is raised.
+    Raises `csv.Error` if END is not a separate row, since an unclosed quote includes it.
     """
     before: tuple[int, list[str]] | None = None
     for item in enumerate(lines, start=begin):
@@ -494,7 +494,7 @@ def _whole(lines: Iterable[list[str]], begin: int) -> Iterator[tuple[int, list[s
 
 
 def _not_text(path: Path, separator: str, encoding: str, clock: Clock, skip: int) -> DataError:
-    """Return an error about a file that is not text in this encoding."""
+    """Return the error for a file that is not text in this encoding."""
     content, row, byte = path.read_bytes(), 1, ""
     try:
         content.decode(encoding)
@@ -516,10 +516,10 @@ def _numbers(
     decimal: str,
     missing: Missing,
 ) -> Array:
-    """Return a column of text as numbers; its row is looked for only if one is wrong."""
+    """Convert a column of texts to numbers; `rows` are needed for error messages only."""
     try:
         plain = cells if decimal == "." else [cell.translate(POINT) for cell in cells]
-        # All cells at once, which is fast; one by one only where this fails, to name the wrong one.
+        # Converting all cells at once is fast. If it fails, single cells name the wrong one.
         found: Array = np.array([c if c else "nan" for c in plain], dtype=float)
         if any("_" in cell for cell in plain):
             raise ValueError("digits with a line between them")
