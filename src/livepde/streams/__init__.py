@@ -1,4 +1,4 @@
-"""Sources of samples: files, brokers, joined tables, twin experiments."""
+"""Sources of samples (files, brokers, joined tables, twin experiments) and stages of streams."""
 
 from livepde.streams.clock import Clock
 from livepde.streams.csvfile import read_csv

@@ -1,16 +1,16 @@
-"""Gaps and spikes of input and boundary channels, which are measurements, too.
+"""Gaps and spikes of input and boundary channels, which are also measurements.
 
-A gap is interpolated between its neighbours: by PCHIP where two values on each side are known, else
-by a straight line. At the end of a record, where no next value is known, nothing is filled in: the
-identifier holds the last value and says so.
+A gap is interpolated between its neighbours: by PCHIP if two values on each side are known, else by
+a straight line. Gaps at the end of a record are not filled: the identifier holds the last value and
+reports it.
 
-A spike is a single value far off the cubic through two neighbours on each side of it. It is refused
-and leaves a gap. If leaving out one value does not remove the large residuals, the channel has
-really changed, as an actuator does, and all values stay. A step that is written as two rows, a
-moment apart beside the usual interval, ends one curve and begins another.
+A spike is a single value far from the cubic through two neighbours on each side. It is refused and
+leaves a gap. If the large residuals remain without the value, the channel has really changed, such
+as an actuator, and all values are kept. A step that is recorded as two rows, much closer than the
+usual interval, ends one curve and begins another.
 
-Of channels that are constant between two readings nothing is refused. A value that holds until the
-next reading is never missing; a missing mean is part of the next one.
+Channels that are constant between two readings have no spikes. A value that holds until the next
+reading is never missing. A missing mean is part of the next mean.
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ from livepde.samples import Sample, in_order, number
 from livepde.stepping import Between, Held
 from livepde.streams.table import DataTable
 
-# With 12 of 1000 records of smooth signals and white noise lose a value, and all spikes of more
-# than 40 standard deviations are found: tests/test_gaps.py.
+# With 12, none of 1000 records `channel(seed)` of tests/test_gaps.py loses a value, and 297 of 300
+# spikes of 60 standard deviations of the noise are detected, but only 103 of 300 spikes of 40.
 BEYOND = 12.0
-LOCAL = 31  # residuals whose median is the local scale
-FEWEST = 8  # residuals from which a scale is taken
-RECENT = 64  # values of a channel that are kept to tell the scale of the next ones
-CENTRE, NEIGHBOURS = 2, 5  # of the five values that make a residual
-LEFT = 0.2  # share of a residual that may remain without a spike; of a step's 0.3 remains
-SHORT = 1.0 / 16.0  # of the usual interval: two rows nearer than this may write a step
-STAYS = 0.5  # of a step: what the values before and after it may change
-LONG = 10  # rows of a gap: a longer one is reported, as interpolation may miss much in it
-ROUNDING = 1e-12  # of the largest value of a channel: less is no residual
-ABOUT = 3  # values on each side that have to be plausible without a spike
+LOCAL = 31  # number of residuals whose median is the local scale
+FEWEST = 8  # smallest number of residuals that determine a scale
+RECENT = 64  # number of past values of a channel that determine the scale of residuals
+CENTRE, NEIGHBOURS = 2, 5  # index of the centre among the values of a residual, and their number
+LEFT = 0.2  # share of a residual that may remain without a spike; after a step, 0.3 remains
+SHORT = 1.0 / 16.0  # largest interval of two rows that record a step, in usual intervals
+STAYS = 0.5  # largest change before and after such a step, relative to the step
+LONG = 10  # rows of a gap; longer gaps are reported, since interpolation may be poor
+ROUNDING = 1e-12  # smallest relevant residual, relative to the largest value of a channel
+ABOUT = 3  # values on each side that must have small residuals without a spike
 GAUSS = 1.4826  # standard deviation over median absolute deviation of Gaussian noise
 
 Series = Sequence[tuple[float, float]]
-"""Times and known values of a channel, in order."""
+"""Times and known values of a channel, in order of time."""
 Waiting: TypeAlias = deque[tuple[Sample, dict[str, float]]]
-"""Samples that are not decided, with the values of the channels, NaN where missing."""
+"""Waiting samples with the values of the channels, NaN where missing."""
 
 
 def _residuals(t: Array, x: Array) -> tuple[Array, Array]:
-    """Return residuals of values to the cubic through two neighbours on each side, and weights.
+    """Return residuals to the cubic through two neighbours on each side, and their weights.
 
-    The residuals are reduced where the neighbours are far away, shape (values - 4,). The weights
-    are those of the five values in each, shape (values - 4, 5).
+    Residuals, shape (values - 4,), are reduced if the neighbours are far away. They are linear
+    combinations of five values each, with the weights, shape (values - 4, 5).
     """
     window = np.lib.stride_tricks.sliding_window_view
     times, values = window(t, NEIGHBOURS), window(x, NEIGHBOURS)
@@ -66,10 +66,10 @@ def _residuals(t: Array, x: Array) -> tuple[Array, Array]:
             if j != i:
                 weights[:, i] *= (times[:, CENTRE] - times[:, j]) / (times[:, i] - times[:, j])
         weights[:, i] *= -1.0
-    # The error of a cubic grows with the product of the distances, so that a large residual beside
-    # a gap is no evidence of a spike.
+    # The error of a cubic is proportional to the product of the distances, so that a large residual
+    # next to a gap does not indicate a spike.
     reach = np.abs(np.prod([times[:, CENTRE] - times[:, i] for i in others], axis=0))
-    # A cubic through two neighbours a moment apart takes their noise for a slope.
+    # If two neighbours are very close, the slope of the cubic is dominated by their noise.
     noise = np.sqrt((weights * weights).sum(axis=1))
     far = np.maximum(reach / np.median(reach), noise / np.median(noise))
     weights /= np.maximum(1.0, far)[:, None]
@@ -77,7 +77,7 @@ def _residuals(t: Array, x: Array) -> tuple[Array, Array]:
 
 
 def _curves(t: Array, x: Array) -> IntArray:
-    """Return the number of the curve that each value is part of: steps of two rows part them."""
+    """Return the number of the curve of each value; steps of two close rows separate curves."""
     steps, change = np.diff(t), np.abs(np.diff(x))
     near = np.maximum(np.append(0.0, change[:-1]), np.append(change[1:], 0.0))
     parts = (steps < SHORT * np.median(steps)) & (near < STAYS * change)
@@ -85,19 +85,19 @@ def _curves(t: Array, x: Array) -> IntArray:
 
 
 def _threshold(x: Array, size: Array, beyond: float) -> Array:
-    """Return the size above which residuals are implausible, from their global and local scale."""
+    """Return the thresholds of residuals, from their global and local scale."""
     absolute = np.abs(size)
     usual = float(np.median(absolute))
     steps = np.abs(np.diff(x))
-    # Most residuals of a coarsely resolved channel are zero, and then one step of its resolution
-    # would count as a spike.
+    # Most residuals of a channel with a coarse resolution are zero. Without this bound, one step of
+    # the resolution would count as a spike.
     resolution = steps[steps > 0.0].min(initial=math.inf)
     local = np.full_like(absolute, usual)
-    # A local scale only raises the threshold: where no residual is above it without, none is with.
+    # The local scale only raises the threshold, so it is not needed if no residual exceeds this.
     suspect = absolute.max() > beyond * max(GAUSS * usual, resolution)
-    if suspect and len(absolute) > LOCAL:  # where shorter, SciPy before 1.15.3 corrupts memory
-        # A window that is reflected at an end would count a spike there twice, so the ends take
-        # the median of the first and the last whole window.
+    if suspect and len(absolute) > LOCAL:  # SciPy before 1.15.3 corrupts memory for short arrays
+        # A window reflected at an end would count a spike there twice. The ends therefore have the
+        # median of the first and the last complete window.
         half = LOCAL // 2
         local = scipy.ndimage.median_filter(absolute, size=LOCAL)
         local[:half], local[-half:] = local[half], local[-half - 1]
@@ -107,9 +107,9 @@ def _threshold(x: Array, size: Array, beyond: float) -> Array:
 def find_spikes(t: Array, x: Array, beyond: float = BEYOND) -> Mask:
     """Return which known values of a channel are spikes, shape (values,).
 
-    `t`, `x`: times and finite values, in order.
+    `t`, `x`: increasing times, and finite values.
     `beyond`: distance from the cubic through the neighbours above which a value is suspect, in
-    robust standard deviations: the sum of the global and the local one.
+    units of the sum of the global and the local robust standard deviation.
     """
     spikes = np.zeros(len(x), dtype=bool)
     if len(x) < FEWEST + NEIGHBOURS - 1:
@@ -127,9 +127,9 @@ def find_spikes(t: Array, x: Array, beyond: float = BEYOND) -> Mask:
     excess = np.zeros(len(size))
     threshold = np.maximum(_threshold(x, size[whole], beyond), ROUNDING)
     excess[whole] = np.abs(size[whole]) / threshold
-    # The largest residual comes first, because a spike raises the residuals of its neighbours, too.
+    # The largest residual is first, because a spike also increases the residuals of its neighbours.
     for row in np.argsort(-excess)[: int((excess > 1.0).sum())].tolist():
-        if excess[row] <= 1.0:  # explained by a suspect before
+        if excess[row] <= 1.0:  # explained by an earlier suspect
             continue
         suspect = _suspect(size, weights, row)
         (own,) = np.nonzero(curve == curve[suspect])
@@ -141,9 +141,9 @@ def find_spikes(t: Array, x: Array, beyond: float = BEYOND) -> Mask:
 
 
 def _suspect(size: Array, weights: Array, row: int) -> int:
-    """Return the value whose change would best explain the residuals around a row."""
-    # The centre of the largest residual need not be the spike: uneven times may give a neighbour
-    # a larger weight. The pattern of all residuals that a value is part of tells them apart.
+    """Return the index of the value whose error best explains the residuals near `row`."""
+    # The centre of the largest residual need not be the spike, since for uneven times a neighbour
+    # may have a larger weight. All residuals that contain a value are compared with its pattern.
     best, most = row + CENTRE, -1.0
     for value in range(row, row + NEIGHBOURS):
         rows = np.arange(max(value - NEIGHBOURS + 1, 0), min(value + 1, len(size)))
@@ -156,8 +156,8 @@ def _suspect(size: Array, weights: Array, row: int) -> int:
 
 
 def _explains(t: Array, x: Array, suspect: int, largest: float) -> bool:
-    """Return whether the values about a suspect have small residuals without it."""
-    # Without two values on each side a spike cannot be told from the start of a change.
+    """Return whether the values around a suspect have small residuals without it."""
+    # A spike and the start of a change look the same without two values on each side.
     if not CENTRE <= suspect < len(x) - CENTRE:
         return False
     first = max(suspect - ABOUT, 0)
@@ -169,9 +169,9 @@ def _explains(t: Array, x: Array, suspect: int, largest: float) -> bool:
 
 
 def bridged(t: float, past: Series, later: Series) -> float:
-    """Return the value of a channel in a gap, NaN if it is not between known values.
+    """Interpolate a channel in a gap; NaN if the time is not between known values.
 
-    PCHIP where two values on each side are known, else a straight line.
+    The interpolation is PCHIP if two values on each side are known, else linear.
 
     >>> bridged(1.0, [(0.0, 2.0)], [(2.0, 4.0)])
     3.0
@@ -186,7 +186,7 @@ def bridged(t: float, past: Series, later: Series) -> float:
 
 
 def _spikes_after(past: Series, later: Series, beyond: float) -> list[bool]:
-    """Return which of the later values are spikes; of the last two of them nothing is known."""
+    """Return which of the later values are spikes; the last two cannot be judged yet."""
     if len(later) <= CENTRE or not math.isfinite(beyond):
         return [False] * len(later)
     t, x = np.array([*past, *later]).T
@@ -194,9 +194,9 @@ def _spikes_after(past: Series, later: Series, beyond: float) -> list[bool]:
 
 
 def filled_column(t: Array, x: Array, beyond: float = BEYOND) -> tuple[Array, Mask, Mask]:
-    """Return a channel without gaps, where it was interpolated, and where a spike was refused.
+    """Return a channel without gaps, and masks of its interpolated values and refused spikes.
 
-    Gaps before the first value and after the last stay.
+    Gaps before the first and after the last value remain.
     """
     known = np.flatnonzero(np.isfinite(x))
     spikes = np.zeros(len(x), dtype=bool)
@@ -207,8 +207,8 @@ def filled_column(t: Array, x: Array, beyond: float = BEYOND) -> tuple[Array, Ma
     if len(known) < 2:
         return new, gaps, spikes
     gaps[known[0] : known[-1]] = ~np.isfinite(new[known[0] : known[-1]])
-    # The first and the last interval keep the straight line: PCHIP takes its slopes from values on
-    # both sides, and `bridged` has to give the same on a stream.
+    # Interpolation is linear in the first and the last interval, because PCHIP needs values on both
+    # sides for its slopes, and the results must agree with those of `bridged` on a stream.
     new[gaps] = np.interp(t[gaps], t[known], x[known])
     inner = gaps & (t > t[known[1]]) & (t < t[known[-2]])
     if inner.any():
@@ -224,12 +224,12 @@ def fill_table(
     *,
     means: Iterable[str] = (),
 ) -> DataTable:
-    """Return a finished record without gaps between known values, and without spikes.
+    """Return a complete record without spikes, and without gaps between known values.
 
     Its remarks count interpolated values as "interpolated", or as "bridged" in gaps of more than
-    `LONG` rows, refused ones as "spike", those after the last value as "ended" if they are as many,
-    and remaining gaps as "missing". Readings of the channels `means` are means since the last one:
-    a gap is part of the next mean.
+    `LONG` rows; refused values as "spike"; missing values at the end as "ended" if there are more
+    than `LONG`; and other gaps as "missing". A reading of the channels `means` is the mean since
+    the last reading, so that a gap is part of the next mean.
     """
     values, remarks = table.values.copy(), dict(table.remarks)
     fills, screens, of_means = set(interpolated), set(screened), set(means)
@@ -248,7 +248,7 @@ def fill_table(
         if name not in fills:
             column[gaps], gaps = math.nan, np.zeros_like(gaps)
         values[:, k] = column
-        after = int(np.isfinite(column)[::-1].argmax())  # the last known value, from the end
+        after = int(np.isfinite(column)[::-1].argmax())  # missing values at the end
         ended = after if after > LONG else 0
         left = np.isnan(column).sum() - ended
         bridges = 0
@@ -263,27 +263,27 @@ def fill_table(
 
 @dataclass(frozen=True)
 class FillGaps:
-    """Interpolation of gaps of input channels, and refusal of spikes, as a stage of a stream.
+    """Stage of a stream that interpolates gaps of input channels and refuses spikes.
 
-    A sample without a value of one of the channels waits until the next value has come, at most for
-    `wait` or `samples`; then it is passed on as it is. While spikes are refused every sample waits
-    for the next two values of each channel: a lag of two samples.
+    A sample that lacks a value of one of the channels waits for the next value, at most for `wait`
+    or `samples`. After that, it is passed on unchanged. If spikes are refused, every sample waits
+    for the next two values of each channel, which is a lag of two samples.
 
     Parameters
     ----------
     channels
         Names of the input and boundary channels.
     wait
-        Longest time that a sample waits, in the unit of the stream.
+        Longest time for which a sample waits, in the unit of the stream.
     samples
-        Largest number of samples that it waits for.
+        Largest number of later samples that a sample waits for.
     spikes
-        Distance from its neighbours above which a value is refused, in robust standard deviations;
-        infinity: no spikes are sought, and only samples with gaps wait.
+        Distance from its neighbours above which a value is refused, in robust standard deviations.
+        Infinity: spikes are not refused, and only samples with gaps wait.
     between
-        Channel -> how it behaves between two readings, as for `Identifier`. Nothing is refused of a
-        channel that is not a "line"; a "hold" value is never missing, and a missing "next" value is
-        the next one.
+        Channel -> its behaviour between two readings, see `Identifier`. Only channels that are a
+        "line" have spikes. A "hold" value is never missing, and a missing "next" value equals the
+        next value.
 
     Examples
     --------
@@ -313,7 +313,7 @@ class FillGaps:
         Held.of(self.between, self.channels)  # raises for another channel or behaviour
 
     def __call__(self, stream: Iterable[Any]) -> Filled:
-        """Return the stream without gaps; items are `Sample`, (t, z) or (t, z, inputs)."""
+        """Return the stream without gaps; its items are `Sample`, (t, z) or (t, z, inputs)."""
         return Filled(self, stream)
 
 
@@ -348,7 +348,7 @@ class Filled(Iterable[Sample]):
         return {name: number(named.get(name), f"input '{name}'") for name in self.stage.channels}
 
     def _later(self, waiting: Waiting, name: str) -> Series:
-        """Return the known values of a channel after the first sample that waits."""
+        """Return the known values of a channel after the first waiting sample."""
         found = [(float(sample.t), values[name]) for sample, values in list(waiting)[1:]]
         return [pair for pair in found if math.isfinite(pair[1])]
 
@@ -369,7 +369,7 @@ class Filled(Iterable[Sample]):
     def _released(
         self, waiting: Waiting, recent: Mapping[str, deque[tuple[float, float]]]
     ) -> Sample:
-        """Return the first sample that waits, without gaps as far as possible."""
+        """Remove and return the first waiting sample, with gaps filled if possible."""
         sample, values = waiting[0]
         t, changed = float(sample.t), {}
         for name in self.stage.channels:
@@ -378,7 +378,7 @@ class Filled(Iterable[Sample]):
             value, kind = decided(t, values[name], list(past), later, self.stage.spikes, own)
             for each in kind:
                 self.counts[each, name] += 1
-            # The decided value, not the given one: a refused spike must not judge later values.
+            # This value is without spikes: a refused spike must not affect later decisions.
             if math.isfinite(value):
                 past.append((t, value))
             if kind:
@@ -395,9 +395,9 @@ def decided(
     beyond: float = BEYOND,
     between: Between = "line",
 ) -> tuple[float, tuple[str, ...]]:
-    """Return the value of a channel for a sample, and the kinds of remarks on it.
+    """Return the value of a channel in a sample without gap or spike, and the kinds of remarks.
 
-    `past` and `later` are known values before and after. If `beyond` is infinite, spikes stay.
+    `past`, `later`: known values before and after. If `beyond` is infinite, spikes are kept.
     """
     kinds: tuple[str, ...] = ()
     if between == "hold":
@@ -410,7 +410,7 @@ def decided(
         if not _spikes_after(past, [(t, value), *later], beyond)[0]:
             return value, ()
         kinds = ("spike",)
-    # Later values are not judged yet, so one of them may be a spike itself.
+    # Later values have not been judged yet and may also be spikes.
     spikes = _spikes_after(past, later, beyond)
     plausible = [pair for pair, spike in zip(later, spikes, strict=True) if not spike]
     found = bridged(t, past, plausible)
@@ -418,7 +418,7 @@ def decided(
 
 
 def _with(sample: Sample, values: Mapping[str, float]) -> Sample:
-    """Return a sample with other values of some channels, in z or inputs as before."""
+    """Return a copy of a sample with new values of channels, each in z or inputs as before."""
     inputs = None if sample.inputs is None else dict(sample.inputs)
     if not isinstance(sample.z, Mapping):
         return Sample(t=sample.t, z=sample.z, inputs={**(inputs or {}), **values})

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 EARLY = "early"  # kind of the remark on readings before another file begins
-PAUSE = 5.0  # usual intervals, beyond which readings are far apart
-SAME = 1e-10  # of the whole time: times that differ by less are one moment
+PAUSE = 5.0  # usual intervals beyond which readings are far apart
+SAME = 1e-10  # times that differ by less, relative to the total duration, are equal
 
 
 def join_tables(
@@ -37,18 +37,18 @@ def join_tables(
 ) -> DataTable:
     """Merge the rows of several tables in order of time; absent channels are missing values.
 
-    The result begins with the first row in which a sensor has a value and before which every
-    table with inputs has begun. Other channels without a value in that row have the one that their
-    neighbours give: on a line, or the last or the next one.
+    The result begins with the first row in which a sensor has a value and all tables with inputs
+    have begun. Inputs without a value in this row are interpolated linearly, or have their last or
+    next value, according to `between`.
 
     `second`: one second in the unit of time.
     `sensors`: channels that are not interpolated.
     `needed`: channels without which a row is left out.
     `where`: name of the data, for messages.
-    `between`: channel -> how it behaves between two readings; a line if it is left out.
-    `together`: the tables of sensors must have begun, too.
-    `profile`: sensors that an initial profile is made of. In the first row they have the value on
-    the line between their readings before and after it, unless these are far apart.
+    `between`: channel -> its behaviour between two readings; default "line".
+    `together`: whether tables with only sensors must also have begun.
+    `profile`: sensors of the initial profile. Their missing values in the first row are linearly
+    interpolated, unless their readings before and after it are far apart.
     Raises `DataError`: some times are dates and some numbers; or the tables have no time in common.
     """
     times, first = _on_one_clock(tables, second, where)
@@ -64,7 +64,7 @@ def join_tables(
         )
     begin = int(usable.argmax())
     kinds: Any = np.array([between.get(name, "line") for name in names])
-    # A run needs each input at its start, where a slower logger may have no row.
+    # A run needs all inputs at its start, where a slower logger may have no row.
     opened = ~sensed | joined.columns.isin(list(profile))
     for k in np.flatnonzero(opened & ~known[begin] & known.any(axis=0)):
         at = known[:, k]
@@ -74,7 +74,7 @@ def join_tables(
     kept = np.isfinite(inputs).all(axis=1)
     if not kept.any():
         raise DataError(f"{where}: no row has all channels that it needs.")
-    # A row that is left out keeps the means that it states, and what changes of inputs that hold.
+    # A row that lacks needed channels still keeps its means and the changes of held inputs.
     held = kinds != "line"
     last = joined.ffill().shift().to_numpy()
     new = known & ((kinds == "next") | (joined.to_numpy() != last))
@@ -99,9 +99,9 @@ def _common_start(
     *,
     together: bool,
 ) -> tuple[float, float]:
-    """Return when all tables that have to have begun, and by how little one moment may differ.
+    """Return the time at which all required tables have begun, and the tolerance of equal times.
 
-    Refuses tables without a time in common; what holds continues after its last reading.
+    Refuses tables without a time in common; held inputs continue after their last reading.
     """
     starts, ends = np.transpose([(t[0], t[-1]) for t in times])
     holds = [all(between.get(name) == "hold" for name in table.names) for table in tables]
@@ -113,7 +113,7 @@ def _common_start(
 
 
 def _counted(kind: str, names: Iterable[str], marked: Mask) -> Counter[tuple[str, str]]:
-    """Return how many rows of each column are marked, (rows, columns), where any is."""
+    """Count the marked rows of each column, shape (rows, columns); counts of zero are omitted."""
     counts = zip(names, marked.sum(axis=0).tolist(), strict=True)
     return Counter({(kind, name): n for name, n in counts if n})
 
@@ -121,12 +121,12 @@ def _counted(kind: str, names: Iterable[str], marked: Mask) -> Counter[tuple[str
 def not_late(
     table: DataTable, late: Mapping[str, float], sensors: Collection[str]
 ) -> list[DataTable]:
-    """Return a table as several, in which the times of late channels are earlier.
+    """Split a table so that the times of late channels can be corrected.
 
-    A channel without values stays where it is. A sensor whose times are early has no value at the
-    start of the others, which begin as before; an input has to be known from the start.
+    A channel without values is not corrected. If a correction makes a sensor begin after the other
+    channels, it has a missing value at their start; an input must be known from the start.
 
-    `late`: channel -> how much later than its values its times are, in the unit of the times.
+    `late`: channel -> delay of its times relative to its values, in the unit of the times.
     `sensors`: channels that may be missing.
     """
     seen = np.isfinite(table.values)
@@ -145,16 +145,16 @@ def not_late(
 
 
 def _is_amid(t: float, times: Array) -> bool:
-    """Return whether a time is between two of several, which are not far apart."""
+    """Return whether a time is between two consecutive times that are not far apart."""
     k, steps = int(np.searchsorted(times, t)), np.diff(times)
     return bool(0 < k < len(times) and steps[k - 1] <= PAUSE * np.median(steps))
 
 
 def _opening(t: float, times: Array, values: Array, between: Between) -> float:
-    """Return the value of a channel at a time where it has none."""
+    """Return the value of a channel at a time without a reading, NaN if it is unknown."""
     if between == "line":
         return float(np.interp(t, times, values))
-    k = int(np.searchsorted(times, t))  # the first one later
+    k = int(np.searchsorted(times, t))  # first later time
     if between == "hold":
         return float(values[k - 1]) if k else np.nan
     return float(values[k]) if k < len(values) else np.nan
@@ -163,9 +163,9 @@ def _opening(t: float, times: Array, values: Array, between: Between) -> float:
 def _on_one_clock(
     tables: Sequence[DataTable], second: float, where: str
 ) -> tuple[list[Array], float | None]:
-    """Return the times of each table, and the date from which all count: the earliest origin.
+    """Return the times of each table relative to the earliest origin, and this origin.
 
-    The date is in seconds since 1970, or None where times are numbers.
+    The origin is in seconds since 1970, or None if times are numbers.
     """
     dated = [since_1970(table.origin) for table in tables if table.origin is not None]
     if not dated:
@@ -182,9 +182,9 @@ def _outer_join(
 ) -> tuple[Array, pd.DataFrame]:
     """Return the times of all rows in order, shape (rows,), and a column for each channel.
 
-    Times that fall into one interval of this width are one row, with the first table's time.
+    Times in the same interval of length `width` are one row, with the time of the first table.
     """
-    import pandas as pd  # slow to load, and a single table needs none
+    import pandas as pd  # slow to load, and not needed for a single table
 
     keys = [np.rint(t / width) for t in times]
     moments = pd.concat([pd.Series(t, index=key) for t, key in zip(times, keys, strict=True)])

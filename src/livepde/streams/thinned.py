@@ -1,4 +1,4 @@
-"""Every n-th row of a stream, with the switches and the means that lie between."""
+"""Thinning of a stream that preserves switches of held inputs and means."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ from livepde.stepping import Between
 
 
 class Thinned:
-    """Every n-th row of a stream, without the loss of a switch or of a share of a mean.
+    """Keep every n-th row of a stream without losing a switch or a part of a mean.
 
-    A row that would be left out stays as a row of its held inputs alone where one of them
-    (`between = "hold"`) changes. So does a row with a `"next"` reading that lacks a channel that
-    each sample needs. Such a reading becomes the mean, weighted by time, since the last row that
-    stays.
+    If a held input (`between = "hold"`) changes in a row that would be left out, the row is kept
+    with only its held inputs. The same applies to a row with a `"next"` reading that lacks a needed
+    channel. A `"next"` reading becomes the time-weighted mean since the last kept row.
 
     `between`: behaviour of each column between two readings.
 
-    `held`: columns that are no "line", shape (columns,).
+    `held`: columns that are not a "line", shape (columns,).
 
     >>> rows = Thinned(["line", "hold"])
     >>> rows.take(0.0, np.array([20.0, 1.0]), chosen=True, whole=True)
@@ -38,25 +37,25 @@ class Thinned:
         self._begun = False
 
     def stride(self, every: int) -> int:
-        """Return the number of rows of which one is read: all where a row may hold a switch."""
+        """Return the stride at which rows are read: 1 if rows may contain a switch or a mean."""
         return 1 if self.held.any() else every
 
     def remember(self, row: Array) -> None:
-        """Remember the values of a row before the start that hold until the next reading."""
+        """Store the held values of a row, such as a row before the start."""
         for k in self._hold:
             if math.isfinite(row[k]):
                 self._last[k] = row[k]
 
     def take(self, t: float, row: Array, *, chosen: bool, whole: bool) -> Array | None:
-        """Return the rest of a row, NaN where a column is missing; None if nothing is left.
+        """Return the kept part of a row, NaN in missing columns; None if the row is left out.
 
-        `chosen`: whether `every` leaves the row.
-        `whole`: whether the row has all channels that a sample needs.
+        `chosen`: whether the row is one of every n rows.
+        `whole`: whether the row has all needed channels.
         """
         for k, mean in self._means.items():
             mean.add(t, float(row[k]))
         kept = chosen and whole
-        # Before the first row that is kept, values are remembered for it.
+        # Before the first kept row, held values are only stored for it.
         stays = kept or (self._begun and self._states(row, chosen))
         self.remember(row)
         if not stays:
@@ -70,15 +69,15 @@ class Thinned:
         return found
 
     def _states(self, row: Array, chosen: bool) -> bool:
-        """Return whether a row changes an input that holds, or has the end of a mean."""
+        """Return whether a row changes a held input, or is chosen and ends a mean."""
         changed = any(math.isfinite(row[k]) and row[k] != self._last[k] for k in self._hold)
         return changed or (chosen and any(math.isfinite(row[k]) for k in self._means))
 
 
 class _Mean:
-    """Mean of the readings since it was last taken, each weighted by the time since the one before.
+    """Mean of the readings since the last `taken`, weighted by the time since each last reading.
 
-    A missing reading leaves its time to the next one.
+    The time of a missing reading is added to the weight of the next reading.
     """
 
     def __init__(self) -> None:
