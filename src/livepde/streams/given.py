@@ -1,4 +1,4 @@
-"""Measurements as users have them, for `Identifier.run`: a table, a dataset, or a file."""
+"""Reading of the data of `Identifier.run`: a table, a dataset, or a file."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ from livepde.streams.clock import CALLED_TIME, Clock
 from livepde.streams.csvfile import how_written, read_csv
 from livepde.units import Affine, conversion, other_time_unit
 
-INDEX = "__index_level_0__"  # how pandas names an index without a name in a Parquet file
-TEMPERATURE = re.compile(r"T\b")  # not a time, though `CALLED_TIME` has no regard for capitals
+INDEX = "__index_level_0__"  # name by pandas of an unnamed index in a Parquet file
+TEMPERATURE = re.compile(r"T\b")  # not a time; `CALLED_TIME` ignores case
 
 
 def _is_time(name: str) -> bool:
-    """Return whether a column has the name of times."""
+    """Return whether the name of a column indicates times."""
     return bool(CALLED_TIME.match(name)) and not TEMPERATURE.match(name)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """How the channels of an identifier are read from a table."""
+    """Reader of the channels of an identifier from tabular data."""
 
-    channels: Sequence[str]  # that need a column
-    optional: Sequence[str]  # that are read if there is such a column: noise of readings, places
+    channels: Sequence[str]  # channels that need a column
+    optional: Sequence[str]  # channels that are read if they have a column: noise, places
     unit: str  # the model's unit of time; empty if it has none
     channel_units: Mapping[str, str]  # sensor or input -> its unit in the model
-    # The column of times. Default: the index of a table, the coordinate of a dataset, else the one
-    # column that is called time, t, date or the like.
+    # The column of times. Default: the index of a table, the coordinate of a dataset, else the only
+    # column with a name such as time, t or date.
     time: str | None = None
-    time_unit: str | None = None  # of times that are numbers, default that of the model
-    columns: Mapping[str, str] = field(default_factory=dict)  # channel -> column of another name
-    units: Mapping[str, str] = field(default_factory=dict)  # the same -> unit of its column
-    strict: bool = False  # whether a column that is no channel is an error; else it is ignored
+    time_unit: str | None = None  # unit of numeric times; None: the model's unit
+    columns: Mapping[str, str] = field(default_factory=dict)  # channel -> column if names differ
+    units: Mapping[str, str] = field(default_factory=dict)  # channel -> unit of its column
+    strict: bool = False  # whether other columns are an error; else they are ignored
 
     def table(self, data: Any) -> tables.DataTable:
-        """Return the samples.
+        """Return the samples of the data.
 
-        Raises `DataError`: a column that is missing, unknown or holds text; times that do not
-        increase; a file that cannot be read.
-        Raises `ConfigurationError`: options that do not fit the identifier; dates for a model
-        without a unit of time.
+        Raises `DataError`: a column is missing, unknown or contains text; times do not increase; or
+        a file cannot be read.
+        Raises `ConfigurationError`: options do not fit the identifier, or times are dates and the
+        model has no unit of time.
         """
         self._check()
         if is_dataset(data):
@@ -64,7 +64,7 @@ class Reading:
         return table
 
     def _check(self) -> None:
-        """Refuse options that name no channel, and units of times that the model cannot have."""
+        """Refuse options for unknown channels, and units for a model without units."""
         known = [*self.channels, *self.optional]
         for option, given in (("columns", self.columns), ("units", self.units)):
             for name in given:
@@ -89,7 +89,7 @@ class Reading:
             )
 
     def _clock(self, time: str, unit: str | None, **written: Any) -> Clock:
-        """Return how times are read; `unit`: of times that are numbers, if it is known."""
+        """Return the clock that converts times; `unit`: unit of numeric times, if it is known."""
         if not self.unit:
             return Clock(time, **written)
         factor, second = (
@@ -100,7 +100,7 @@ class Reading:
 
     @cached_property
     def _names(self) -> dict[str, str]:
-        """Channel -> its column, which an optional one may lack."""
+        """Channel -> its column, which may be absent for an optional channel."""
         return {name: self.columns.get(name, name) for name in (*self.channels, *self.optional)}
 
     def _columns(
@@ -111,10 +111,10 @@ class Reading:
         units: Mapping[str, str],
         decimal: str = ".",
     ) -> dict[str, tables.Column]:
-        """Return the column of each channel that has one, all checked.
+        """Return the column of each channel; a missing one is refused unless it is optional.
 
         `names`: columns of the data.
-        `units`: column -> its unit, of data that state one.
+        `units`: column -> its unit, if the data contain units.
         """
         noise_of = dict(zip(map(noise_channel, self.channels), self.channels, strict=True))
         found: dict[str, tables.Column] = {}
@@ -123,11 +123,11 @@ class Reading:
                 if name in self.optional and name not in self.columns:
                     continue
                 raise self._missing(where, name, column, names)
-            of = noise_of.get(name, "")  # the noise of each reading of this channel
+            of = noise_of.get(name, "")  # channel whose noise this column contains
             unit = self.units.get(name, units.get(column, ""))
             rule = self._rule(name, unit, self.channel_units.get(of or name))
             scale = rule.factor, rule.offset
-            if of:  # in the unit of the readings where it states none
+            if of:  # the default unit of noise is the unit of the readings
                 scale = rule.factor if unit else found[of].factor, 0.0
             found[name] = tables.Column((column,), *scale, decimal=decimal, noise_of=of)
         if self.strict:
@@ -136,11 +136,11 @@ class Reading:
 
     @staticmethod
     def _rule(name: str, unit: str, own: str | None) -> Affine:
-        """Return how values in a stated unit, else their own, become those of the model."""
+        """Return the conversion from a unit, by default the model's unit, to the model's unit."""
         return conversion(unit or own, own, f"units of '{name}'") if own else Affine()
 
     def _refuse_more(self, where: str, names: Sequence[str], used: set[str]) -> None:
-        """Refuse a column that is no channel."""
+        """Refuse a column that is not used."""
         for name in (name for name in names if name not in used):
             raise SampleError(
                 f"{where}: column '{name}' is not a channel of this identifier, which has "
@@ -148,7 +148,7 @@ class Reading:
             )
 
     def _missing(self, where: str, name: str, column: str, names: Sequence[str]) -> SampleError:
-        """Return an error about a channel without its column."""
+        """Return the error for a channel without a column."""
         hint = tables.hint(column, list(names))
         return SampleError(
             f"{where}: there is no column '{column}'{hint} If it has another name, give "
@@ -156,7 +156,7 @@ class Reading:
         )
 
     def _time(self, where: str, names: Sequence[str]) -> str:
-        """Return the column of times."""
+        """Return the name of the column of times."""
         if self.time is not None:
             tables.check_columns(where, [self.time], list(names))
             return self.time
@@ -164,7 +164,7 @@ class Reading:
         called = list(filter(_is_time, free))
         if len(called) == 1:
             return called[0]
-        if not called and (INDEX in free or names[:1] == [""]):  # an index that pandas has written
+        if not called and (INDEX in free or names[:1] == [""]):  # index written by pandas
             return INDEX if INDEX in free else ""
         what = "no column is called time"
         if called:
@@ -184,7 +184,7 @@ class Reading:
         return self._tabulated(time, series[time], series, {})
 
     def _uses_index(self, index: Any, names: Sequence[str]) -> bool:
-        """Return whether the index of a pandas table has its times; it may only count the rows."""
+        """Return whether the index of a pandas table contains times, not only row numbers."""
         if self.time is not None:
             return False
         counts = hasattr(index, "step") and index.name is None  # a RangeIndex
@@ -201,7 +201,7 @@ class Reading:
         return True
 
     def _dataset(self, data: Any) -> tables.DataTable:
-        """Return the samples of an xarray dataset, whose variables may state their units."""
+        """Return the samples of an xarray dataset, whose variables may have units."""
         dims = set(data[list(data.data_vars.keys() & self._names.values())].dims)
         if len(dims) > 1:
             raise SampleError(
@@ -212,7 +212,7 @@ class Reading:
         series = {str(name): data[name].to_series() for name in names}
         units = {str(name): str(data[name].attrs.get("units", "")) for name in names}
         if not dims:
-            self._columns("data", "", list(map(str, data.data_vars)), {})  # names what is missing
+            self._columns("data", "", list(map(str, data.data_vars)), {})  # raises an error
         time = self.time or str(*dims)
         if time not in data.coords:
             raise SampleError(f"data: there is no coordinate '{time}' with the times: assign it.")
@@ -222,7 +222,7 @@ class Reading:
     def _tabulated(
         self, time: str, times: Any, series: Mapping[str, Any], units: Mapping[str, str]
     ) -> tables.DataTable:
-        """Return the samples in columns of pandas."""
+        """Return the samples in the columns of a pandas table."""
         unit = self.time_unit or units.get(time)
         if times.dtype.kind == "m":
             self._need_unit("the times are durations")
@@ -231,7 +231,7 @@ class Reading:
         return tables.tabulated(times, series, columns, self._clock(time, unit), where="data")
 
     def _file(self, path: Path) -> tables.DataTable:
-        """Return the samples of a file; its extension gives the format."""
+        """Return the samples of a file; its suffix determines the format."""
         where = str(path)
         if path.suffix in (*tables.JSON_LINES, ".parquet"):
             if path.suffix == ".parquet":
@@ -265,7 +265,7 @@ class Reading:
 
 
 def _first_keys(path: Path) -> list[str]:
-    """Return the keys of the first object in a file of JSON lines."""
+    """Return the keys of the first line in a file of JSON lines."""
     try:
         with path.open(encoding="utf-8") as file:
             first = json.loads(next((line for line in file if line.strip()), "{}"))

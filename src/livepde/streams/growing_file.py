@@ -1,8 +1,8 @@
-"""The lines of a file that grows, whatever becomes of it: rotated, cut, copied, or written again.
+"""Lines of a growing file, which may also be rotated, truncated, copied or rewritten.
 
-A file is known by its device and inode numbers and by its first bytes. Before and after each look
-the bytes before the place of reading are compared with those that were read: what has changed under
-its name is another file, which is read from its start.
+A file is identified by its device and inode numbers and by its first bytes. Before and after each
+read, the bytes before the read position are compared with the bytes read earlier. If they have
+changed, the file counts as a new file, which is read from its start.
 """
 
 from __future__ import annotations
@@ -23,42 +23,42 @@ from typing import NamedTuple
 
 from livepde.errors import DataError
 
-LONGEST = 1_000_000  # bytes of a line; longer ones are refused unread
-CHUNK = 1 << 20  # bytes that are read at once
-CHUNKS = 16  # of one look: a signal is heard between two looks
+LONGEST = 1_000_000  # bytes of a line; longer lines are refused
+CHUNK = 1 << 20  # bytes read at a time
+CHUNKS = 16  # largest number of chunks per call: signals are handled between two calls
 HEAD = 4096  # bytes at the start of a file that identify it
-TAIL = 512  # bytes before the place of reading that are compared
-NAP = 0.05  # seconds for which a file that was written again must not have changed
-RESTLESS = 1.0  # seconds after which a file is read that changes at each look
-HOLES = 60.0  # seconds after which NUL bytes amid a file are no longer expected to be filled
-LINGER = 60.0  # seconds for which a file that was rotated is still looked at
-MOST_KNOWN = 16  # files whose places are known
-SIBLINGS = 1000  # files of a folder among which rotated ones are looked for
+TAIL = 512  # bytes before the read position that are compared
+NAP = 0.05  # seconds without changes after which a rewritten file is read
+RESTLESS = 1.0  # seconds after which a rewritten file is read even if it still changes
+HOLES = 60.0  # seconds after which NUL bytes inside a file are no longer expected to be filled
+LINGER = 60.0  # seconds for which a rotated file is still read
+MOST_KNOWN = 16  # largest number of files whose identity is stored
+SIBLINGS = 1000  # largest number of files in a folder that are searched for rotated files
 PACKED = (".gz", ".bz2", ".xz", ".zst", ".zip")
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 
 class Line(NamedTuple):
-    """A line of a file, or an event of it."""
+    """A line of a file, or a message about the file."""
 
-    number: int  # of the file
-    start: int  # first byte of the line in it
-    content: bytes  # with its end
-    kind: str = ""  # if there is no line: "malformed", or "rewritten" where rows may be missing
-    told: str = ""
+    number: int  # number of the file
+    start: int  # offset of the line in the file
+    content: bytes  # with its line end
+    kind: str = ""  # kind of a message: "malformed", or "rewritten" if rows may be missing
+    told: str = ""  # text of a message
 
 
 class FilePosition(NamedTuple):
-    """A place in a file, and the mark of the file."""
+    """A position in a file, and the identity of the file."""
 
-    start: int = 0  # byte before which all was read
-    crc: int = 0  # checksum of the first bytes before it
+    start: int = 0  # read position: offset of the first unread byte
+    crc: int = 0  # checksum of the bytes before it, at most the first HEAD
     inode: int = 0  # 0: unknown
-    header: int = 0  # byte at which the header in effect begins
+    header: int = 0  # offset of the valid header
 
     @classmethod
     def read(cls, text: str) -> FilePosition | None:
-        """Return the place in a text; None if there is none."""
+        """Return the position that a text contains; None if the text is empty."""
         return cls(*map(int, text.split())) if text else None
 
     def __str__(self) -> str:
@@ -67,7 +67,7 @@ class FilePosition(NamedTuple):
 
 @dataclass(eq=False)
 class _Content:
-    """An open file, read up to an offset."""
+    """An open file and its read position."""
 
     path: Path
     file: io.FileIO
@@ -75,18 +75,18 @@ class _Content:
     offset: int = 0
     head: bytes = b""
     tail: bytes = b""
-    skipping: bool = False  # inside a line that is too long
-    hole: tuple[int, float] = (-1, 0.0)  # where NUL bytes were seen first, and when
-    # Of a file that was written again: when it was seen first, last as it is, and how it was.
+    skipping: bool = False  # whether the read position is inside a line that is too long
+    hole: tuple[int, float] = (-1, 0.0)  # offset of the first NUL byte, and when it was found
+    # For a rewritten file: time of its discovery, time of its last change, and its state then.
     restless: tuple[float, float, tuple[int, int]] | None = None
-    # Last line that was read before the file was written again, and the byte after it.
+    # Last line that was read before the file was rewritten, and the offset after it.
     follows: tuple[bytes, int] | None = None
 
     @classmethod
     def open(cls, path: Path) -> _Content | None:
-        """Open a file, None if there is none; raises `DataError` if it is not a file."""
+        """Open a file; return None if it does not exist; raise `DataError` if it is not a file."""
         try:
-            # To open a pipe without a writer would hold the program up.
+            # Opening a pipe without a writer would block.
             if not stat.S_ISREG(path.stat().st_mode):
                 raise DataError(
                     f"{path} is a device, a pipe or a folder, not a file: name a file, or send "
@@ -101,7 +101,7 @@ class _Content:
         return os.fstat(self.file.fileno())
 
     def _written(self) -> tuple[int, int]:
-        """Return when the file was written last, and its size."""
+        """Return the time of the last modification, and the size."""
         found = self.stat
         return found.st_mtime_ns, found.st_size
 
@@ -109,7 +109,7 @@ class _Content:
         self.file.close()
 
     def at(self, start: int, count: int) -> bytes:
-        """Return some bytes from a place on."""
+        """Return `count` bytes from the offset `start`, or fewer at the end."""
         found = b""
         self.file.seek(start)
         while len(found) < count:
@@ -120,7 +120,7 @@ class _Content:
         return found
 
     def known(self, head: bytes, tail: bytes, offset: int) -> bool:
-        """Return whether the file has these bytes before an offset."""
+        """Return whether the file begins with `head` and has `tail` before an offset."""
         return (
             self.stat.st_size >= offset
             and self.at(0, len(head)) == head
@@ -128,16 +128,16 @@ class _Content:
         )
 
     def is_unchanged(self) -> bool:
-        """Return whether the lines that were read are still there."""
+        """Return whether the content before the read position is unchanged."""
         return self.known(self.head, self.tail, self.offset)
 
     def fits(self, place: FilePosition) -> bool:
-        """Return whether a place may be in this file."""
+        """Return whether a position may be in this file."""
         head = self.at(0, min(place.start, HEAD))
         return self.stat.st_size >= place.start and zlib.crc32(head) == place.crc
 
     def go_to(self, start: int) -> None:
-        """Continue from a place."""
+        """Set the read position."""
         self.offset = start
         self.head = self.at(0, min(start, HEAD))
         count = min(start, TAIL)
@@ -145,7 +145,7 @@ class _Content:
         self.skipping = False
 
     def settled(self, now: float) -> bool:
-        """Return whether a file that was written again may be read: it has not changed lately."""
+        """Return whether a rewritten file may be read, since it has not changed recently."""
         if self.restless is None:
             return True
         begun, since, before = self.restless
@@ -159,9 +159,9 @@ class _Content:
         return True
 
     def lines(self, grows: bool) -> list[Line] | None:
-        """Return the next lines that are ended; None if the file was changed.
+        """Return the next complete lines; None if earlier content has changed.
 
-        `grows`: the last line needs its end, and NUL bytes may still be filled.
+        `grows`: the last line is incomplete without a line end, and NUL bytes may be filled later.
         """
         if not self.is_unchanged():
             return None
@@ -170,10 +170,10 @@ class _Content:
             before = self._written()
             chunk = self.at(self.offset, CHUNK)
             lines, used = self._split(chunk, grows)
-            # What was written meanwhile may have changed the bytes that were just read.
+            # The file may have been rewritten during the read.
             if not self.is_unchanged():
                 return found or None
-            # Nothing was read before, so nothing shows that.
+            # At the start there is no earlier content to compare, so any write counts.
             if not self.offset and self._written() != before:
                 break
             if used:
@@ -188,9 +188,9 @@ class _Content:
         return found
 
     def _missed(self, chunk: bytes) -> list[Line]:
-        """Return a report if rows may be missing between a file and its earlier content.
+        """Return a message if rows may be missing between a rewritten file and its old content.
 
-        Where the last line is still there, as in a window of rows that moves on, none is missing.
+        No row is missing if the file still contains the last line, such as in a moving window.
         """
         last, offset = self.follows or (b"", 0)
         self.follows = None
@@ -203,7 +203,7 @@ class _Content:
         return [Line(self.number, 0, b"", "rewritten", text)]
 
     def _split(self, chunk: bytes, grows: bool) -> tuple[list[Line], int]:
-        """Return the lines of a chunk, and how many of its bytes they are."""
+        """Return the lines of a chunk, and the number of their bytes."""
         end, start, found = len(chunk), 0, list[Line]()
         if grows and (hole := self._hole(chunk)) >= 0:
             end = hole
@@ -230,40 +230,40 @@ class _Content:
         return Line(self.number, self.offset + start, content)
 
     def _hole(self, chunk: bytes) -> int:
-        """Return where NUL bytes begin that are still to be filled; -1 without."""
+        """Return the offset in a chunk of NUL bytes that may still be filled, or -1."""
         hole = chunk.find(b"\0")
         if hole < 0 or (self.head or chunk).startswith(UTF_16):
             return -1
         place, now = self.offset + hole, time.monotonic()
         if self.hole[0] != place:
             self.hole = place, now
-        # Rows are written after what was lost in a crash: it will not be filled.
+        # If rows follow after a long time, the NUL bytes are from a crash and will not be filled.
         ended = bool(chunk[hole:].strip(b"\0")) and now - self.hole[1] >= HOLES
         return -1 if ended else hole
 
 
 @dataclass(eq=False)
 class GrowingFile:
-    """The lines of a file, and of those that replace it.
+    """Lines of a file and of the files that replace it.
 
-    A file that is renamed (rotated logs) is read to its end before the new one of its name, also
-    where it was renamed twice between two looks, or while the program was away; for a minute it is
-    still looked at. A copy that was made before the file was emptied is found in the same way.
+    A renamed file (rotated logs) is read to its end before the new file with its name, even if it
+    was renamed twice between two reads, or while the program was not running. It is still read for
+    a minute after that. A copy that was made before the file was emptied is treated likewise.
     """
 
     path: Path  # it need not exist yet
     grows: bool  # whether lines may be added
-    place: FilePosition | None = None  # where an earlier session has stopped
+    place: FilePosition | None = None  # position at the end of an earlier session
     _now: _Content | None = field(default=None, init=False)
-    _next: deque[_Content] = field(default_factory=deque, init=False)  # rotated, to be read
+    _next: deque[_Content] = field(default_factory=deque, init=False)  # rotated files, unread
     _older: list[tuple[_Content, float]] = field(default_factory=list, init=False)
-    # Number -> first bytes and inode number of the last files.
+    # Number of each recent file -> its first bytes and inode number.
     _known: dict[int, tuple[bytes, int]] = field(default_factory=dict, init=False)
     _number: int = field(default=0, init=False)
-    _left: tuple[int, int] = field(default=(0, 0), init=False)  # where it was closed
+    _left: tuple[int, int] = field(default=(0, 0), init=False)  # `here` when it was closed
 
     def lines(self) -> list[Line]:
-        """Return the next lines, or none."""
+        """Return the next lines, which may be none."""
         told = self._opened() if self._now is None else []
         now = self._now
         if told or now is None:
@@ -281,18 +281,18 @@ class GrowingFile:
 
     @property
     def here(self) -> tuple[int, int]:
-        """Number of the file that is read, and the offset in it; (0, 0) before any."""
+        """Number of the current file and read position in it; (0, 0) before the first file."""
         return self._left if self._now is None else (self._now.number, self._now.offset)
 
     def place_of(self, number: int, start: int, header: int) -> FilePosition:
-        """Return a place in one of the files."""
+        """Return the position `start` in the file with a number."""
         head, inode = self._known.get(number, (b"", 0))
         if self._now is not None and self._now.number == number:
             head = self._now.head
         return FilePosition(start, zlib.crc32(head[:start]), inode, header)
 
     def before(self, start: int) -> list[bytes]:
-        """Return the lines of the file that is read from a place to where it is read."""
+        """Return the lines of the current file from an offset to the read position."""
         if self._now is None:
             return []
         count = min(self._now.offset - start, CHUNK)
@@ -311,7 +311,7 @@ class GrowingFile:
         self._older.clear()
 
     def _begin(self, content: _Content) -> None:
-        """Read a file from now on."""
+        """Make a file the current file."""
         if self._now is not None:
             self._remember(self._now)
         self._number += 1
@@ -324,19 +324,19 @@ class GrowingFile:
         self._known[content.number] = content.head, content.stat.st_ino
 
     def _was_read(self, content: _Content) -> bool:
-        """Return whether a file has been read; its number alone may be that of a deleted one."""
+        """Return whether a file was read: inode numbers are reused, so its content also counts."""
         inode = content.stat.st_ino
         heads = [head for head, number in self._known.values() if number == inode and head]
         return any(content.at(0, len(head)) == head for head in heads)
 
     def _opened(self) -> list[Line]:
-        """Open the file that is there now, at its start or where an earlier session has left it."""
+        """Open the file at the position of an earlier session, else at its start."""
         place = self.place
         if place is not None and place.start and self._resumed(place):
             return []
         content = _Content.open(self.path)
         if content is None:
-            return []  # it may still come
+            return []  # it may be created later
         self._begin(content)
         self.place = None
         if place is None or not place.start:
@@ -348,7 +348,7 @@ class GrowingFile:
         return [Line(content.number, 0, b"", "rewritten", text)]
 
     def _resumed(self, place: FilePosition) -> bool:
-        """Open the file of a place, under its name or another one; return whether it is there."""
+        """Open the file of a position, which may be renamed; return whether it was found."""
         others = (
             path for path in self._folder() if _inode(path) == place.inode or self._is_rotated(path)
         )
@@ -360,7 +360,7 @@ class GrowingFile:
         return True
 
     def _changed(self, now: _Content) -> list[Line]:
-        """Continue with a file whose content was changed."""
+        """Continue after the content of the current file has changed."""
         copy = self._copy_of(now)
         if copy is not None:
             self._begin(copy)
@@ -370,7 +370,7 @@ class GrowingFile:
         if again is None:
             return []
         moment = time.monotonic()
-        if now.stat.st_size >= now.offset:  # it was not cut, so old rows may still be replaced
+        if now.stat.st_size >= now.offset:  # not truncated, so rewriting may be in progress
             again.restless = moment, moment, (0, 0)
         again.follows = now.follows
         if now.offset:
@@ -380,7 +380,7 @@ class GrowingFile:
         return []
 
     def _copy_of(self, now: _Content) -> _Content | None:
-        """Return the copy of a file that was made before it was emptied, where it was read to."""
+        """Return the copy of a file from before it was emptied, at the same read position."""
 
         def fits(copy: _Content) -> bool:
             return not self._was_read(copy) and copy.known(now.head, now.tail, now.offset)
@@ -391,7 +391,7 @@ class GrowingFile:
         return copy
 
     def _ended(self, now: _Content) -> bool:
-        """Go over to the next file if this one has another name now; return whether it did."""
+        """Switch to the next file if the current one was renamed; return whether it did."""
         try:
             named = self.path.stat()
         except FileNotFoundError:
@@ -409,7 +409,7 @@ class GrowingFile:
         return True
 
     def _between(self, now: _Content) -> Iterator[_Content]:
-        """Iterate over the files that were rotated after a file, the oldest first."""
+        """Yield the files that were rotated after a file, oldest first."""
         since = now.stat.st_mtime_ns
         for path in self._rotated():
             found = _Content.open(path)
@@ -422,7 +422,7 @@ class GrowingFile:
                 found.close()
 
     def _older_lines(self) -> list[Line]:
-        """Return lines that a writer has added to a file after it was renamed."""
+        """Return lines that were added to files after they were renamed."""
         found: list[Line] = []
         for content, until in list(self._older):
             found += content.lines(True) or []
@@ -432,7 +432,7 @@ class GrowingFile:
         return found
 
     def _folder(self) -> list[Path]:
-        """Return the other files in the folder of this one, the oldest first."""
+        """Return the other files in the folder of the file, oldest first."""
         found = []
         with os.scandir(self.path.parent) as entries:
             for entry in islice(entries, SIBLINGS):
@@ -442,11 +442,11 @@ class GrowingFile:
         return [path for _, path in sorted(found)]
 
     def _rotated(self) -> list[Path]:
-        """Return the files whose names are those of rotated ones, the oldest first."""
+        """Return the files with names of rotated files, oldest first."""
         return [path for path in self._folder() if self._is_rotated(path)]
 
     def _is_rotated(self, path: Path) -> bool:
-        """Return whether a name is as rows.csv.1, rows.csv-20260101, rows.1.csv, rows-2026.csv."""
+        """Return whether a name is like rows.csv.1, rows.csv-20260101, rows.1.csv, rows-26.csv."""
         stem, suffix = re.escape(self.path.stem), re.escape(self.path.suffix)
         dated = rf"{stem}[.\-_~][0-9T:.\-_]+{suffix}"
         after = rf"{re.escape(self.path.name)}[.\-_~].*"
@@ -455,7 +455,7 @@ class GrowingFile:
 
 
 def _first(paths: Iterable[Path], fits: Callable[[_Content], bool]) -> _Content | None:
-    """Open the first file that fits, None if there is none."""
+    """Open the first file that fits, or return None."""
     for path in paths:
         content = _Content.open(path)
         if content is not None:
@@ -466,7 +466,7 @@ def _first(paths: Iterable[Path], fits: Callable[[_Content], bool]) -> _Content 
 
 
 def _inode(path: Path) -> int:
-    """Return the inode number of a file, -1 if it is gone."""
+    """Return the inode number of a file, or -1 if it does not exist."""
     try:
         return path.stat().st_ino
     except OSError:
@@ -474,6 +474,6 @@ def _inode(path: Path) -> int:
 
 
 def _begin_alike(one: _Content, other: _Content) -> bool:
-    """Return whether two files have the same first line, as a header, or are JSON."""
+    """Return whether two files have the same first line (a header), or contain JSON."""
     first, second = (content.at(0, HEAD) for content in (one, other))
     return first.startswith(b"{") or first.partition(b"\n")[0] == second.partition(b"\n")[0]
