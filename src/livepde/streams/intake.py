@@ -1,8 +1,8 @@
 """Intake of rows into ordered samples; late, missing, repeated and malformed rows are counted.
 
-A source delivers rows, column -> value, each with a time; one row need not hold all channels. Rows
-of one moment make one sample. A sample is ready when a row has come that is later by more than
-`wait`; within that time rows may come in any order.
+A source delivers rows, column -> value, each with a time and some of the channels. Rows with the
+same time are merged into one sample. A sample is ready when a row has arrived that is later by more
+than `wait`; within that time, rows may arrive in any order.
 """
 
 from __future__ import annotations
@@ -26,35 +26,35 @@ from livepde.streams.table import Column, channel_value, row_time, without_noise
 
 @dataclass(frozen=True)
 class Habit:
-    """Arrival of one channel: waiting time, repeated values, interpolation and spikes."""
+    """Options of a channel: waiting time, repeated values, interpolation and spikes."""
 
-    wait: float = 0.0  # for which a sample waits for this channel, if longer than `Policy.wait`
-    repeated: Literal["first", "last"] | None = None  # as in the policy; None: as the policy says
-    # A sample without this channel takes a value interpolated from the next one, if that comes
-    # while the sample waits; it waits no longer then.
+    wait: float = 0.0  # time to wait for this channel, if longer than `Policy.wait`
+    repeated: Literal["first", "last"] | None = None  # see `Policy`; None: the value there
+    # If a sample lacks this channel, it is interpolated once the next value has arrived, which also
+    # ends the wait for this channel.
     interpolated: bool = False
-    screened: bool = False  # a spike is refused, if two later values come while the sample waits
-    between: Between = "line"  # how the channel behaves between two readings
+    screened: bool = False  # a spike is refused if two later values arrive during the wait
+    between: Between = "line"  # behaviour of the channel between two readings
 
     @property
     def bridged(self) -> bool:
-        """Whether values of samples may be others than those of rows."""
+        """Whether values of samples may differ from the values of rows."""
         return self.interpolated or self.screened
 
 
 @dataclass(frozen=True)
 class Policy:
-    """Policy for rows that are late, incomplete, repeated, or ahead of the others."""
+    """Policy for rows that are late, incomplete, repeated, or ahead of other rows."""
 
-    wait: float = 0.0  # for which a row may come after a later one, before it is refused
-    tolerance: float = 0.0  # rows whose times differ by at most this are of one moment, the first
-    # A row that is later than the newest one by more than this, or by more than ten usual steps of
-    # its channels, waits until the rows after it agree with it; a row at the old times refutes it.
+    wait: float = 0.0  # largest delay after a later row up to which a row is accepted
+    tolerance: float = 0.0  # rows whose times differ by at most this are one sample
+    # A row later than the newest one by more than this, or by more than ten usual steps of its
+    # channels, waits for later rows to confirm it; a row that continues the old times refutes it.
     leap: float = math.inf
-    # Which of two values of a channel for one moment is kept, while the sample waits.
+    # Which of two different values of a channel in one sample is used.
     repeated: Literal["first", "last"] = "first"
-    shift: float = 0.0  # correction of a wrong clock by the user: added to all times that come
-    channels: Mapping[str, Habit] = field(default_factory=dict)  # channel -> its own options
+    shift: float = 0.0  # user's correction of a wrong clock, added to all times
+    channels: Mapping[str, Habit] = field(default_factory=dict)  # channel -> its options
 
     def __post_init__(self) -> None:
         waits = {f"wait of '{name}'": habit.wait for name, habit in self.channels.items()}
@@ -65,11 +65,11 @@ class Policy:
             raise DataError(f"intake: shift must be a finite time; got {self.shift}.")
 
     def keeps(self, channel: str) -> Literal["first", "last"]:
-        """Return which of two values of a channel is kept."""
+        """Return which of two different values of a channel is used."""
         return self.habit(channel).repeated or self.repeated
 
     def longest(self, habit: Habit) -> float:
-        """Return the time for which a sample waits for a channel of this habit."""
+        """Return the time for which a sample waits for a channel with these options."""
         return max(self.wait, habit.wait)
 
     def habit(self, channel: str) -> Habit:
@@ -77,10 +77,10 @@ class Policy:
         return self.channels.get(channel, PLAIN)
 
 
-AGREE = 16.0  # usual steps for which rows far ahead have to continue before they are used
-FEWEST = 3  # times of rows that are far ahead, or first, before they are used
-MOST_AHEAD = 1000  # rows that wait so; more than these are used without a contradiction
-REMEMBERED = 1024  # accepted samples that are remembered though the journal has them
+AGREE = 16.0  # usual steps over which rows far ahead must continue before they are used
+FEWEST = 3  # smallest number of distinct times of waiting rows before they are used
+MOST_AHEAD = 1000  # largest number of waiting rows; more are used unless refuted
+REMEMBERED = 1024  # accepted samples kept in memory, even if the journal has them
 PLAIN = Habit()
 NO_VALUE = "no value of any channel"
 NAN = math.nan
@@ -91,24 +91,24 @@ Known: TypeAlias = tuple[float, Mapping[str, float]]  # time and values of an ac
 class Remark:
     """A countable irregularity of a row, a value or a sample.
 
-    `kind`: not used: "malformed" (unreadable, or without a value), "invalid" (outside of the valid
-    range), "spike", "late", "conflict" (another value than the one accepted for this time), "leap"
-    (a time too far ahead), "repeated" (a row that was accepted before with the same values),
-    "outside" (not between start and stop), "skipped" (a sample without a needed channel). "clock":
-    late rows follow one another, so that a clock went back. Used all the same: "shifted" (late rows
-    lead on to it: the clock was set back), "disordered" (came after a later row), "missing" (a
-    sample without this channel), "interpolated" (the same, with a value between known ones).
+    `kind`, for data that are not used: "malformed" (unreadable, or without a value), "invalid" (out
+    of the valid range), "spike", "late", "conflict" (differs from the value accepted for this
+    time), "leap" (a time too far ahead), "repeated" (a row with the same time and values was
+    accepted before), "outside" (not between start and stop), "skipped" (a sample that lacks a
+    needed channel), "clock" (consecutive late rows: a clock went back). For data that are used:
+    "shifted" (continues late rows: the clock was set back), "disordered" (arrived after a later
+    row), "missing" (a sample that lacks this channel), "interpolated" (filled in such a sample).
     """
 
     kind: str
-    channel: str  # of the value; '' for a whole row
-    message: str  # of several remarks that of the first
-    number: int = 1  # of occurrences
-    row: Any = None  # token of its row; for a sample that of the last row
+    channel: str  # channel of the value; '' for a whole row
+    message: str  # for merged remarks, the message of the first
+    number: int = 1  # number of occurrences
+    row: Any = None  # token of the row; for a sample, of its last row
 
 
 def gather(found: dict[tuple[str, str], Remark], remark: Remark) -> None:
-    """Merge a remark into those of its kind and channel: first message, total number."""
+    """Add a remark; remarks of one kind and channel are merged, with their total number."""
     key = remark.kind, remark.channel
     same = found.get(key)
     found[key] = remark if same is None else replace(same, number=same.number + remark.number)
@@ -116,40 +116,40 @@ def gather(found: dict[tuple[str, str], Remark], remark: Remark) -> None:
 
 @dataclass(kw_only=True)
 class Ready:
-    """A sample: open as long as rows may add to it, then complete."""
+    """A sample, which is open while rows may be added to it."""
 
     t: float
-    values: dict[str, float] = field(default_factory=dict)  # of the channels that have come
-    tokens: list[Any] = field(default_factory=list)  # of its rows, to acknowledge them
+    values: dict[str, float] = field(default_factory=dict)  # values of the channels so far
+    tokens: list[Any] = field(default_factory=list)  # tokens of its rows, for acknowledgement
 
 
 @dataclass
 class IntakeOutcome:
-    """Outcome of a row: ready samples, remarks, and tokens of rows that no sample uses."""
+    """Outcome of a row: ready samples, remarks, and tokens of rows not used in a sample."""
 
     ready: list[Ready] = field(default_factory=list)
     remarks: list[Remark] = field(default_factory=list)
     spent: list[Any] = field(default_factory=list)
 
     def remark(self, kind: str, channel: str, message: str, row: Any) -> None:
-        """Add a remark about the row with a token."""
+        """Add a remark about the row with the token `row`."""
         self.remarks.append(Remark(kind, channel, message, row=row))
 
 
 class Past(Protocol):
-    """The samples in the journal, among which repeated rows are looked for."""
+    """The samples in the journal, which are searched for repeated rows."""
 
     @property
     def last(self) -> float:
-        """Time of the last sample, -inf before any."""
+        """Time of the last sample, or -inf."""
 
     def between(self, low: float, high: float) -> Sequence[Known]:
-        """Return some of the samples between two times, none where they were thinned."""
+        """Return some of the samples between two times, none if they were thinned."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Held:
-    """A row as it was read: its time, its values, and remarks on them, made once it is used."""
+    """A row with its time and values, and remarks on them, which are made if the row is used."""
 
     t: float
     values: dict[str, float]
@@ -159,47 +159,47 @@ class _Held:
 
 @dataclass(eq=False)
 class Intake:
-    """Ordering of rows into samples."""
+    """Merges rows into samples in order of time."""
 
     columns: Mapping[str, Column]  # channel -> its column
     clock: Clock  # conversion of the time column
-    policy: Policy = field(default_factory=Policy)  # for rows out of order
+    policy: Policy = field(default_factory=Policy)  # policy for irregular rows
     _: KW_ONLY
-    missing: Missing = ()  # numbers and texts that mean a missing value
-    origin: float | None = None  # t = 0 in seconds since 1970, of dates; None: the first row's time
-    dates: bool | None = None  # whether times are dates; None: as in the first row
-    last: float = -math.inf  # time of the last sample, also of an earlier session
-    # Last samples of an earlier session, for channels that are interpolated or screened.
+    missing: Missing = ()  # numbers and texts that stand for a missing value
+    origin: float | None = None  # for dates, t = 0 in seconds since 1970; None: the first time used
+    dates: bool | None = None  # whether times are dates; None: determined by the first row
+    last: float = -math.inf  # time of the last sample, perhaps of an earlier session
+    # Last samples of an earlier session, for interpolation, spikes and usual steps.
     recent: InitVar[Iterable[Known]] = ()
-    # Samples in the journal, to recognise rows that were accepted before it had them all.
+    # Samples in the journal, to recognise rows that are older than the samples in memory.
     past: Past | None = field(default=None, init=False)
 
     def __post_init__(self, recent: Iterable[Known]) -> None:
         self._newest = self.last
-        self._received = math.nan  # when the newest row was received
+        self._received = math.nan  # time at which the newest row was received
         self._open: dict[float, Ready] = {}
         self._recent = deque(recent, maxlen=RECENT)
         self._before: dict[str, float] = {}  # held inputs of rows before the first sample
         self._times = ChannelTimes(self._recent)
-        self._ahead: list[_Held] = []  # rows far ahead, or the first rows, that wait for others
-        self._accepted: deque[tuple[float, dict[str, float]]] = deque()  # values as they came
+        self._ahead: list[_Held] = []  # waiting rows: rows far ahead, or the first rows
+        self._accepted: deque[tuple[float, dict[str, float]]] = deque()  # samples with raw values
 
     @property
     def start(self) -> datetime | None:
-        """The date of t = 0, if times are dates."""
+        """Date of t = 0 if times are dates, else None."""
         if self.origin is None or not self.dates:
             return None
         return origin_at(self.origin)
 
     @property
     def waiting(self) -> list[Any]:
-        """Tokens of the rows that are in no sample yet."""
+        """Tokens of the rows in open samples, and of the rows that wait for confirmation."""
         found = [token for sample in self._open.values() for token in sample.tokens]
         return found + [one.token for one in self._ahead]
 
     @property
     def interval(self) -> float:
-        """Seconds between two samples as they usually come; infinite if that is not known."""
+        """Usual interval in seconds until the next sample is ready; infinite if not known."""
         seconds = (self._times.slowest + self._longest) / self.clock.second
         return math.inf if math.isnan(seconds) else seconds
 
@@ -211,7 +211,7 @@ class Intake:
 
     @property
     def why(self) -> str:
-        """Reason to doubt the clocks of the source, in one sentence; empty if there is none."""
+        """Reason to doubt the clocks of the source, in one sentence, or an empty string."""
         remedy = "if a clock is wrong, specify its correction with `intake.shift`"
         for name, late in self._times.went_back.items():
             return (
@@ -238,9 +238,9 @@ class Intake:
     def take(
         self, row: Mapping[str, Any], token: Any = None, received: float = math.nan
     ) -> IntakeOutcome:
-        """Take a row; return the outcome of it and of rows that waited.
+        """Process a row; return the outcome of this row and of waiting rows.
 
-        `received`: seconds of a clock of this machine; a row may be ahead by the time that passed.
+        `received`: monotonic arrival time in s; a row may be ahead by the time since the last one.
         """
         found = IntakeOutcome()
         held = self._read(row, token, found)
@@ -250,7 +250,7 @@ class Intake:
         return found
 
     def _read(self, row: Mapping[str, Any], token: Any, found: IntakeOutcome) -> _Held | None:
-        """Return a row with its time and values, None if it is unreadable or outside."""
+        """Return a row with its time and values; None if it is unreadable or out of range."""
         try:
             times = self._time(row)
         except DataError as error:
@@ -266,13 +266,13 @@ class Intake:
             found.remarks += remarks or [Remark("malformed", "", NO_VALUE, row=token)]
             return None
         t, again = times
-        # An hour that clocks show twice: its second pass, unless these values came in the first.
+        # In an hour that clocks repeat, a row is in the second pass unless it repeats an old row.
         if again and self._passed(t, again, values) and not self._repeats(t, values):
             t += again
         return _Held(t=t, values=values, token=token, remarks=remarks)
 
     def _passed(self, t: float, hour: float, values: Mapping[str, float]) -> bool:
-        """Return whether rows of a time or later ones have come, of the same channels."""
+        """Return whether rows with the same channels at this time or later have arrived."""
         if t <= self.last:
             return True
         mine = set(present(values))
@@ -280,7 +280,7 @@ class Intake:
         return any(not mine.isdisjoint(present(one.values)) for one in waiting)
 
     def _judged(self, held: _Held, received: float, found: IntakeOutcome) -> bool:
-        """Return whether a row is used or waits for others."""
+        """Return whether a row is used or waits for confirmation."""
         if self._repeats(held.t, held.values):
             text = f"t = {held.t:g} has been accepted with the same values before"
             found.remark("repeated", "", text, held.token)
@@ -289,14 +289,14 @@ class Intake:
             self._wait(held, received, found)
             return True
         if held.t > self._newest:
-            # A row that continues the old times refutes those far ahead, and confirms earlier ones.
+            # A row that continues the old times refutes later waiting rows, confirms earlier ones.
             self._refuse([one for one in self._ahead if one.t > held.t], found)
             self._use_ahead(found)
             self._received = received
         return self._placed(held, found)
 
     def _is_ahead(self, held: _Held, received: float) -> bool:
-        """Return whether a row has to wait for others: the first rows, and rows far ahead."""
+        """Return whether a row must wait: if it is one of the first rows, or far ahead."""
         if not self._begun:
             return True
         passed = (received - self._received) * self.clock.second
@@ -304,14 +304,14 @@ class Intake:
         return held.t - self._newest > (max(reach, passed) if passed > 0.0 else reach)
 
     def _reach(self, usual: float) -> float:
-        """Return by how much a row may be ahead of the one before it."""
+        """Return the time by which a row may be ahead of the row before it."""
         return self.policy.leap if math.isnan(usual) else min(self.policy.leap, FAR * usual)
 
     def _wait(self, held: _Held, received: float, found: IntakeOutcome) -> None:
-        """Let a row wait for others, and use all rows that wait if they agree."""
+        """Add a row to the waiting rows, and use all waiting rows if they agree."""
         latest = held.t + self.policy.tolerance + self._longest
-        # A row of an earlier time refutes those that have come before it; of the first rows none
-        # has privilege, and those that agree decide.
+        # A row with an earlier time refutes waiting rows with much later times. The first rows do
+        # not refute each other: the longest run that agrees is used.
         if self._begun:
             self._refuse([one for one in self._ahead if one.t > latest], found)
         self._ahead.append(held)
@@ -324,9 +324,9 @@ class Intake:
             self._use_ahead(found)
 
     def _agreed(self) -> list[float]:
-        """Return the times of waiting rows that continue at a usual pace for long enough, or none.
+        """Return the times of a run of waiting rows with usual steps that is long enough, or none.
 
-        Rows far ahead have to be the last ones; of the first rows the longest run counts.
+        The run is the latest one, or for the first rows of a source the longest one.
         """
         times = sorted({one.t for one in self._ahead})
         steps = [b - a for a, b in pairwise(times)]
@@ -335,17 +335,17 @@ class Intake:
         if math.isnan(usual):
             usual, span = own, 0.0
         reach = self._reach(max(usual, own))
-        # The last rows of them, without a step that would be far ahead itself.
+        # A step that is itself far ahead ends a run.
         breaks = [k for k, step in enumerate(steps, start=1) if step > reach]
         runs = [times[k:stop] for k, stop in pairwise([0, *breaks, len(times)])]
         last = runs[-1] if self._begun else max(runs, key=len)
         return last if len(last) >= FEWEST and last[-1] - last[0] >= span else []
 
     def _use_ahead(self, found: IntakeOutcome) -> None:
-        """Use the rows that wait."""
+        """Use all waiting rows."""
         waiting, self._ahead = self._ahead, []
         if self.origin is None:
-            # The first row that is used sets t = 0 for all later ones.
+            # The first used row defines t = 0.
             first = waiting[0].t if waiting else 0.0
             self.origin = _microseconds(first / self.clock.second) if self.dates else 0.0
             zero = self.origin * self.clock.second
@@ -355,7 +355,7 @@ class Intake:
                 found.spent.append(one.token)
 
     def _refuse(self, rows: Sequence[_Held], found: IntakeOutcome) -> None:
-        """Refuse rows that have waited, as too far ahead."""
+        """Refuse waiting rows as too far ahead."""
         refused = {id(one) for one in rows}
         for one in rows:
             far = f"ahead of the newest row at {self._newest:g}" if self._begun else "from others"
@@ -364,17 +364,17 @@ class Intake:
         self._ahead = [one for one in self._ahead if id(one) not in refused]
 
     def _repeats(self, t: float, values: Mapping[str, float]) -> bool:
-        """Return whether a row was accepted before, or waits, with the same values."""
+        """Return whether a row with the same time and values was accepted or waits."""
         waiting = [one.values for one in self._ahead if one.t == t]
         remembered, journaled = self._known(t)
         if any(_same(values, known) for known in (*waiting, *(one for _, one in remembered))):
             return True
-        # The journal has other values than the rows where gaps and spikes were bridged.
+        # The journal contains interpolated values, not raw ones, so these channels do not count.
         firm = {n: value for n, value in values.items() if not self.policy.habit(n).bridged}
         return any(_same(firm or values, known) for _, known in journaled)
 
     def _known(self, t: float) -> tuple[list[Known], list[Known]]:
-        """Return the accepted samples of a moment: as they came, and in the journal."""
+        """Return the accepted samples at a time: with raw values, and in the journal."""
         low, high = t - self.policy.tolerance, t + self.policy.tolerance
         found: list[Known] = [
             (s, sample.values) for s, sample in self._open.items() if low <= s <= high
@@ -383,13 +383,13 @@ class Intake:
             return found, []
         for s, values in reversed(self._accepted):
             if s < low:
-                return found, []  # all samples since then are remembered
+                return found, []  # all samples since then are in memory
             if s <= high:
                 found.append((s, values))
         return found, [*self.past.between(low, high)] if self.past is not None else []
 
     def withdraw(self, last: float) -> None:
-        """Accept rows later than this time again: the samples after it were withdrawn."""
+        """Accept rows later than the time `last` again, after later samples were withdrawn."""
         self.last = self._newest = last
         self._times.withdraw(last)
         while self._accepted and self._accepted[-1][0] > last:
@@ -398,17 +398,17 @@ class Intake:
     def flush(self) -> IntakeOutcome:
         """Release all open samples at the end of the source."""
         found = IntakeOutcome()
-        # Nothing can confirm a single row far ahead any more; several confirm each other.
+        # Without further rows, a single time far ahead is refused; several confirm each other.
         if self._begun and len({one.t for one in self._ahead}) == 1:
             self._refuse(self._ahead, found)
         self._use_ahead(found)
-        # With an infinite newest time no sample waits any longer.
+        # With an infinite newest time, no sample waits.
         self._newest = math.inf
         self._release(found)
         return found
 
     def _placed(self, held: _Held, found: IntakeOutcome) -> bool:
-        """Return whether a row became part of a sample."""
+        """Add a row to a sample; return whether it was not too late."""
         t, values = held.t, held.values
         found.remarks += held.remarks
         moment = self._moment(t)
@@ -426,7 +426,7 @@ class Intake:
         return moment is not None
 
     def _refuse_late(self, held: _Held, found: IntakeOutcome) -> None:
-        """Count the values of a row that is too late: other values than known ones, or new ones."""
+        """Count the values of a late row that are new, or differ from accepted values."""
         both = chain(*self._known(held.t))
         near = sorted(both, key=lambda sample: abs(sample[0] - held.t))
         known = near[0][1] if near else {}
@@ -460,16 +460,16 @@ class Intake:
             if value < low or value > high:
                 text = f"{value:g} is not between {low:g} and {high:g}"
                 found.remark("invalid", channel, text, token)
-                # Missing, not absent: the channel has come, and the sample must not wait for it.
+                # Missing, not absent: the sample must not wait for this channel.
                 value = math.nan
             values[channel] = value
         return values, found.remarks
 
     def _time(self, row: Mapping[str, Any]) -> tuple[float, float]:
-        """Return the time of a row, and how much later the clocks show it again.
+        """Return the time of a row, and the time until clocks show it again (0: never).
 
-        It is the model time once t = 0 is known, else seconds since 1970 if times are dates; -inf
-        before start, inf after stop.
+        It is the model time if t = 0 is known, else for dates the time since 1970. It is -inf
+        before start and inf after stop.
         """
         stated, dates = row_time(row, self.clock, before=self.dates)
         t = stated + self.policy.shift
@@ -483,13 +483,13 @@ class Intake:
         if not dates:
             return t, 0.0
         if self.origin is None:
-            _microseconds(t / self.clock.second)  # raises for a time that is no date in UTC
+            _microseconds(t / self.clock.second)  # raises an error if there is no such date in UTC
         naive = is_naive(row.get(self.clock.name), self.clock)
         again = self.clock.repeated_hour(stated) if naive else 0.0
         return t - (self.origin or 0.0) * self.clock.second, again
 
     def _moment(self, t: float) -> float | None:
-        """Return the moment of a time, None if its sample was released."""
+        """Return the time of the sample for a row at time t, None if it was released."""
         near = [s for s in self._open if abs(s - t) <= self.policy.tolerance]
         if near:
             return min(near, key=lambda s: abs(s - t))
@@ -507,21 +507,21 @@ class Intake:
                 found.remark("conflict", channel, text, token)
                 if self.policy.keeps(channel) == "first":
                     continue
-            # An empty cell of a second row must not erase a value that has come.
+            # An empty cell of a second row must not delete a value.
             if math.isnan(known) or not math.isnan(value):
                 sample.values[channel] = value
 
     def _release(self, found: IntakeOutcome) -> None:
-        """Release, in order, the samples that are complete or have waited long enough."""
+        """Release the samples that are complete or have waited long enough, in order."""
         for t in sorted(self._open):
-            # Samples leave in order, so one that still waits holds back those after it.
+            # Samples are released in order, so a waiting sample delays all later ones.
             if not self._ripe(t):
                 return
             self.last = t
             self._complete(self._open.pop(t), found)
 
     def _complete(self, sample: Ready, found: IntakeOutcome) -> None:
-        """Release a sample, or leave it out if a channel is missing that it needs."""
+        """Release a sample, or skip it if a needed channel is missing."""
         t, came, needed = sample.t, dict(sample.values), list[str]()
         self._fill(sample, found)
         for channel, column in self.columns.items():
@@ -545,7 +545,7 @@ class Intake:
         found.ready.append(sample)
 
     def _fill(self, sample: Ready, found: IntakeOutcome) -> None:
-        """Interpolate gaps of a sample, refuse its spikes and readings with a wrong noise."""
+        """Interpolate gaps of a sample; refuse spikes and readings with an invalid noise."""
         for channel in self.columns:
             self._bridge(channel, sample, found)
             if channel in self._before and math.isnan(sample.values.get(channel, NAN)):
@@ -555,7 +555,7 @@ class Intake:
             found.remark("invalid", channel, text, sample.tokens[-1])
 
     def _remember(self, t: float, came: dict[str, float]) -> None:
-        """Remember an accepted sample, at least until the journal has it."""
+        """Keep an accepted sample in memory, at least until it is in the journal."""
         self._accepted.append((t, came))
         if len(self._accepted) > 2 * REMEMBERED:
             kept = math.inf if self.past is None else self.past.last
@@ -563,7 +563,7 @@ class Intake:
                 self._accepted.popleft()
 
     def _held(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Return the held inputs that an omitted sample states."""
+        """Return the known inputs of a skipped sample: held, mean or interpolated ones."""
         habits = {channel: self.policy.habit(channel) for channel in values}
         return {
             channel: value
@@ -573,14 +573,14 @@ class Intake:
         }
 
     def _is_news(self, channel: str, value: float) -> bool:
-        """Return whether a value of an input is a mean, or not the one that holds already."""
+        """Return whether a value of an input is a mean, or differs from the held value."""
         if (between := self.policy.habit(channel).between) != "hold":
             return between == "next"
         before = (one.get(channel, NAN) for _, one in reversed(self._recent))
         return value != next(filter(math.isfinite, before), NAN)
 
     def _hold_first(self, values: Mapping[str, float]) -> None:
-        """Remember values of rows before the first sample that hold until the next reading."""
+        """Store values of rows before the first sample that hold until the next reading."""
         if not self._recent:
             self._before |= {
                 channel: value
@@ -589,17 +589,17 @@ class Intake:
             }
 
     def _lacks(self, channel: str, values: Mapping[str, float]) -> bool:
-        """Return whether a sample has no value of a channel; noise requires a reading."""
-        if self.policy.habit(channel).between == "hold" and self._recent:  # it holds until the next
+        """Return whether a sample lacks a value of a channel; noise is only due with a reading."""
+        if self.policy.habit(channel).between == "hold" and self._recent:  # the last value holds
             return False
         of = self.columns[channel].noise_of
         absent = math.isnan(values.get(channel, NAN))
         return absent and not (of and math.isnan(values.get(of, NAN)))
 
     def _bridge(self, channel: str, sample: Ready, found: IntakeOutcome) -> None:
-        """Interpolate a gap of a sample, or refuse a spike, where later values are known."""
+        """Interpolate a gap of a sample, or refuse a spike, if later values are known."""
         t, habit = sample.t, self.policy.habit(channel)
-        # A sample that does not wait is released before any later value has come.
+        # A sample that does not wait is released before any later value arrives.
         if not (habit.bridged and self.policy.longest(habit) > 0.0):
             return
         later = self._later(t, channel)
@@ -620,22 +620,22 @@ class Intake:
         sample.values[channel] = value
 
     def _later(self, t: float, channel: str) -> Series:
-        """Return the known values of a channel in samples that are still open."""
+        """Return the known values of a channel in later open samples."""
         values = ((s, self._open[s].values.get(channel, NAN)) for s in sorted(self._open) if s > t)
         return [pair for pair in values if math.isfinite(pair[1])]
 
     def _ripe(self, t: float) -> bool:
-        """Return whether a sample is complete, or has waited long enough for the rest."""
+        """Return whether a sample is complete, or has waited long enough for absent channels."""
         values, policy = self._open[t].values, self.policy
         absent = [channel for channel in self.columns if self._awaited(t, channel, values)]
         if policy.wait == 0.0 and not absent:
             return True
         waits = [policy.wait, *(policy.habit(channel).wait for channel in absent)]
-        # The times of rows decide, not the seconds that pass: a replay gives the same samples.
+        # Times of rows decide, not elapsed seconds, so that a replay gives the same samples.
         return t + policy.tolerance + max(waits) < self._newest
 
     def _awaited(self, t: float, channel: str, values: Mapping[str, float]) -> bool:
-        """Return whether a sample waits for a channel that may still come, or be interpolated."""
+        """Return whether a sample waits for a channel, or for the next value to interpolate it."""
         habit = self.policy.habit(channel)
         if not (habit.interpolated and self.policy.longest(habit) > 0.0):
             return channel not in values
@@ -643,7 +643,7 @@ class Intake:
 
 
 def _same(values: Mapping[str, float], known: Mapping[str, float]) -> bool:
-    """Return whether the values of a row are those of a sample."""
+    """Return whether a sample has all values of a row."""
     return all(
         known.get(name, NAN) == value or (math.isnan(value) and name in known)
         for name, value in values.items()
@@ -651,7 +651,7 @@ def _same(values: Mapping[str, float], known: Mapping[str, float]) -> bool:
 
 
 def _microseconds(stamp: float) -> float:
-    """Return seconds since 1970 rounded to microseconds, as a date stores them."""
+    """Round seconds since 1970 to microseconds, the resolution of dates."""
     try:
         return since_1970(origin_at(stamp))
     except (ValueError, OverflowError, OSError):
