@@ -1,4 +1,4 @@
-"""Rows from a message broker, and estimates back to it (MQTT 5, by paho-mqtt)."""
+"""Source of rows and sink of estimates for a message broker (MQTT 5, with paho-mqtt)."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Broker", "MqttSink", "MqttSource"]
 
-LARGEST = 16 * LONGEST  # bytes of a message; the broker keeps larger ones to itself
-UNCONFIRMED = 20  # messages of a sink that are on their way at a time
+LARGEST = 16 * LONGEST  # bytes of a message; the broker does not send larger ones
+UNCONFIRMED = 20  # largest number of unconfirmed messages of a sink
 PATIENCE = 10.0  # seconds for the first connection, and for the last messages
-CONFIRMED = 1000  # acknowledged messages that are known again if the broker did not hear it
-TAKEN_OVER = 142  # reason of a broker that has a newer client of the same name
+CONFIRMED = 1000  # acknowledged messages that are recognised if an acknowledgement is lost
+TAKEN_OVER = 142  # reason code: a newer client has the same client identifier
 
 log = logging.getLogger("livepde.mqtt")
 
@@ -43,18 +43,18 @@ class Broker:
     host, port
         Address of the broker.
     client_id
-        Name of the session, for which the broker queues messages while the client is offline. Two
-        runs need two names.
+        Name of the session, for which the broker queues messages while the client is offline. Each
+        run needs its own name.
     username, password
         Login, if the broker requires one; the password is never written anywhere.
     tls
-        Encrypt, with the certificates that the system trusts.
+        Whether to encrypt; certificates are verified against those of the system.
     ca_file
-        Encrypt, and trust the certificates of this file (PEM) only.
+        File of the only trusted certificates (PEM); implies encryption.
     session
-        Seconds for which the broker keeps the session of a client that is away.
+        Seconds for which the broker keeps the session of an offline client.
     ahead
-        Messages that the broker may send before the first is acknowledged, at most 65535. A message
+        Largest number of unacknowledged messages that the broker may send, at most 65535. A message
         is acknowledged when its sample is in the journal.
     """
 
@@ -78,11 +78,11 @@ class Broker:
         return f"{self.host}:{self.port}"
 
     def client(self, suffix: str = "") -> Client:
-        """Return a client that is not connected yet."""
+        """Return a client without a connection."""
         with optional("mqtt", "MQTT needs paho-mqtt", DataError):
             from paho.mqtt.client import Client, MQTTv5
             from paho.mqtt.enums import CallbackAPIVersion
-        # Acknowledged by hand: the broker keeps a message until its sample is in the journal.
+        # With manual acknowledgement, the broker keeps a message until its sample is in the journal
         client = Client(
             CallbackAPIVersion.VERSION2,
             client_id=self.client_id + suffix,
@@ -100,7 +100,7 @@ class Broker:
         return client
 
     def connect(self, client: Client) -> None:
-        """Connect; if the connection is lost, reconnect in a separate thread."""
+        """Connect to the broker; a separate thread reconnects after a loss of the connection."""
         from paho.mqtt.packettypes import PacketTypes
         from paho.mqtt.properties import Properties
 
@@ -109,7 +109,7 @@ class Broker:
         properties.ReceiveMaximum = self.ahead
         properties.MaximumPacketSize = LARGEST
         try:
-            # No clean start: the broker goes on with the session and sends what came meanwhile.
+            # Without a clean start, the broker resumes the session and sends the queued messages.
             client.connect(self.host, self.port, clean_start=False, properties=properties)
         except (OSError, ValueError) as error:
             raise DataError(f"MQTT: no broker at {self.address} ({error}).") from error
@@ -117,7 +117,7 @@ class Broker:
 
 
 class _Peer:
-    """A client that reconnects to its broker, and logs losses of the connection."""
+    """A client that reconnects to its broker and logs losses of the connection."""
 
     def __init__(self, broker: Broker, suffix: str = "") -> None:
         self._broker = broker
@@ -129,7 +129,7 @@ class _Peer:
         self._client.on_disconnect = self._on_disconnect
 
     def _start(self) -> None:
-        """Connect; raise if the broker does not want us."""
+        """Connect; raise `DataError` if the broker refuses or does not answer."""
         self._broker.connect(self._client)
         if not self._started.wait(PATIENCE):
             self._refusal = self._refusal or "no answer"
@@ -166,7 +166,7 @@ class _Peer:
         self._disconnected(int(reason.value))
 
     def _connected(self, resumed: bool) -> None:
-        """Go on; `resumed` if the broker still knows the session."""
+        """Handle a new connection; `resumed`: whether the broker has resumed the session."""
         raise NotImplementedError
 
     def _disconnected(self, reason: int) -> None:
@@ -177,8 +177,8 @@ class _Peer:
 class _Delivery:
     """A message to acknowledge: its number, the hash of its content, and its connection.
 
-    The broker assigns the numbers, and after a reconnect repeats unacknowledged messages with the
-    same numbers. An acknowledgement on a later connection would refer to another message.
+    The broker assigns the numbers. After a reconnect, it repeats unacknowledged messages with the
+    same numbers, but a number from an earlier connection may refer to another message.
     """
 
     number: int
@@ -188,7 +188,7 @@ class _Delivery:
 
 
 def _check_filter(topic: str) -> None:
-    """Refuse a topic filter that is not valid in MQTT."""
+    """Refuse an invalid topic filter."""
     levels = topic.split("/")
     signs = [level for level in levels if "+" in level or "#" in level]
     alone = all(sign in ("+", "#") for sign in signs)
@@ -201,7 +201,7 @@ def _check_filter(topic: str) -> None:
 
 def _check_overlap(one: str, other: str) -> None:
     """Refuse two topic filters that match the same message."""
-    # No message matches both if at some level they name different words, or one of them has ended.
+    # No message matches both if at a level they have different words, or only one has ended.
     for level, against in zip_longest(one.split("/"), other.split("/")):
         if "#" in (level, against):
             break
@@ -214,25 +214,25 @@ def _check_overlap(one: str, other: str) -> None:
 
 
 class MqttSource(_Peer, RowSource):
-    """Rows from topics; unacknowledged messages are delivered again, also after a restart.
+    """Rows from topics; unacknowledged messages are delivered again, even after a restart.
 
-    A message is a row (a JSON object, column -> value), or for a topic with a column of its own a
-    number, alone or as {"value": 1.5, TIME: ...}. A number without a time has that of its arrival;
-    one that the broker kept, or sends again, is refused then: nobody knows when it was measured.
+    A message is a row (a JSON object, column -> value). For a topic with its own column, it is a
+    number, alone or as {"value": 1.5, TIME: ...}. A number without a time has the time of its
+    arrival, but is refused if the broker has retained or repeated it: its time is then unknown.
 
     Parameters
     ----------
     broker
         Connection to the broker.
     topics
-        Topic -> column of its numbers; None: its messages are rows. "+" and "#" as usual.
+        Topic filter, perhaps with "+" or "#" -> column of its numbers; None: its messages are rows.
     time
         Name of the time column.
 
     Attributes
     ----------
     dropped
-        Number of messages without acknowledgement (QoS 0) that were lost, as they came too fast.
+        Number of messages without acknowledgement (QoS 0) that were lost since the queue was full.
     """
 
     def __init__(self, broker: Broker, topics: Mapping[str, str | None], time: str) -> None:
@@ -256,7 +256,7 @@ class MqttSource(_Peer, RowSource):
         self._start()
 
     def _connected(self, resumed: bool) -> None:
-        # A new session has no open messages, and gives their numbers to others.
+        # A new session has no unacknowledged messages and reuses their numbers.
         if not resumed:
             with self._lock:
                 self._deliveries.clear()
@@ -268,7 +268,7 @@ class MqttSource(_Peer, RowSource):
             self._connection += 1
         if reason == TAKEN_OVER:
             self._taken_over = True
-            self._client.disconnect()  # and do not take it back
+            self._client.disconnect()  # stops reconnecting
 
     def _on_subscribe(self, client: Any, data: Any, mid: int, reasons: Any, more: Any) -> None:
         for topic, reason in zip(self._topics, reasons, strict=True):
@@ -283,7 +283,7 @@ class MqttSource(_Peer, RowSource):
         except UnicodeDecodeError:
             topic = ""
         columns = self._columns(topic)
-        if not columns:  # the session still has it from a case that was another
+        if not columns:  # the session still has a subscription of an earlier case
             client.ack(message.mid, message.qos)
             return
         with self._lock:
@@ -292,7 +292,7 @@ class MqttSource(_Peer, RowSource):
             if message.qos:
                 content = hash((topic, payload))
                 known = self._deliveries.get(message.mid)
-                # Sent again after a reconnect: its row is in the queue or in the journal already.
+                # Repeated after a reconnect: its row is already in the queue or in the journal.
                 if message.dup and known is not None and known.content == content:
                     known.connection = self._connection
                     if known.safe:
@@ -300,7 +300,7 @@ class MqttSource(_Peer, RowSource):
                     return
                 delivery = _Delivery(message.mid, content, self._connection)
                 self._deliveries[message.mid] = delivery
-            # The broker sends such messages without limit, so that the queue needs one.
+            # The broker sends messages of QoS 0 without a limit, so that the queue needs a limit.
             elif self._rows.qsize() >= self._broker.ahead:
                 self.dropped += 1
                 return
@@ -309,7 +309,7 @@ class MqttSource(_Peer, RowSource):
 
     def _confirm(self, delivery: _Delivery) -> None:
         self._client.ack(delivery.number, 1)
-        # If the acknowledgement is lost, the message comes again, and must be recognised.
+        # If the acknowledgement is lost, the message is repeated and must be recognised.
         self._confirmed.append(delivery)
         if len(self._confirmed) > CONFIRMED:
             oldest = self._confirmed.popleft()
@@ -332,21 +332,21 @@ class MqttSource(_Peer, RowSource):
         return Row({self._time: moment, column: values.get("value")}, token=token)
 
     def _columns(self, topic: str) -> list[str | None]:
-        """Return the column of a topic that is listened to, nothing for others."""
+        """Return the column of a subscribed topic in a list; empty for other topics."""
         from paho.mqtt.client import topic_matches_sub
 
         return [column for sub, column in self._topics.items() if topic_matches_sub(sub, topic)]
 
     @property
     def done(self) -> bool:
-        """A broker never reports the end of its messages."""
+        """False: a broker never reports the end of its messages."""
         return False
 
     def poll(self, wait: float) -> Sequence[Row]:
-        """Return the messages that have come.
+        """Return the rows of messages that have arrived.
 
-        Raises `DataError`: another client has taken the session; or nothing can come any more,
-        because as many messages as the broker sends ahead wait for later ones.
+        Raises `DataError`: another client has taken over the session; or the broker sends no more
+        messages, because `ahead` messages are unacknowledged and wait for later ones.
         """
         rows = drained(self._rows, wait)
         if wait and not rows:
@@ -372,7 +372,7 @@ class MqttSource(_Peer, RowSource):
                 )
 
     def acknowledge(self, tokens: Iterable[Any]) -> None:
-        """Acknowledge messages to the broker; while it is offline, after the reconnect."""
+        """Acknowledge messages to the broker, or after the reconnect if it is offline."""
         with self._lock:
             for token in tokens:
                 known = None if token is None else self._deliveries.get(token.number)
@@ -395,9 +395,9 @@ def _topic_of(topic: str, label: str) -> str:
 def home_assistant(
     estimate: Estimate, topic: str, title: str
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the topics and messages by which Home Assistant finds the numbers of a run.
+    """Yield topics and messages of the MQTT discovery of Home Assistant.
 
-    Each unknown is a sensor, and the level of the verdict another one, of one device.
+    The run is a device. Each unknown and the level of the verdict are its sensors.
     """
     node = re.sub(r"[^A-Za-z0-9_-]", "_", topic)
     shared = {
@@ -426,27 +426,27 @@ def home_assistant(
 
 
 class MqttSink(_Peer):
-    """Publishes estimates: one JSON object for each sample, and each number to its own topic.
+    """Sink that publishes each estimate as a JSON object, and each unknown to its own topic.
 
-    Never waits for the broker: while it is away the newest estimates are kept and the others
-    counted.
+    `put` never waits for the broker. While the broker is offline, the newest estimates are kept,
+    and the others are dropped and counted.
 
     Parameters
     ----------
     broker, topic
-        Where to: TOPIC has the objects; TOPIC/unknowns/LABEL the unknowns; TOPIC/status "running",
-        or "offline" when the run has ended or cannot be reached. All but the first are retained.
+        Destination: TOPIC for the objects; TOPIC/unknowns/LABEL for unknowns; TOPIC/status for
+        "running", or "offline" if the run has ended or is unreachable. Only TOPIC is not retained.
     discovery
         Whether to publish a discovery message for each sensor of Home Assistant.
     title
-        Name of the run, as Home Assistant shows it.
+        Name of the run in Home Assistant.
     keep
-        Estimates that may wait for the broker.
+        Largest number of estimates that wait for the broker.
 
     Attributes
     ----------
     dropped
-        Estimates that were not sent because newer ones came while the broker was away.
+        Number of estimates that were dropped while the broker was offline.
     """
 
     def __init__(
@@ -472,7 +472,7 @@ class MqttSink(_Peer):
         self._given_up = threading.Event()
         self._free = threading.Semaphore(UNCONFIRMED)
         self._client.on_publish = self._on_publish
-        # The last will: the broker publishes it when the connection breaks.
+        # The broker publishes this last will if the connection breaks.
         self._client.will_set(f"{self._topic}/status", "offline", 1, retain=True)
         self._start()
         self._sender = threading.Thread(target=self._send, daemon=True)
@@ -485,7 +485,7 @@ class MqttSink(_Peer):
         self._started.set()
 
     def put(self, estimate: Estimate) -> None:
-        """Publish an estimate, as soon as the broker takes it."""
+        """Queue an estimate, which is published as soon as the broker accepts it."""
         with self._changed:
             if len(self._waiting) == self._waiting.maxlen:
                 self.dropped += 1
@@ -497,7 +497,7 @@ class MqttSink(_Peer):
             self._changed.notify()
 
     def _send(self) -> None:
-        discovered = True  # by Home Assistant
+        discovered = True  # whether discovery messages were sent to Home Assistant
         while not self._given_up.is_set():
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._announce or self._closing)
@@ -515,7 +515,7 @@ class MqttSink(_Peer):
                 return
 
     def _publish_numbers(self, estimate: Estimate, discovered: bool) -> None:
-        """Publish an estimate, after the messages by which its numbers are discovered."""
+        """Publish an estimate, after the discovery messages if these were not sent yet."""
         if not discovered:
             for topic, content in home_assistant(estimate, self._topic, self._title):
                 self._publish(topic, json.dumps(content))
@@ -536,13 +536,13 @@ class MqttSink(_Peer):
         self._free.release()
 
     def close(self) -> None:
-        """Disconnect when all is sent, or the broker has not answered for some time."""
+        """Disconnect after all messages were sent, at the latest after `PATIENCE`."""
         until = time.monotonic() + PATIENCE
         with self._changed:
             self._closing = True
             self._changed.notify()
         self._sender.join(PATIENCE)
-        # A message gives its place back when the broker has confirmed it.
+        # A message releases the semaphore when the broker has confirmed it.
         for _ in range(UNCONFIRMED):
             if not self._free.acquire(timeout=max(until - time.monotonic(), 0.0)):
                 log.warning("the broker at %s did not accept all estimates", self._broker.address)

@@ -1,4 +1,4 @@
-"""Rows from a control system, and estimates back to it (OPC UA, by asyncua)."""
+"""Source of rows and sink of estimates for a control system (OPC UA, with asyncua)."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from livepde.streams.sources import Row, RowSource, drained
 
 __all__ = ["OpcuaServer", "OpcuaSink", "OpcuaSource"]
 
-PATIENCE = 5.0  # seconds for each answer
-LOOK = 1.0  # seconds between two looks at whether the server is there
-LONGEST_WAIT = 30.0  # seconds between two attempts to reach it again
-HELD = 65535  # rows that wait to be taken; newer ones are dropped then
-QUEUED = 10  # values of a node that the server keeps between two messages
+PATIENCE = 5.0  # timeout of requests in seconds
+LOOK = 1.0  # seconds between two checks of the connection
+LONGEST_WAIT = 30.0  # longest time in seconds between two attempts to reconnect
+HELD = 65535  # largest number of waiting rows; newer rows are then dropped
+QUEUED = 10  # values of a node that the server queues between two messages
 
 log = logging.getLogger("livepde.opcua")
 
 
 @dataclass(frozen=True)
 class OpcuaServer:
-    """How to reach a server.
+    """Connection to a server: address, login and encryption.
 
     Parameters
     ----------
@@ -41,8 +41,8 @@ class OpcuaServer:
     username, password
         Login, if the server requires one; the password is never written anywhere.
     security
-        "Policy,Mode,certificate,key" with files (PEM or DER), and perhaps the certificate of the
-        server, which is then the only one that is trusted. Empty: messages are not encrypted.
+        "Policy,Mode,certificate,key" with files (PEM or DER), and optionally the certificate of the
+        server, which is then the only trusted one. Empty: no encryption.
     """
 
     url: str
@@ -51,12 +51,12 @@ class OpcuaServer:
     security: str = ""
 
     async def client(self) -> Any:
-        """Return a client that is not connected yet."""
+        """Return a client without a connection."""
         from asyncua.client.client import Client
 
         client: Any = Client(self.url, timeout=PATIENCE)
         if self.security:
-            # A server compares the name of a client with the one in its certificate.
+            # A server compares the URI of a client with the URI in its certificate.
             client.application_uri = _application_of(Path(self.security.split(",")[2]))
             await client.set_security_string(self.security)
         if self.username is not None:
@@ -66,7 +66,7 @@ class OpcuaServer:
 
 
 def _application_of(path: Path) -> str:
-    """Return the name of the application for which a certificate was made."""
+    """Return the application URI in a certificate."""
     from cryptography import x509
 
     content = path.read_bytes()
@@ -82,7 +82,7 @@ def _application_of(path: Path) -> str:
 
 
 class _Client:
-    """A connection to a server, in its own thread, that reconnects until it is closed."""
+    """A connection to a server in its own thread, which reconnects until it is closed."""
 
     def __init__(self, server: OpcuaServer) -> None:
         with optional("opcua", "OPC UA needs asyncua", DataError):
@@ -108,7 +108,7 @@ class _Client:
             runner.run(self._stay())
 
     async def _stay(self) -> None:
-        """Serve, and reconnect when the connection is lost."""
+        """Serve, and reconnect if the connection is lost."""
         from asyncua.ua.uaerrors import UaError
 
         while not self._stop.is_set():
@@ -131,7 +131,7 @@ class _Client:
         raise NotImplementedError
 
     def _connected(self) -> None:
-        """Note that the server accepts requests."""
+        """Record that the server accepts requests."""
         if self._started.done():
             log.info("reconnected to the server at %s", self._server.url)
         else:
@@ -139,7 +139,7 @@ class _Client:
         self._wait = LOOK
 
     async def _stopped(self, wait: float) -> bool:
-        """Wait, and return whether to stop."""
+        """Wait until the client is closed, at most `wait` seconds; return whether it is closed."""
         try:
             await asyncio.wait_for(self._stop.wait(), wait)
         except TimeoutError:
@@ -148,7 +148,7 @@ class _Client:
 
     def close(self) -> None:
         """Disconnect from the server."""
-        with suppress(RuntimeError):  # the loop has closed by itself: nothing is left to stop
+        with suppress(RuntimeError):  # raised if the loop is already closed
             self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(PATIENCE)
 
@@ -156,16 +156,16 @@ class _Client:
 class OpcuaSource(_Client, RowSource):
     """Rows from nodes of a server, one for each change of a value.
 
-    A row has the time at which the server's source saw the change, as a date. A value whose status
-    is not good is a broken row. A constant value is sent only once. Changes while the server cannot
-    be reached are lost; the source tries to reconnect until the server is back.
+    The time of a row is the source time of the change, as a date. A value whose status is not good
+    is a broken row. A constant value is sent only once. Changes while the server is unreachable are
+    lost; the source tries to reconnect until the server is available again.
 
     Parameters
     ----------
     server
-        How to reach the server.
+        Connection to the server.
     columns
-        Node -> column, as {"ns=2;s=T_05": "T_05"}.
+        Node -> column, such as {"ns=2;s=T_05": "T_05"}.
     time
         Name of the time column.
     interval
@@ -174,14 +174,14 @@ class OpcuaSource(_Client, RowSource):
     Attributes
     ----------
     dropped
-        Rows that came faster than they were taken.
+        Number of rows that were lost because the queue was full.
     undated
-        Values without a source time, which have the server's, or the time of their arrival.
+        Number of values without a source time, which have the server time or the arrival time.
 
     Raises
     ------
     DataError
-        There is no server, it refuses the name, or a node does not exist.
+        There is no server, it refuses the login, or a node does not exist.
     """
 
     def __init__(
@@ -216,7 +216,7 @@ class OpcuaSource(_Client, RowSource):
                 raise DataError(f"the server ended the subscription ({changes.ended})")
 
     def _take(self, column: str, found: Any) -> None:
-        """Take a value with its time and status; after a reconnect it may be a known one."""
+        """Queue the row of a value, unless the value is known, such as after a reconnect."""
         moment = found.SourceTimestamp or found.ServerTimestamp or datetime.now(UTC)
         if self._seen.get(column) == moment:
             return
@@ -241,20 +241,20 @@ class OpcuaSource(_Client, RowSource):
 
     @property
     def done(self) -> bool:
-        """False: the data of a server never end."""
+        """False: a server never reports the end of its data."""
         return False
 
     @property
     def steady(self) -> bool:
-        """False: a server does not send a value that stays the same."""
+        """False: a server does not send unchanged values."""
         return False
 
     def poll(self, wait: float) -> Sequence[Row]:
-        """Return the changes that have come.
+        """Return the rows of changes that have arrived.
 
-        Raises `DataError`: the thread of the connection has ended by an unforeseen error.
+        Raises `DataError`: the thread of the connection has ended with an unexpected error.
         """
-        broken = not self._thread.is_alive()  # asked first: its last rows come before the error
+        broken = not self._thread.is_alive()  # checked first, so that its last rows are returned
         rows = drained(self._rows, wait)
         if broken and not rows:
             raise DataError(f"OPC UA: {self._server.url}: the connection failed, see the log.")
@@ -277,19 +277,19 @@ class _Changes:
 
 
 class OpcuaSink(_Client):
-    """Writes estimates to nodes of a server, at most once a second, always the newest ones.
+    """Sink that writes the newest estimate to nodes of a server, at most once a second.
 
     Parameters
     ----------
     server
-        How to reach the server.
+        Connection to the server.
     columns
         Node -> an unknown, such as alpha; its standard deviation, alpha_std; or verdict.
 
     Raises
     ------
     DataError
-        There is no server, it refuses the name, or a node cannot be written.
+        There is no server, it refuses the login, or a node cannot be written.
     """
 
     def __init__(self, server: OpcuaServer, columns: Mapping[str, str]) -> None:
@@ -298,9 +298,9 @@ class OpcuaSink(_Client):
         super().__init__(server)
 
     def put(self, estimate: Estimate) -> None:
-        """Write an estimate as soon as the server is there.
+        """Write an estimate as soon as the server is reachable.
 
-        Raises `DataError`: it has no number of a name.
+        Raises `DataError`: the estimate has no value with one of the names in `columns`.
         """
         row = estimate.to_dict()
         values = {"verdict": row["verdict"]}
@@ -318,7 +318,7 @@ class OpcuaSink(_Client):
         self._connected()
         stopped, written = False, None
         while not stopped:
-            stopped = await self._stopped(LOOK)  # the last values are written before the end
+            stopped = await self._stopped(LOOK)  # before the last pass, to write the last values
             await client.check_connection()
             values = self._newest
             for node, kind, name in () if values is written else nodes:
@@ -328,7 +328,7 @@ class OpcuaSink(_Client):
 
 
 async def _writable(client: Any, name: str, column: str) -> tuple[Any, Any, str]:
-    """Return a node, its type and the value to write."""
+    """Return a node, its type and the name of the value to write; check that it is writable."""
     from asyncua.ua import AccessLevel, VariantType
     from asyncua.ua.uaerrors import UaError
 
