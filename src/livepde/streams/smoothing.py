@@ -1,15 +1,15 @@
 """Causal smoothers as stages of a stream (section 3.3).
 
 The theory wants data that are smooth in time, ||(z^delta - z)_t||_Z <= delta~(t), "which can be
-achieved by averaging over sufficiently large time intervals". A stage takes samples and yields
-samples, each as soon as it has come:
+achieved by averaging over sufficiently large time intervals". A stage yields a smoothed sample as
+soon as each sample arrives:
 
     smoothed = LocalPolynomial(width=1.0, degree=2)(stream)
     for sample in smoothed:
         estimate = identifier.step(sample.t, sample.z, sample.inputs)
         smoothed.std, smoothed.d_rate
 
-Smoothing reduces the noise, but may add a lag, which is stated for each stage.
+Smoothing reduces the noise but may add a lag, which is documented for each stage.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from livepde.errors import ConfigurationError, SampleError
 from livepde.linalg import Array, Mask
 from livepde.samples import Sample, in_order
 
-LARGEST_MEMO = 256  # weights kept for different spacings and patterns of missing samples
-RESOLUTION = 1e-9  # offsets that differ by less than this share of the width have the same weights
+LARGEST_MEMO = 256  # largest number of stored weights, for spacings and patterns of missing values
+RESOLUTION = 1e-9  # offsets that differ by less, relative to the width, have the same weights
 
 
 class Weights(ABC):
@@ -34,28 +34,28 @@ class Weights(ABC):
 
     @abstractmethod
     def add(self, t: float, z: Array) -> tuple[Array, Array, Array]:
-        """Take one sample and return z~_k and two variances, per variance of the raw noise.
+        """Process a sample; return z~_k and two variances, relative to that of the raw noise.
 
-        They are sum_j w_kj^2, of the noise of z~_k, and sum_j (w_kj - w_k-1,j)^2, of that of
-        z~_k - z~_k-1; NaN for the first sample. All have the shape (channels,), NaN where z is
-        missing.
+        The first, sum_j w_kj^2, is the variance of the noise of z~_k. The second, of the noise of
+        z~_k - z~_k-1, is sum_j (w_kj - w_k-1,j)^2, and NaN for the first sample. All have the shape
+        (channels,), NaN where z is missing.
         """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Smoother(ABC):
-    """A causal smoother: call it with a stream and get a stream.
+    """A causal smoother: a function of a stream that returns the smoothed stream.
 
     Parameters
     ----------
     noise
-        Standard deviation of the raw noise: one number, or one for each channel. Default: estimated
-        from all samples so far, by the residuals of values to the straight line between their two
-        neighbours (Gasser, Sroka and Jennen-Steinmetz 1986). Only the curvature of the signal
-        biases the estimate, which assumes noise that is independent from sample to sample.
+        Standard deviation of the raw noise: a number, or a number for each channel. By default it
+        is estimated from all samples so far, by the residuals of values to the straight line
+        between their two neighbours (Gasser, Sroka and Jennen-Steinmetz 1986). The estimate assumes
+        independent noise in each sample and is biased only by the curvature of the signal.
     channels
-        Names of the channels to smooth, for samples by name; default all of the first sample that
-        are not inputs of it. Inputs and other channels pass unchanged, without the lag.
+        Names of the channels to smooth, for samples with names; default: all channels of the first
+        sample except its inputs. Inputs and other channels are passed unchanged, without lag.
     """
 
     noise: float | Sequence[float] | None = None
@@ -72,37 +72,37 @@ class Smoother(ABC):
 
     @abstractmethod
     def weights(self) -> Weights:
-        """Return a memory without samples."""
+        """Return weights without samples in memory."""
 
     @abstractmethod
     def noise_factor(self, h: float) -> float:
-        """Return std / sigma, settled, for samples at a distance h and white noise."""
+        """Return the limit of std / sigma for samples at intervals h with white noise."""
 
     def __call__(self, stream: Iterable[Any]) -> Smoothed:
-        """Return the smoothed stream; items are `Sample`, (t, z) or (t, z, inputs)."""
+        """Return the smoothed stream; its items are `Sample`, (t, z) or (t, z, inputs)."""
         return Smoothed(self, stream)
 
 
 class Smoothed(Iterable[Sample]):
     """A smoothed stream, with the noise level of the last sample.
 
-    A missing value stays missing: smoothing does not invent data.
+    A missing value remains missing: smoothing does not fill gaps.
 
     Attributes
     ----------
     std
         Standard deviation of the noise of the smoothed channels, sigma sqrt(sum_j w_kj^2), shape
-        (channels,); the value of `noise` for the observation.
+        (channels,); to be used as `noise` of the observation.
     d_rate
-        The noise part of d~ = (d_alpha^delta)_t for each channel, the root mean square of the rate
-        of the smoothed noise,
+        The contribution of noise to d~ = (d_alpha^delta)_t for each channel: the root mean square
+        rate of change of the smoothed noise,
 
             sigma sqrt(sum_j (w_kj - w_k-1,j)^2) / (t_k - t_k-1),
 
         shape (channels,), NaN for the first sample. The contribution of the lag, the rate of z~ - z
         without noise, is not included.
     sigma
-        Standard deviation of the raw noise, given or estimated, shape (channels,).
+        Standard deviation of the raw noise, specified or estimated, shape (channels,).
     """
 
     def __init__(self, smoother: Smoother, stream: Iterable[Any]) -> None:
@@ -137,11 +137,11 @@ class Smoothed(Iterable[Sample]):
     def norm_d_rate(self, gram: Array | None = None) -> float:
         """Return the root mean square of ||d~||_Z after the last sample, from `d_rate`.
 
-        For `Subdomain` and G^+ that is ||d~||_X; G_alpha only shrinks it in X. The channels are
-        taken as independent. Under the link conditions (cond:link) the last theorem of
-        the paper bounds the limit superior of ||q^ - q*||_Q by 2 gamma_0 / epsilon_0 times its
-        supremum over time (th:parameter_noisesmooth); no data error meets them that does not
-        vanish.
+        For `Subdomain` and G^+ this norm is ||d~||_X; G_alpha only reduces it in X. The channels
+        are assumed to be independent. Under the link conditions (cond:link), the last theorem of
+        the paper bounds the limit superior of ||q^ - q*||_Q by 2 gamma_0 / epsilon_0 times the
+        supremum of the norm over time (th:parameter_noisesmooth). Only a vanishing data error
+        satisfies these conditions.
 
         Parameters
         ----------
@@ -188,17 +188,17 @@ class Smoothed(Iterable[Sample]):
 
 
 class _NoiseLevel:
-    """Standard deviation of white noise, by residuals to the line between the neighbours."""
+    """Standard deviation of white noise, from residuals to the line between two neighbours."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        # The last two values of each channel and their times, the older one first.
+        # The last two values of each channel and their times, in order.
         self.z = np.full((2, *shape), np.nan)
         self.t = np.full((2, *shape), np.nan)
         self.squares = np.zeros(shape)
         self.counts = np.zeros(shape)
 
     def add(self, t: float, z: Array) -> Array:
-        """Take one sample and return the standard deviation so far, NaN where it is unknown."""
+        """Process a sample; return the standard deviation so far, NaN where it is unknown."""
         present = np.isfinite(z)
         # The residual z_1 - (1 - s) z_0 - s z, with t_1 = (1 - s) t_0 + s t, has the variance
         # sigma^2 (1 + (1 - s)^2 + s^2) for white noise; the curvature of the signal is neglected.
@@ -235,7 +235,7 @@ class _Window(Weights):
         self.times.append(t)
         self.values.append(z)
         width = self.smoother.width
-        # A sample at the very start of the window (t - width, t] is outside, whatever its rounding.
+        # A sample at the start of the window (t - width, t] is outside, regardless of rounding.
         gone = 0
         while self.times[gone] <= t - width * (1 - RESOLUTION):
             gone += 1
@@ -244,7 +244,7 @@ class _Window(Weights):
         weights = self._weights(np.array(self.times) - t, np.isfinite(values))
         change = np.full(z.shape, np.nan)
         if len(self.last):
-            # Weights change by samples in both windows, samples that left, and samples that came.
+            # Contributions of samples in both windows, samples that left, and new samples.
             kept = self.last[gone:]
             change = ((weights[: len(kept)] - kept) ** 2).sum(axis=0)
             change += (self.last[:gone] ** 2).sum(axis=0) + (weights[len(kept) :] ** 2).sum(axis=0)
@@ -259,7 +259,7 @@ class _Window(Weights):
         if present.all():
             weights[:] = self._of(offsets)[:, None]
             return weights
-        # Channels that lack the same samples have the same weights.
+        # Channels with the same missing samples have the same weights.
         patterns, which = np.unique(present.T, axis=0, return_inverse=True)
         for k, pattern in enumerate(patterns):
             column = np.zeros(len(offsets))
@@ -271,7 +271,7 @@ class _Window(Weights):
         return weights
 
     def _of(self, offsets: Array) -> Array:
-        # Equidistant samples give the same offsets again and again, up to rounding.
+        # Equidistant samples always have the same offsets, up to rounding.
         rounded = np.round(offsets / (self.smoother.width * RESOLUTION))
         key = rounded.tobytes()
         if key not in self._memo:
@@ -283,7 +283,7 @@ class _Window(Weights):
 
 @dataclass(frozen=True)
 class _WindowSmoother(Smoother):
-    """A smoother that sees the samples of (t - width, t]."""
+    """A smoother over the samples in the window (t - width, t]."""
 
     width: float
 
@@ -302,7 +302,7 @@ class _WindowSmoother(Smoother):
 
     @abstractmethod
     def window(self, s: Array) -> Array:
-        """Return the weights of samples at t_k + width · s, with -1 < s <= 0 and s[-1] = 0."""
+        """Return the weights of samples at times t_k + width · s, -1 < s <= 0 and s[-1] = 0."""
 
 
 def _positive(owner: object, name: str, value: float) -> None:
@@ -314,11 +314,11 @@ def _positive(owner: object, name: str, value: float) -> None:
 
 @dataclass(frozen=True)
 class WindowAverage(_WindowSmoother):
-    """The mean over the samples of (t - width, t].
+    """The mean over the samples in the window (t - width, t].
 
-    Exact for constants. Lag: t_k minus the mean of their times, half the width for equidistant
-    samples; a linear trend is delayed by it. The standard deviation of the noise falls with the
-    root of the number of samples.
+    Exact for constants. A linear trend is delayed by the lag: t_k minus the mean of the times, half
+    the width for equidistant samples. The standard deviation of the noise is inversely proportional
+    to the square root of the number of samples.
 
     >>> stage = WindowAverage(3.0, noise=1.0)([(0, [0.0]), (1, [1.0]), (2, [2.0]), (3, [3.0])])
     >>> [float(sample.z[0]) for sample in stage], stage.std.round(3).tolist()
@@ -331,19 +331,19 @@ class WindowAverage(_WindowSmoother):
 
 @dataclass(frozen=True)
 class LocalPolynomial(_WindowSmoother):
-    """The value at t of the polynomial that fits the samples of (t - width, t] best.
+    """The value at t of the least-squares polynomial through the samples in (t - width, t].
 
-    Exact for polynomials up to `degree`, at any spacing of the samples, so it has no lag for a
-    linear trend (degree >= 1); of a smooth signal it misses the order width^(degree + 1). The
-    price is noise: its variance is about (degree + 1)^2 over the number of samples. With fewer than
-    degree + 1 samples the degree falls.
+    Exact for polynomials up to `degree` at any spacing of the samples, so that a linear trend has
+    no lag (degree >= 1). The error for a smooth signal is of order width^(degree + 1). The variance
+    of the noise is about (degree + 1)^2 over the number of samples. With fewer than degree + 1
+    samples, the degree is reduced.
 
     Parameters
     ----------
     width
-        Of the window, in the unit of time.
+        Length of the window, in the unit of time.
     degree
-        Of the polynomial, >= 0; 0 is `WindowAverage`.
+        Degree of the polynomial, >= 0; 0 is `WindowAverage`.
     """
 
     degree: int = 1
@@ -356,7 +356,7 @@ class LocalPolynomial(_WindowSmoother):
     def window(self, s: Array) -> Array:
         degree = min(self.degree, len(s) - 1)
         powers = np.vander(s, degree + 1, increasing=True)
-        # The row of the constant term: the value of the polynomial at s = 0, the newest sample.
+        # The row of the constant term: the value of the polynomial at the newest sample, s = 0.
         fit: Array = np.linalg.pinv(powers)[0]
         return fit
 
@@ -365,8 +365,8 @@ class LocalPolynomial(_WindowSmoother):
 class Exponential(Smoother):
     """Exponential smoothing, z~_k = z~_k-1 + a (z_k - z~_k-1), a = 1 - exp(-(t_k - t_k-1)/time).
 
-    Exact for constants. Lag: h (1 - a)/a for equidistant samples, about `time`. For every channel
-    t_k-1 is its last sample with a value.
+    Exact for constants. The lag is h (1 - a)/a for equidistant samples, about `time`. For each
+    channel, t_k-1 is the time of its last sample with a value.
 
     Parameters
     ----------
@@ -393,9 +393,9 @@ class Exponential(Smoother):
 @dataclass
 class _Fading(Weights):
     time: float
-    # Of each channel: value, variance and time of the last sample that had one.
+    # Smoothed value, variance and time of the last sample with a value, for each channel.
     state: tuple[Array, Array, Array] | None = None
-    seen: Mask | None = None  # which channels the last sample had
+    seen: Mask | None = None  # whether the last sample had a value, for each channel
 
     def add(self, t: float, z: Array) -> tuple[Array, Array, Array]:
         present = np.isfinite(z)
@@ -409,7 +409,7 @@ class _Fading(Weights):
             )
         first = present & np.isnan(smooth)
         share = -np.expm1(-(t - times) / self.time)
-        # z~_k - z~_k-1 = a (z_k - z~_k-1), and the noise of z_k is independent of that of z~_k-1.
+        # z~_k - z~_k-1 = a (z_k - z~_k-1), where the noises of z_k and z~_k-1 are independent.
         change = share**2 * (1.0 + variance)
         new = np.where(first, z, smooth + share * (z - smooth))
         spread = np.where(first, 1.0, (1.0 - share) ** 2 * variance + share**2)

@@ -22,9 +22,9 @@ from livepde.streams.table import JSON_LINES, no_file
 
 T = TypeVar("T")
 
-BATCH = 100  # most rows of one poll
-HEADERS = 16  # of a file that are remembered
-NAP = 0.05  # seconds between looks at a file that does not grow
+BATCH = 100  # largest number of rows per poll
+HEADERS = 16  # largest number of stored headers
+NAP = 0.05  # seconds between two checks of a file that does not grow
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,10 @@ class Row:
     token
         Token by which the source identifies the row.
     broken
-        Reason why there are no values; '' if there are.
+        Reason why there are no values; '' if there are values.
     kind
         Kind of the remark on a row without values: "malformed"; "rewritten": rows before it may be
-        missing, since the file was replaced; "header": the columns are other ones from here on.
+        missing, since the file was replaced; "header": the columns have changed.
     """
 
     values: Mapping[str, Any]
@@ -52,42 +52,42 @@ class Row:
 
 
 class RowSource(Protocol):
-    """A source of rows as they arrive; used from one thread.
+    """A source of rows as they arrive; used from a single thread.
 
-    A subclass without a position, acknowledgements or resources takes the methods as they are here.
+    The default methods suit a source without a position, acknowledgements or resources.
     """
 
     @property
     def done(self) -> bool:
-        """True if nothing more will come."""
+        """True if there will be no more rows."""
 
     @property
     def steady(self) -> bool:
-        """Whether rows come while nothing changes, so that their absence is a fault."""
+        """Whether unchanged values are sent too, so that a lack of rows is a fault."""
         return True
 
     def poll(self, wait: float) -> Sequence[Row]:
-        """Return the rows that are there, or after at most `wait` seconds none."""
+        """Return the available rows, possibly none, after at most `wait` seconds."""
 
     def position(self, waiting: Iterable[Any]) -> str:
-        """Return the position before the rows with these tokens, which are still to be taken.
+        """Return the position before the rows with these tokens, which are not yet processed.
 
-        A source created with it delivers those rows and all later ones; '' if the source itself
-        remembers, or cannot go back.
+        A source that is created with this position delivers these and all later rows. It is '' if
+        the source itself stores its position, or cannot go back.
         """
         return ""
 
     def acknowledge(self, tokens: Iterable[Any]) -> None:
-        """Acknowledge rows that have been kept for good, by their tokens."""
+        """Acknowledge rows that are safely stored, by their tokens."""
         return
 
     def close(self) -> None:
-        """Release its resources."""
+        """Release the resources of the source."""
         return
 
 
 def json_row(text: str | bytes, token: Any = None) -> Row:
-    """Return the row in a line of JSON: an object, column -> value."""
+    """Parse a row from a line of JSON, an object with column -> value."""
     if len(text) > LONGEST:
         return Row({}, token=token, broken=f"longer than {LONGEST} characters")
     try:
@@ -100,7 +100,7 @@ def json_row(text: str | bytes, token: Any = None) -> Row:
 
 
 def drained(waiting: queue.Queue[T], wait: float) -> list[T]:
-    """Return the items in a queue, at most a batch, or none after `wait` seconds."""
+    """Return up to a batch of items from a queue, or none after `wait` seconds."""
     found: list[T] = []
     while len(found) < BATCH:
         try:
@@ -111,30 +111,30 @@ def drained(waiting: queue.Queue[T], wait: float) -> list[T]:
 
 
 class Follow(RowSource):
-    """A CSV file with a header, or a file of JSON lines (.jsonl), also while it grows.
+    """Rows of a CSV file with a header or of a file of JSON lines (.jsonl), which may grow.
 
     The title of a logger (TOA5), lines of units under the header and lines that begin with # are
-    skipped. A line is read once its end has been written. If a header appears again, its order of
-    the columns holds from there on.
+    skipped. A line is read after its end has been written. If a header appears again, its columns
+    apply to the following rows.
 
-    Changes of the file are described in `livepde.streams.growing_file`: one that is renamed is
-    read to its end before the new one, and one that is cut or written again is read from its start,
-    where known rows are repeated. If rows may be missing, a row without values reports it.
+    Changes of the file are described in `livepde.streams.growing_file`: a renamed file is read to
+    its end before the new file. A truncated or rewritten file is read from its start, so that known
+    rows are repeated. If rows may be missing, a row without values reports it.
 
     Parameters
     ----------
     path
-        The file; it need not exist yet if `follow`.
+        Path of the file, which need not exist yet if `follow`.
     separator, encoding
-        Of a CSV file; an encoding in which the letters of English are single bytes.
+        Format of a CSV file; ASCII characters must be single bytes in the encoding.
     skip
-        Lines before the header.
+        Number of lines before the header.
     times
-        Columns whose texts together are the time, which stands under the first name.
+        Columns whose joined texts are the time, which gets the first of these names.
     follow
-        Wait for more at the end of the file.
+        Whether to wait for more rows at the end of the file.
     position
-        Return value of the method `position`. Another file is read from its start.
+        Return value of the method `position`. A different file is read from its start.
     """
 
     def __init__(
@@ -156,13 +156,13 @@ class Follow(RowSource):
         self._resumed = FilePosition.read(position)
         self._file = GrowingFile(self.path, follow, self._resumed)
         self._ready: deque[Line] = deque()
-        self._number = 0  # of the file whose lines are read
-        self._headers: dict[tuple[int, int], list[str]] = {}  # file and first byte -> columns
+        self._number = 0  # number of the current file
+        self._headers: dict[tuple[int, int], list[str]] = {}  # file number and offset -> columns
         self._header: list[str] | None = None
-        self._above = 0  # lines above the header that are still to come
-        self._labels = 0  # lines under the header that may be labels
+        self._above = 0  # number of lines left above the header
+        self._labels = 0  # number of next lines that may be labels
         self._ended = False
-        # Lines are told apart as bytes, before they are decoded.
+        # Lines are separated as bytes, before they are decoded.
         if b"a\n".decode(encoding, "replace") != "a\n":
             raise DataError(
                 f"{self.path}: a file in {encoding} cannot be read while it grows; write it in "
@@ -177,7 +177,7 @@ class Follow(RowSource):
         return self._ended
 
     def poll(self, wait: float) -> Sequence[Row]:
-        """Return the complete lines that are there."""
+        """Return the rows of the complete lines, possibly none, after at most `wait` seconds."""
         until = time.monotonic() + wait
         while True:
             try:
@@ -196,7 +196,7 @@ class Follow(RowSource):
             time.sleep(min(NAP, wait))
 
     def position(self, waiting: Iterable[Any]) -> str:
-        """Return the place of the first line that still waits, or of the next one, and the file."""
+        """Return the position of the first waiting line, else of the next line."""
         if self._resumed is not None:
             return str(self._resumed)  # no line was read yet
         following = [(line.number, line.start) for line in islice(self._ready, 1)]
@@ -209,7 +209,7 @@ class Follow(RowSource):
         self._file.close()
 
     def _rows(self) -> list[Row]:
-        """Return the next rows, or none."""
+        """Return the next rows, which may be none."""
         rows: list[Row] = []
         while len(rows) < BATCH and not self._ended:
             if not self._ready:
@@ -225,12 +225,12 @@ class Follow(RowSource):
         return rows
 
     def _enter(self, line: Line) -> None:
-        """Begin with the lines of another file; after a resume with the header it has."""
+        """Begin with the lines of another file, after a resume with its header."""
         self._number, self._header = line.number, None
         self._above, self._labels = self._skip, 0
         resumed, self._resumed = self._resumed, None
         if any(number == line.number for number, _ in self._headers):
-            # Lines that were added to an earlier file.
+            # This line was added to an earlier file.
             self._header = self._headers[max(at for at in self._headers if at[0] == line.number)]
             self._above = 0
         elif line.start and not self._json:
@@ -239,7 +239,7 @@ class Follow(RowSource):
             del self._headers[place]
 
     def _read_header(self, line: Line, at: int) -> None:
-        """Read the header at a place, and labels under it, from the text before a line."""
+        """Read the header at an offset, and labels under it, from the content before a line."""
         self._above = 0 if at else self._skip
         for content in self._file.before(at):
             if at >= line.start or (self._header is not None and not self._labels):
@@ -274,7 +274,7 @@ class Follow(RowSource):
         return self._row_of(cells, token)
 
     def _row_of(self, cells: list[str], token: tuple[int, int]) -> Row | None:
-        """Return the row of the cells of a line; None of a header, labels or a comment."""
+        """Return the row of a line's cells; None for a header, labels or a comment."""
         if self._header is None:
             return None if is_title(cells) else self._headed(cells, token)
         if cells[0].startswith("#"):
@@ -294,15 +294,15 @@ class Follow(RowSource):
         return Row(values, token=token)
 
     def _is_header(self, cells: list[str]) -> bool:
-        """Return whether a line has most of the names of the header."""
+        """Return whether a line contains most of the names in the header."""
         names = {name for name in self._header or () if name}
         found = len(names.intersection(cells))
         return 2 * found > len(names) or (found > 0 and found == len(names))
 
     def _headed(self, cells: list[str], token: tuple[int, int]) -> Row | None:
-        """Take a line as the header; return a row that reports a wrong or another one."""
+        """Use a line as header; return a row that reports an invalid or different header."""
         before, self._labels = self._header, UNDER
-        # Of two columns with one name neither is taken: both are missing.
+        # Two columns with the same name are both ignored.
         self._header = [name if cells.count(name) == 1 else "" for name in cells]
         self._headers[token] = self._header
         if twice := sorted(set(cells) - set(self._header)):
@@ -315,7 +315,7 @@ class Follow(RowSource):
 
 
 class Lines(RowSource):
-    """JSON lines from standard input, or another iterable of lines; read in its own thread."""
+    """Rows of JSON lines from standard input or any iterable, which is read in its own thread."""
 
     def __init__(self, lines: Iterable[str]) -> None:
         self._queue: queue.Queue[str | bytes | None] = queue.Queue(BATCH)
@@ -323,10 +323,10 @@ class Lines(RowSource):
         threading.Thread(target=self._pump, args=(lines,), daemon=True).start()
 
     def _pump(self, lines: Iterable[str]) -> None:
-        stream: Any = getattr(lines, "buffer", lines)  # bytes: what is no text is a broken row
+        stream: Any = getattr(lines, "buffer", lines)  # bytes: invalid text becomes a broken row
         try:
             pieces = stream
-            if hasattr(stream, "readline"):  # an endless line comes in pieces, refused one by one
+            if hasattr(stream, "readline"):  # a line that is too long is refused in pieces
                 pieces = iter(lambda: stream.readline(LONGEST + 1) or None, None)
             for line in pieces:
                 if line.strip():
@@ -340,7 +340,7 @@ class Lines(RowSource):
         return self._ended
 
     def poll(self, wait: float) -> Sequence[Row]:
-        """Return the lines that have come."""
+        """Return the rows of the lines that have arrived."""
         if self._ended:
             return []
         lines = drained(self._queue, wait)
@@ -349,7 +349,7 @@ class Lines(RowSource):
 
 
 class Rows(RowSource):
-    """Rows from a Python iterator of mappings, column -> value."""
+    """Rows from an iterable of mappings, column -> value."""
 
     def __init__(self, rows: Iterable[Mapping[str, Any]]) -> None:
         self._rows = iter(rows)
