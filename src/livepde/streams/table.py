@@ -1,4 +1,4 @@
-"""Samples from JSON lines (a file, or as they come), Parquet files, and columns in memory."""
+"""Samples from JSON lines (a file or a stream), Parquet files, and columns in memory."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from livepde.streams.clock import Clock, is_naive, read_times, with_second_passe
 from livepde.streams.thinned import Thinned
 
 HOUR = 3600.0  # seconds by which clocks are set back in autumn
-JSON_LINES = (".jsonl", ".ndjson")  # endings of files of JSON lines
+JSON_LINES = (".jsonl", ".ndjson")  # suffixes of files of JSON lines
 STREAM = "standard input"
-MOST = 12  # names that are listed
-# Endings of files that are data: a case may name any other file, whose columns are not listed.
+MOST = 12  # largest number of names in a message
+# Suffixes of data files. The columns of other files, which a case may name, are not listed.
 SHOWN = (".csv", ".txt", ".tsv", ".tab", ".dat", ".asc", ".log", ".jsonl", ".ndjson", ".parquet")
 
 
@@ -38,22 +38,22 @@ SHOWN = (".csv", ".txt", ".tsv", ".tab", ".dat", ".asc", ".log", ".jsonl", ".ndj
 class Column:
     """Columns and scale of a channel: value = factor * (mean of the columns) + offset.
 
-    Several columns are averaged; where one of them is missing, so is the channel.
+    If one of several columns has a missing value, the channel also has.
 
     Attributes
     ----------
     valid
-        Range of valid values; a value outside is missing.
+        Range of valid values; other values count as missing.
     needed
         Whether samples without this channel are left out.
     decimal
         Decimal mark of numbers as text: "." or ",".
     noise_of
-        Channel whose readings have this standard deviation; "": none. A value that is not
-        positive makes the reading missing; a missing one is replaced by that of the sensor.
+        Channel whose readings have the standard deviations in this column; "": none. If a value is
+        not positive, the reading is missing. If it is missing, the noise of the sensor is used.
     between
-        How the channel behaves between two readings; omitted rows keep their values
-        of a channel that is no "line".
+        Behaviour of the channel between two readings. Rows that are left out still supply the
+        values of channels that are not a "line".
     """
 
     names: tuple[str, ...]
@@ -67,13 +67,13 @@ class Column:
 
 
 def decimal_marks(columns: Mapping[str, Column]) -> dict[str, str]:
-    """Return the decimal mark of each column that the channels need, by its name."""
+    """Return the decimal mark of each column of the channels, by name."""
     return {name: column.decimal for column in columns.values() for name in column.names}
 
 
 @dataclass(frozen=True, eq=False)
 class DataTable:
-    """Samples in memory, checked: iterate over it, as often as needed.
+    """Checked samples in memory; an iterable of `Sample`.
 
     Attributes
     ----------
@@ -82,13 +82,13 @@ class DataTable:
     values
         Channel values, NaN where missing, shape (samples, channels).
     names
-        Channels.
+        Names of the channels.
     origin
-        The first sample's date, if times are dates.
+        Date of the first sample if times are dates, else None.
     remarks
-        (kind, channel) -> how many values were not valid ("invalid"), or without a noise of their
-        own ("missing"), samples left out because a channel is missing that they need ("skipped"),
-        and rows that repeat the one before, of no channel ("repeated").
+        (kind, channel) -> number of invalid values ("invalid"), of readings without their own noise
+        ("missing"), of samples left out since a needed channel is missing ("skipped"), or, with an
+        empty channel, of rows that repeat the row before ("repeated").
     """
 
     t: Array
@@ -114,18 +114,18 @@ def read_json_lines(
     every: int = 1,
     missing: Missing = (),
 ) -> DataTable:
-    """Read channels from a file of JSON lines, one object with column -> value for each moment.
+    """Read channels from a file of JSON lines, one object with column -> value for each time.
 
     Parameters
     ----------
     columns, clock, every, missing
-        As for `read_csv`; a column that a line does not have is missing there.
+        See `read_csv`; a column that is absent in a line has a missing value.
 
     Raises
     ------
     DataError
-        No such file; no such column in any line; a line that is no object or has no time; no
-        number in a channel; times that do not increase. The message names file and line.
+        The file does not exist; no line has a column; a line is not an object or has no time; a
+        channel is not a number; times do not increase. The message names file and line.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8").split("\n")
@@ -171,16 +171,16 @@ def tabulated(
     times
         Numbers, dates, or dates as text.
     values
-        Column -> numbers, as many as there are times; NaN where missing.
+        Column -> numbers, one for each time, NaN where missing.
     columns, clock, every, missing
-        As for `read_csv`.
+        See `read_csv`.
     where
         Name of the data, for messages.
 
     Raises
     ------
     DataError
-        No such column; another length; no finite number; times that do not increase.
+        A column is missing, has a wrong length, text or infinity; times do not increase.
     """
     moments = times.tolist() if hasattr(times, "tolist") else list(times)
     if not moments:
@@ -191,10 +191,10 @@ def tabulated(
     def numbers(name: str, use: Any) -> Array:
         given = values[name]
         try:
-            # NumPy would count a date in nanoseconds, and drop an imaginary part.
+            # NumPy would convert a date to nanoseconds, and drop an imaginary part.
             if getattr(getattr(given, "dtype", None), "kind", "") in ("m", "M", "c"):
                 raise TypeError
-            if hasattr(given, "iloc"):  # of pandas, where a missing value may be no float
+            if hasattr(given, "iloc"):  # in pandas, a missing value need not be a float
                 given = given.to_numpy(dtype=float, na_value=np.nan)
             column: Array = np.asarray(given, dtype=float)
         except (TypeError, ValueError):
@@ -222,7 +222,7 @@ def tabulated(
 
 
 def _first_text(column: Any) -> str:
-    """Return the end of a sentence: the first text in a column that is no number."""
+    """Return the end of the message on the first text in a column that is not a number."""
     cells = column.tolist() if hasattr(column, "tolist") else list(column)
     texts = (cell for cell in cells if isinstance(cell, str) and number_of(cell) is None)
     for text in texts:
@@ -242,10 +242,10 @@ def to_table(
     missing: Missing,
     where: tuple[str, Callable[[int], str]],
 ) -> DataTable:
-    """Return the channels between start and stop.
+    """Return the table of the channels between start and stop.
 
-    `written` are the dates as they are written, None if times are numbers. `numbers` gives the
-    chosen rows of a column, `where` names the data and a row.
+    `written`: the cells of dates, None if times are numbers. `numbers`: function that returns the
+    chosen rows of a column. `where`: name of the data, and function that returns that of a row.
     """
     dates, repeats = written is not None, partial(_repeats, numbers, columns)
     if written is not None:
@@ -253,7 +253,7 @@ def to_table(
             times, written, clock, lambda *pair: bool(repeats(*np.array(pair)[:, None]).all())
         )
     rows = Thinned([column.between for column in columns.values()])
-    # Rows that are left out may hold a switch, or a part of a mean.
+    # Rows that are left out may contain a switch or a part of a mean.
     stride = rows.stride(every)
     inside = _inside(times, dates, clock, where[0])
     use = _once(times, inside, clock if dates else None, repeats)
@@ -267,7 +267,7 @@ def to_table(
         value: Array = column.factor * np.mean(parts, axis=0) + column.offset
         return value
 
-    # A column of the array for each channel, shape (samples, channels); there may be none.
+    # Shape (samples, channels), where the number of channels may be 0.
     values = np.column_stack(
         [scaled(column, use) for column in columns.values()] or [np.zeros((len(use), 0))]
     )
@@ -291,7 +291,7 @@ def to_table(
 def _repeats(
     numbers: Callable[[str, Any], Array], columns: Mapping[str, Column], one: Any, other: Any
 ) -> Mask:
-    """Return which rows have the values of others; both are arrays of row numbers."""
+    """Return which rows `one` have the values of the rows `other`; both are row numbers."""
     rows = np.concatenate([one, other])
     found = np.ones(len(one), dtype=bool)
     for a, b in (np.split(numbers(name, rows), 2) for name in decimal_marks(columns)):
@@ -302,9 +302,9 @@ def _repeats(
 def _complete(
     columns: Mapping[str, Column], values: Array, chosen: Mask, remarks: Counter[tuple[str, str]]
 ) -> Mask:
-    """Return which chosen samples have all channels that they need; values that are not valid go.
+    """Set invalid values to NaN; return which chosen samples have all needed channels.
 
-    A sample is left out for its first missing channel only. `remarks`: of both, counted.
+    `remarks` counts invalid values, and each incomplete sample for its first missing channel.
     """
     kept = chosen.copy()
     for k, (name, channel) in enumerate(columns.items()):
@@ -319,7 +319,7 @@ def _complete(
 
 
 def _inside(times: Array, dates: bool, clock: Clock, source: str) -> IntArray:
-    """Return the rows between start and stop."""
+    """Return the numbers of the rows between start and stop."""
     low, high = clock.bounds(dates, source)
     use = np.flatnonzero((times >= low) & (times <= high))
     if not len(use):
@@ -330,9 +330,9 @@ def _inside(times: Array, dates: bool, clock: Clock, source: str) -> IntArray:
 def _once(
     times: Array, use: IntArray, clock: Clock | None, repeats: Callable[[Any, Any], Mask]
 ) -> IntArray:
-    """Return rows without those that have time and values of the one before; `clock`: of dates.
+    """Return the rows without those that have the time and values of the row before.
 
-    In an hour that clocks show twice, such a row may be another reading.
+    In an hour that clocks repeat, such a row may be a new reading. `clock`: None for numbers.
     """
     again = np.flatnonzero(np.diff(times[use]) == 0.0)
     if clock is not None:
@@ -345,7 +345,7 @@ def _once(
 def _increasing(
     times: Array, use: IntArray, clock: Clock | None, row: Callable[[int], str]
 ) -> IntArray:
-    """Return rows, whose times must increase; `clock`: of dates."""
+    """Return the rows after checking that their times increase; `clock`: None for numbers."""
     late = np.flatnonzero(np.diff(times[use]) <= 0)
     if len(late):
         last, t = times[use[late[0] : late[0] + 2]]
@@ -356,7 +356,7 @@ def _increasing(
 def _known_before(
     first: int, columns: Mapping[str, Column], scaled: Callable[[Column, IntArray], Array]
 ) -> Array:
-    """Return the last value of each "hold" channel before a row, NaN of others, (channels,)."""
+    """Return the last value of each "hold" channel before a row, else NaN, shape (channels,)."""
     found = np.full(len(columns), math.nan)
     for k, column in enumerate(columns.values()):
         if column.between == "hold" and first:
@@ -370,12 +370,12 @@ def _known_before(
 def _with_held(
     t: Array, values: Array, rows: Thinned, chosen: Mask, kept: Mask
 ) -> tuple[Array, Mask]:
-    """Return the rows of a table, and which stay, with the held inputs of all rows.
+    """Return values with held inputs of all rows, and the mask of the rows that are kept.
 
-    `chosen` are the rows that `every` leaves, `kept` those of them that lack no needed channel.
+    `chosen`: rows selected by `every`. `kept`: chosen rows that have all needed channels.
     """
     found, stays = values.copy(), kept.copy()
-    # Where no row is left out, only the first one may get values: those from before it.
+    # If no row is left out, only the first row may get values, from rows before it.
     count = 1 if kept.all() else len(t)
     for k, time in enumerate(t[:count].tolist()):
         row = rows.take(time, values[k], chosen=bool(chosen[k]), whole=bool(kept[k]))
@@ -386,12 +386,12 @@ def _with_held(
 
 
 def _noise_remarks(columns: Mapping[str, Column], values: Array) -> dict[tuple[str, str], int]:
-    """Take readings away whose noise is not positive; return how many, and how many have none."""
+    """Remove readings whose noise is not positive; count these, and readings without noise."""
     remarks, places = {}, {name: k for k, name in enumerate(columns)}
     for name, column in columns.items():
         if not column.noise_of:
             continue
-        # Views: what is set to NaN here is missing in `values`.
+        # These are views, so that NaN is set in `values`.
         noise, reading = values[:, places[name]], values[:, places[column.noise_of]]
         wrong = noise <= 0.0
         remarks["invalid", column.noise_of] = int((wrong & np.isfinite(reading)).sum())
@@ -401,7 +401,7 @@ def _noise_remarks(columns: Mapping[str, Column], values: Array) -> dict[tuple[s
 
 
 def without_noise(columns: Mapping[str, Column], values: dict[str, float]) -> list[str]:
-    """Take the readings of a sample away whose noise is not positive; return their channels."""
+    """Remove readings of a sample whose noise is not positive; return their channels."""
     refused = []
     for name, column in columns.items():
         if column.noise_of and values.get(name, math.nan) <= 0.0:
@@ -412,9 +412,9 @@ def without_noise(columns: Mapping[str, Column], values: dict[str, float]) -> li
 
 @dataclass(eq=False, repr=False)
 class JsonLines:
-    """Samples from JSON lines, one object with column -> value for each moment, as they come.
+    """Stream of samples from JSON lines, one object with column -> value for each time.
 
-    `origin`: the first sample's date, if times are dates.
+    `origin`: date of the first sample if times are dates, else None.
     """
 
     lines: Iterable[str]
@@ -447,7 +447,7 @@ class JsonLines:
                 yield Sample(t=t - zero, z=dict(zip(self.columns, left.tolist(), strict=True)))
 
     def _values(self, row: Mapping[str, Any], where: str) -> Array:
-        """Return the values of the channels in a row, NaN where they are missing or not valid."""
+        """Return the values of the channels in a row, NaN where they are missing or invalid."""
         values = {}
         for channel, column in self.columns.items():
             value = channel_value(column, row, self.missing, where)
@@ -457,10 +457,10 @@ class JsonLines:
         return np.array(list(values.values()))
 
     def _timed_rows(self, thinned: Thinned) -> Iterator[tuple[str, dict[str, Any], float, bool]]:
-        """Iterate over the rows between start and stop: name, row, time, and whether it is a date.
+        """Yield the rows between start and stop: name, row, time, and whether it is a date.
 
-        `thinned` remembers what rows before start state. The first row after stop ends the stream,
-        which may have no end of its own.
+        `thinned` stores held values of rows before start. The first row after stop ends the
+        iteration, since the stream may be endless.
         """
         dates = None
         for number, line in enumerate(self.lines, start=1):
@@ -481,9 +481,9 @@ class JsonLines:
 def _second_pass(
     t: float, last: float, cell: Any, values: Array, first: dict[float, Array], clock: Clock | None
 ) -> float:
-    """Return how much later a row is than its date shows, in an hour that clocks show twice.
+    """Return the correction of a row's time in the second pass of an hour that clocks repeat.
 
-    `first`: time -> values in the first pass of such an hour. `clock`: of times that are dates.
+    `first`: time -> values in the first pass of such an hour. `clock`: None for numbers.
     """
     again = clock.repeated_hour(t) if clock is not None and is_naive(cell, clock) else 0.0
     if not again:
@@ -498,7 +498,7 @@ def _second_pass(
 def row_time(
     row: Mapping[str, Any], clock: Clock, where: str = "row", before: bool | None = None
 ) -> tuple[float, bool]:
-    """Return the time of a row in the model's unit, and whether it is a date (then since 1970).
+    """Return the time of a row in the model's unit, since 1970 for dates, and whether it is one.
 
     `before`: whether the times of earlier rows were dates.
     """
@@ -511,7 +511,7 @@ def row_time(
 def channel_value(
     column: Column, row: Mapping[str, Any], missing: Missing, where: str = "row"
 ) -> float:
-    """Return the value of a channel in a row, NaN if it is missing."""
+    """Return the value of a channel in a row, or NaN."""
     places = ((name, f"{where}, '{name}'") for name in column.names)
     numbers = [cell_number(row.get(n), place, column.decimal, missing) for n, place in places]
     # NaN if one of the columns is missing.
@@ -530,7 +530,7 @@ def _object(line: str, where: str) -> dict[str, Any]:
 
 
 def _disorder(where: str, t: float, last: float, clock: Clock | None) -> TimeOrderError:
-    """Return an error about a time that is not later than the last; `clock`: of dates."""
+    """Return the error for a time that is not later than the last; `clock`: None for numbers."""
     how, remedy = "earlier than the one before", "sort the rows."
     if t == last:
         how, remedy = "that of the one before", "drop repeated rows."
@@ -549,7 +549,7 @@ def _disorder(where: str, t: float, last: float, clock: Clock | None) -> TimeOrd
 def check_columns(
     where: str, needed: Iterable[str], known: list[str], *, told: bool = True
 ) -> None:
-    """Raise `SampleError` if a column is missing; with `told` the error names the existing ones."""
+    """Raise `SampleError` if a column is missing; `told`: whether it lists existing columns."""
     for name in needed:
         if name not in known:
             ending = hint(name, known) if told else "."
@@ -557,7 +557,7 @@ def check_columns(
 
 
 def hint(name: str, known: list[str]) -> str:
-    """Return the end of a sentence: the closest name, or all known names."""
+    """Return the end of a message: the closest name, or the known names."""
     close = difflib.get_close_matches(name, known, n=1)
     if close:
         return f"; did you mean '{close[0]}'?"
@@ -567,7 +567,7 @@ def hint(name: str, known: list[str]) -> str:
 
 
 def no_file(path: Path) -> DataError:
-    """Return an error about a file that is not there, with those of its kind that are."""
+    """Return the error for a missing file, with a hint at similar files."""
     if not path.parent.is_dir():
         return DataError(f"there is no file '{path}': there is no folder '{path.parent}'.")
     below = sorted(path.parent.glob(f"*/{path.name}"))
@@ -579,7 +579,7 @@ def no_file(path: Path) -> DataError:
 
 @contextmanager
 def parquet_file(path: str | Path) -> Iterator[Any]:
-    """Open a Parquet file; raises `DataError` if there is none, or if it cannot be read."""
+    """Open a Parquet file; raises `DataError` if it does not exist or cannot be read."""
     with optional("parquet", "Parquet files need pyarrow", DataError):
         import pyarrow as pa
         from pyarrow.parquet import ParquetFile
@@ -601,12 +601,12 @@ def read_parquet(
     every: int = 1,
     missing: Missing = (),
 ) -> DataTable:
-    """Read channels from a Parquet file; only the columns that are needed.
+    """Read channels from a Parquet file, of which only the needed columns are loaded.
 
-    `columns`, `clock`, `every`, `missing`: as for `read_csv`; the time column may also hold dates
+    `columns`, `clock`, `every`, `missing`: see `read_csv`; the time column may also contain dates
     with or without a time zone.
-    Raises `DataError`: no such file or column, or it is not Parquet; text in a channel; times that
-    do not increase. The message names file, sample and column.
+    Raises `DataError`: the file or a column does not exist; the file is not Parquet; a channel
+    contains text; times do not increase. The message names file, sample and column.
     """
     where = str(path)
     names = decimal_marks(columns)
@@ -620,7 +620,7 @@ def read_parquet(
 
 
 def _numbers(column: Any, where: str, name: str) -> Array:
-    """Return a column as numbers, NaN where there is none."""
+    """Convert a column to numbers, NaN where missing."""
     from pyarrow import float64, types
 
     kind = column.type

@@ -1,6 +1,6 @@
-"""Twin experiments: samples of a process whose truth is known, and errors against it.
+"""Twin experiments: samples of a simulated process with known truth, and errors of estimates.
 
-The only place with `q_true` and `u_true`. An identifier is given the samples, never the twin.
+Only this module uses `q_true` and `u_true`. An identifier receives the samples, never the twin.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ class Noise(ABC):
 class RelativeNoise(Noise):
     """Noise of a given size relative to each sample: E ||noise||_Z^2 = level^2 ||z||_Z^2.
 
-    Every channel takes the same share of the mean square, whatever its unit:
-    std_k = level ||z||_Z / sqrt(sensors · weights_kk). In R^k with the Euclidean norm that is
-    level times the root mean square of z; for the slopes of Hermite elements it is about 1/h times
+    Every channel has the same share of the mean square, independent of its unit:
+    std_k = level ||z||_Z / sqrt(sensors · weights_kk). In R^k with the Euclidean norm, this is
+    level times the root mean square of z. For the slopes of Hermite elements, it is about 1/h times
     the standard deviation of the values, as if slopes were differences of values.
     """
 
@@ -70,7 +70,7 @@ class RelativeNoise(Noise):
 
 @dataclass(frozen=True)
 class AbsoluteNoise(Noise):
-    """Noise with a given standard deviation: one number, or one for each channel."""
+    """Noise with a given standard deviation: a number, or a number for each channel."""
 
     deviation: float | Sequence[float]
 
@@ -94,7 +94,7 @@ class AbsoluteNoise(Noise):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Twin:
-    """A simulated process with known truth that yields `Sample`s, independent of the estimator.
+    """A simulated process with known truth; an iterable of `Sample`, independent of the estimator.
 
     Parameters
     ----------
@@ -103,31 +103,31 @@ class Twin:
     q_true
         The exact parameter: a number, a function of x, coefficients, or a mapping by name.
     times
-        Sample times, increasing; the first is the initial time, with the sample of the initial
-        state.
+        Increasing sample times. The first is the initial time, with a sample of the initial state.
     u_true
-        Formula of the exact state, u(x, t); for several components a mapping of names to those.
+        Formula of the exact state, u(x, t); for several components, a mapping from names to
+        formulas.
     u0
-        Initial state, if there is no formula: a number, a function of x, or coefficients. Without
-        both that of q_true, where the model says one (`initial`).
+        Initial state if there is no formula: a number, a function of x, or coefficients. Without
+        both, the model must define an initial state (`initial`), which is evaluated for q_true.
     truth
         Origin of the exact data.
 
         "discrete"
-            The model itself, with q_true, by `scheme` and `dt_max`: the same discrete solution as
-            that of the estimator, without truncation error (the "inverse crime", which isolates the
-            performance of the law).
+            Solution of `model` with q_true, `scheme` and `dt_max`. It has the discretisation of the
+            estimator, thus no truncation error (the "inverse crime", which isolates the performance
+            of the law).
         "analytic"
             The formula u_true, projected onto the state space. The data then deviate from the
             estimator's scheme by its discretisation error.
         "fine"
-            The model `fine` (a finer mesh, other elements) with steps of at most `fine_dt`.
-            Sensors that are `portable` (`Points`, `Averages`, ...) see the fine state itself; for a
-            `Subdomain`, `Full` or `Matrix`, whose channels belong to the coefficients of the
-            estimator, it is projected onto them.
+            Solution of the model `fine` (a finer mesh, other elements), with steps up to `fine_dt`.
+            `portable` sensors (`Points`, `Averages`, ...) observe the fine state itself. For a
+            `Subdomain`, `Full` or `Matrix`, whose channels are coefficients of the estimator, the
+            fine state is projected onto the estimator's state space.
     scheme, dt_max
-        Time scheme of the truth, second order by default (for `GradientLaw`, whose scheme is
-        implicit Euler, state that one to have exact data), and for "discrete" its longest substep.
+        Time scheme of the truth and its longest substep. The default is of second order. For exact
+        data of a `GradientLaw`, specify its scheme, implicit Euler.
     fine, fine_dt
         Model (default: `model`) and longest substep of "fine".
     noise
@@ -135,12 +135,12 @@ class Twin:
     seed
         Seed of the noise.
     inputs
-        t -> values of the model's input channels; they are sent with the samples.
+        Function of t that returns the values of the model's inputs, which samples contain.
 
     Raises
     ------
     ConfigurationError
-        A truth that needs other arguments than those given.
+        The arguments that `truth` requires are missing or inconsistent.
 
     Examples
     --------
@@ -189,7 +189,7 @@ class Twin:
             raise ConfigurationError("truth='fine' needs a model `fine`, a `fine_dt`, or both.")
 
     def _check_start(self) -> None:
-        """Refuse a twin whose initial state is missing, or stated twice."""
+        """Refuse a twin whose initial state is missing or specified twice."""
         begun = self.model.form_initial is not None
         if begun and self.u0 is not None:
             raise ConfigurationError("the model has its own initial state: leave out u0.")
@@ -221,7 +221,7 @@ class Twin:
     def weights(self) -> Array:
         """Gram matrix of Z, shape (sensors, sensors).
 
-        ||z||_Z = ||G^+ z||_X where z are coefficients of the state on omega, else Euclidean.
+        If z are coefficients of the state on omega, ||z||_Z = ||G^+ z||_X; else it is Euclidean.
         """
         weights: Array = self._gram.toarray()
         return weights
@@ -246,7 +246,7 @@ class Twin:
         return model.initial_state(q, self._moment(t)) if self.u0 is None else self.u0
 
     def _exact(self, t: float) -> Any:
-        """Return u_true at a time, a function of x or a mapping of those."""
+        """Return u_true at a time: a function of x, or a mapping from names to functions."""
         if isinstance(self.u_true, Mapping):
             return {name: partial(_at, formula, t) for name, formula in self.u_true.items()}
         return partial(_at, self.u_true, t)
@@ -279,7 +279,7 @@ class Twin:
         elif self.fine is None:
             return tuple(self._fine_states)
         else:
-            # Values of the fine state at the quadrature points of the estimator, then projected.
+            # The fine state is evaluated at the estimator's quadrature points and projected.
             parts = []
             for name, block in space.fields.items():
                 points, of = block.measure.points, "" if space.single else name
@@ -293,7 +293,7 @@ class Twin:
     def exact_data(self) -> Array:
         """Data without noise, shape (times, sensors)."""
         model, observed, states = self.model, self.observed, self.states
-        # Sensors at places see the fine state itself, without the error of its projection.
+        # Portable sensors observe the fine state itself, without the error of its projection.
         if self.truth == "fine" and self.fine is not None and self.observation.portable:
             model, states = self.fine, tuple(self._fine_states)
             observed = _bound(self.observation, model)
@@ -317,7 +317,7 @@ class Twin:
         q
             Coefficients in Q, shape (m,).
         unknown
-            One of several unknowns; default all of them (numbers count with their square).
+            Name of an unknown; default: all unknowns (numbers contribute their square).
         """
         space = self.model.parameter_space
         part = slice(None) if unknown is None else space.part(unknown)
@@ -329,7 +329,7 @@ class Twin:
         return float(np.sqrt(e @ (mass @ e) / size))
 
     def baseline(self, q0: Any = None, unknown: str | None = None) -> float:
-        """Return the error of knowing nothing: of q0, by default the prior mean."""
+        """Return the relative L2 error of q0, by default of the prior mean: without any data."""
         return self.error(self.model.latent.value(self.model.initial_parameter(q0)), unknown)
 
     def u_error(self, estimate: Estimate) -> float:
@@ -340,13 +340,13 @@ class Twin:
     def energy(self, estimate: Estimate, gain: float = 1.0) -> float:
         """Return ||e||_Q^2 + ||r||_X^2 with e = q - q_true and r = R (u - u_true).
 
-        The quantity that never grows along the exact-data method (align:neplusnr), for a constant
-        parameter in which the model is linear. e is the difference of latent coefficients.
+        This energy does not increase in the exact-data method (align:neplusnr) if the parameter is
+        constant and the model is linear in it. e is the difference of latent coefficients.
 
         Parameters
         ----------
         gain
-            That of the law: it divides the inner product of Q.
+            Gain of the law, by which the inner product of Q is divided.
         """
         latent = self.model.latent
         e = latent.inverse(estimate.q) - latent.inverse(self.q)
