@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MARKERS = "osD^vP*X"
-# End of a name -> meaning, style and colour of its line in a panel of `loops`.
+# Suffix of a name -> meaning, style and colour of its line in a panel of `loops`.
 LOOP_LINES = {
     "reference": ("reference", "--", PALETTE[-1]),
     "truth": ("truth", "-", PALETTE[-1]),
@@ -40,9 +40,9 @@ LOOP_LINES = {
 
 
 def _snapshots(data: xr.Dataset, name: str, times: Sequence[float] | int) -> list[int]:
-    """Return indices of a field's snapshots nearest to given times, or of a number of them.
+    """Return the indices of a field's snapshots nearest to `times`, or of a number of snapshots.
 
-    Their spacing is quadratic, because an estimate changes most at the start.
+    In the latter case their spacing is quadratic, since an estimate changes most at the start.
     """
     fields = [str(key) for key in data if data[key].dims == ("snapshot", "vertex")]
     if name not in fields:
@@ -69,7 +69,7 @@ def profiles(
     legend: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw profiles of a field on an interval at several times; the last with its 95 % band.
+    """Draw profiles of a field on an interval at several times, the last with its 95 % band.
 
     Parameters
     ----------
@@ -85,9 +85,9 @@ def profiles(
     observed
         Observed interval omega, shaded.
     markers
-        True: mark the vertices, as in the paper.
+        Whether to mark the vertices, as in the paper.
     legend
-        Put a legend beside the panel.
+        Whether to add a legend next to the panel.
 
     Raises
     ------
@@ -141,7 +141,7 @@ def history(
     levels
         Label -> constant to compare with, drawn dashed.
     log
-        True: logarithmic scale of the values.
+        Whether the scale of the values is logarithmic.
     """
     ax = panel(ax)
     for k, (label, (t, values)) in enumerate(series.items()):
@@ -163,7 +163,7 @@ def loops(runs: Mapping[str, xr.Dataset], rows: Sequence[str], *, title: str = "
     runs
         Mapping from name to a dataset with the quantities over `time` and, if available, their
         references (`_reference`), limits (`_low`, `_high`), true values (`_truth`) and standard
-        deviations (`_std`). With the attribute `held`, values are held between samples.
+        deviations (`_std`). Quantities with the attribute `held` are constant between samples.
     rows
         Names of the quantities.
 
@@ -196,7 +196,7 @@ def _loop_panel(ax: Axes, data: xr.Dataset, name: str, t: Array) -> None:
     for end, (meaning, style, colour) in LOOP_LINES.items():
         if f"{name}_{end}" in data:
             said = ax.get_legend_handles_labels()[1]
-            label = "" if meaning in said else meaning  # both limits are one entry of the legend
+            label = "" if meaning in said else meaning  # both limits have one legend entry
             line = data[f"{name}_{end}"].values
             ax.plot(t, line, style, color=colour, linewidth=1.0, label=label)
     values = data[name].values
@@ -210,17 +210,17 @@ def _loop_panel(ax: Axes, data: xr.Dataset, name: str, t: Array) -> None:
 def intervals(
     estimates: Mapping[str, tuple[float, float, float]], unit: str = "", *, ax: Axes | None = None
 ) -> Axes:
-    """Draw intervals of one number below each other, the first with a line through its value.
+    """Draw several intervals of a number below each other, with a line through the first value.
 
     Parameters
     ----------
     estimates
-        Label -> value, lower and upper end, as of the variants of `livepde compare`. Ends that are
-        not finite are left out.
+        Label -> value, lower and upper end, for example of the variants of `livepde compare`.
+        Intervals with infinite or unknown ends are omitted.
     unit
         Unit of the number.
     ax
-        Axes to draw on; default those of a new figure.
+        Axes to draw on; default: the axes of a new figure.
     """
     ax = panel(ax)
     for row, (value, low, high) in enumerate(estimates.values()):
@@ -246,7 +246,7 @@ def ensemble(
     legend: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw an ensemble over time: thin lines for runs, a thick mean with its minimum marked.
+    """Draw an ensemble over time: thin lines for runs, and a thick mean with its minimum.
 
     Parameters
     ----------
@@ -257,7 +257,7 @@ def ensemble(
     levels
         Label -> constant to compare with, drawn dashed.
     legend
-        Put a legend beside the panel.
+        Whether to add a legend next to the panel.
     """
     ax = panel(ax)
     t, rows = np.asarray(times, dtype=float), np.asarray(values, dtype=float)

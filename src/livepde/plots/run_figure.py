@@ -46,7 +46,7 @@ RESIDUALS = (  # variable, its dimension, title of its panel
     ("innovation", "sensor", "innovation"),
     ("validation_error", "validation", "error of validation channels"),
 )
-SLENDER = 6.0  # length over width from which a map has an axis of its own for each
+SLENDER = 6.0  # length over width from which the axes of a map have different scales
 
 
 def overview(
@@ -56,7 +56,7 @@ def overview(
     times: Sequence[float] | int = 5,
     measured: tuple[Array, Array] | None = None,
 ) -> Figure:
-    """Draw a run: readings, unknowns, fields, innovations and validation channels, one panel each.
+    """Draw a run: panels for readings, unknowns, fields, innovations and validation channels.
 
     Parameters
     ----------
@@ -65,10 +65,10 @@ def overview(
     title
         Title above all panels.
     times
-        Times at which fields are drawn, or their number (one space dimension; maps show the last).
+        Times of field profiles in one space dimension, or their number; maps show the last time.
     measured
-        Times and readings as for `curves`: the first panels, of the whole width, draw them and what
-        the model expected of them.
+        Times and readings, see `curves`. The first panels, of the whole width, then show readings
+        and predictions.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def overview(
     panels = _panels(data, times)
     each, columns = [*wide, *panels], 1 if len(panels) == 1 else 2
     rows: list[Any] = [[k] * columns for k in range(len(wide))]
-    # The last panel may take the whole row.
+    # A last single panel has the whole row.
     pairs = range(len(wide), len(each), columns)
     rows += [[k, min(k + 1, len(each) - 1)][:columns] for k in pairs]
     drawn = empty(len(rows), columns, title)
@@ -100,8 +100,8 @@ def curves(data: xr.Dataset, t: Array, measured: Array, *, title: str = "") -> F
     data
         Dataset as returned by `Result.to_xarray()`.
     t, measured
-        Times, and readings of the assimilated and then of the validation sensors, NaN where
-        missing, shapes (samples,) and (samples, sensors).
+        Times, shape (samples,), and readings of the assimilated sensors followed by the validation
+        sensors, NaN where missing, shape (samples, sensors).
     title
         Title above all panels.
     """
@@ -113,7 +113,7 @@ def curves(data: xr.Dataset, t: Array, measured: Array, *, title: str = "") -> F
 
 
 def _measured_panels(data: xr.Dataset, t: Array, measured: Array) -> list[Callable[[Axes], Axes]]:
-    """Return a function for each unit that draws the readings of its sensors on given axes."""
+    """Return a function for each unit that draws the readings of its sensors on axes."""
 
     def of(sensors: list[str]) -> Callable[[Axes], Axes]:
         return lambda ax: measured_and_predicted(data, t, measured, sensors=sensors, ax=ax)
@@ -131,16 +131,16 @@ def measured_and_predicted(
 ) -> Axes:
     """Draw readings and predictions of sensors with one unit.
 
-    Lines of validation sensors are dashed: they are predicted after the sample, and never used.
+    Lines of validation sensors are dashed. Their readings are not used in the estimate.
 
     Parameters
     ----------
     data, t, measured
-        As for `curves`.
+        See `curves`.
     sensors
-        Names of the sensors, of which the first seven are drawn; default all.
+        Names of the sensors, of which the first seven are drawn; default: all.
     ax
-        Where to draw; default a new figure.
+        Axes to draw on; default: the axes of a new figure.
 
     Raises
     ------
@@ -176,21 +176,21 @@ def measured_and_predicted(
 
 
 def estimates(data: xr.Dataset, name: str | None = None, *, ax: Axes | None = None) -> Axes:
-    """Draw an unknown number over time with its 95 % band, and all its regions.
+    """Draw an unknown number, in all its regions, over time with its 95 % band.
 
     Parameters
     ----------
     data
         Dataset as returned by `Result.to_xarray()`.
     name
-        The unknown; it may be left out if there is only one.
+        Name of the unknown; optional if there is only one.
     ax
-        Where to draw; default a new figure.
+        Axes to draw on; default: the axes of a new figure.
 
     Raises
     ------
     ConfigurationError
-        There is no such unknown number, or several and no name is given.
+        The unknown number does not exist, or there are several and `name` is missing.
     """
     known = groups(data)
     if name is None and len(known) == 1:
@@ -207,9 +207,9 @@ def residuals(data: xr.Dataset, *, validation: bool = False, ax: Axes | None = N
     Parameters
     ----------
     data, ax
-        As for `estimates`.
+        See `estimates`.
     validation
-        Draw those of the validation sensors instead.
+        Whether to draw the validation sensors instead.
 
     Raises
     ------
@@ -223,21 +223,21 @@ def residuals(data: xr.Dataset, *, validation: bool = False, ax: Axes | None = N
 
 
 def field(data: xr.Dataset, name: str, *, std: bool = False, ax: Axes | None = None) -> Axes:
-    """Draw an unknown field or the state: its last values on a plane, else over time.
+    """Draw an unknown field or the state: on a plane its last values, else its values over time.
 
     Parameters
     ----------
     data, ax
-        As for `estimates`.
+        See `estimates`.
     name
-        The field.
+        Name of the field.
     std
-        Draw its standard deviation, on a plane, with the places of the sensors.
+        Whether to draw its standard deviation, which requires a plane domain.
 
     Raises
     ------
     ConfigurationError
-        There is no such field, or no map of a standard deviation.
+        The field does not exist, or has no map of its standard deviation.
     """
     known = [*field_names(data), *str(data.attrs.get("state", "")).split()]
     _chosen([name], known, "plots: there is no field")
@@ -250,21 +250,21 @@ def field(data: xr.Dataset, name: str, *, std: bool = False, ax: Axes | None = N
 
 
 def corner(draws: xr.Dataset, names: Sequence[str] | None = None, *, axes: Any = None) -> Any:
-    """Draw the numbers among draws against each other, with their histograms on the diagonal.
+    """Draw pairwise scatter plots of unknown numbers, with histograms on the diagonal.
 
     Parameters
     ----------
     draws
         Dataset as returned by `Result.sample()`.
     names
-        Numbers to draw; default all.
+        Names of the numbers; default: all.
     axes
-        Matrix of axes to draw on, shape (numbers, numbers); default those of a new figure.
+        Matrix of axes to draw on, shape (numbers, numbers); default: the axes of a new figure.
 
     Returns
     -------
     axes
-        The matrix of axes; those above the diagonal are hidden.
+        The matrix of axes; axes above the diagonal are hidden.
     """
     numbers = [str(name) for name in draws.data_vars if draws[name].dims == ("draw",)]
     shown = _chosen(names, numbers, "plots: there is no number")
@@ -287,7 +287,7 @@ def corner(draws: xr.Dataset, names: Sequence[str] | None = None, *, axes: Any =
 
 
 def _chosen(names: Sequence[str] | None, known: list[str], what: str) -> list[str]:
-    """Return the names to draw, default all; `what` begins the message for unknown ones."""
+    """Return the names to draw, by default all; `what` begins the message for unknown names."""
     shown = known if names is None else list(names)
     for name in shown:
         if name not in known:
@@ -296,10 +296,10 @@ def _chosen(names: Sequence[str] | None, known: list[str], what: str) -> list[st
 
 
 class RunPlots:
-    """Figures of a result by name: `result.plot.estimates("alpha")`.
+    """Figures of a result, such as `result.plot.estimates("alpha")`.
 
-    Each draws on `ax`, or on a new figure, and returns the axes. A call, `result.plot()`, draws
-    all of a run and returns the figure.
+    Each method draws on `ax`, or on a new figure, and returns the axes. A call, `result.plot()`,
+    draws an overview of the run and returns the figure.
     """
 
     def __init__(self, result: Any) -> None:
@@ -312,7 +312,7 @@ class RunPlots:
         return data
 
     def __call__(self, **options: Any) -> Figure:
-        """Draw all of the run: see `livepde.plots.overview`."""
+        """Draw an overview of the run, see `livepde.plots.overview`."""
         data = self._data()
         if self._result.readings is not None:
             readings = data["time"].values, self._result.readings()
@@ -342,12 +342,12 @@ class RunPlots:
     def corner(
         self, names: Sequence[str] | None = None, *, n: int = 2000, seed: int = 0, axes: Any = None
     ) -> Any:
-        """Draw `n` draws of the numbers against each other; returns the matrix of axes."""
+        """Draw scatter plots of `n` draws of the unknown numbers; return the matrix of axes."""
         return corner(self._result.sample(n, seed), names, axes=axes)
 
 
 def _panels(data: xr.Dataset, times: Sequence[float] | int) -> list[Callable[[Axes], Axes]]:
-    """Return a function for each panel that draws it on given axes."""
+    """Return a function for each panel that draws it on axes."""
     panels: list[Callable[[Axes], Axes]] = [
         partial(_scalar_panel, data, name, labels) for name, labels in groups(data).items()
     ]
@@ -361,9 +361,9 @@ def _panels(data: xr.Dataset, times: Sequence[float] | int) -> list[Callable[[Ax
 
 
 def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) -> Axes:
-    """Draw one unknown over time with its 95 % band; all its regions in one panel."""
+    """Draw an unknown in all its regions over time, with 95 % bands."""
     t = time_values(data, data["time"].values)
-    # The wide band of the prior would determine the scale and hide all later values.
+    # Early values of the band are wide and would hide later values, so they do not set the scale.
     late = slice(max(len(t) // 10, scored_from(data) + len(t) // 20), None)
     reach: list[Array] = []
     for k, label in enumerate(labels):
@@ -390,7 +390,7 @@ def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) 
 
 
 def _limit_values(values: Array, ax: Axes) -> None:
-    """Fit the value axis to values with a margin of 6 %; a wide range has a logarithmic axis."""
+    """Fit the value axis to values with a margin of 6 %; for a wide range it is logarithmic."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return
@@ -451,7 +451,7 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
     from matplotlib.tri import Triangulation
 
     x, y = data["x"].values, data["y"].values
-    # Vertices of each cell, (cell, 3): a domain may have holes or corners.
+    # The cells, shape (cells, 3), are needed since a domain may have holes or corners.
     triangles = Triangulation(x, y, data["triangle"].values if "triangle" in data else None)
     spread = name.endswith("_std")
     drawn = ax.tripcolor(
@@ -485,7 +485,7 @@ def _range_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
 
 
 def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, ax: Axes) -> Axes:
-    """Draw measured minus predicted values of each channel, with the root mean square error."""
+    """Draw measured minus predicted values of each channel, with root mean square errors."""
     t = time_values(data, data["time"].values)
     errors = used_errors(data, variable, dimension)
     names = [str(name) for name in data[dimension].values]
@@ -518,7 +518,7 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, 
 
 
 def _mark_refused(data: xr.Dataset, ax: Axes) -> None:
-    """Mark the times of readings that were refused, for each sensor in its colour."""
+    """Mark the times of refused readings, in the colour of each sensor."""
     t, names = time_values(data, data["time"].values), list(map(str, data["sensor"].values))
     for name, which in refused_readings(data).items():
         colour = PALETTE[names.index(name) % len(PALETTE)]

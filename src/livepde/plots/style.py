@@ -1,4 +1,4 @@
-"""Parts of the dataset of a run for figures, and their common style: colours, axes, legends."""
+"""Common style of figures (colours, axes, legends), and quantities from the dataset of a run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Largest number of lines in a panel; more sensors are drawn as one line with their range.
+# Largest number of lines in a panel. More sensors are drawn as one line with their range.
 MOST_LINES = 7
 # Time span from which a unit of the time axis is used, its length in seconds, its name.
 CLOCKS = ((2 * 86400.0, 86400.0, "d"), (2 * 3600.0, 3600.0, "h"))
@@ -27,7 +27,7 @@ CLOCKS = ((2 * 86400.0, 86400.0, "d"), (2 * 3600.0, 3600.0, "h"))
 # is omitted, because it is invisible on white.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 GREY = "#7f7f7f"
-# Number of points up to which Matplotlib searches a free place for the legend.
+# Largest number of points for which Matplotlib searches a free place for the legend.
 MOST_POINTS = 20_000
 # Width and height of a panel in inches.
 PANEL = (5.4, 3.4)
@@ -35,18 +35,18 @@ DPI = 120
 
 
 def prior_left(data: xr.Dataset, label: str, k: int = -1) -> float:
-    """Return the share of its prior standard deviation that a number has left at sample k, or NaN.
+    """Return the posterior over prior standard deviation of a number at sample k.
 
-    Laws without a covariance do not know it.
+    It is NaN if it is unknown, such as for laws without a covariance.
     """
     return float(data[f"{label}_left"].values[k]) if f"{label}_left" in data else math.nan
 
 
 def modes_told(data: xr.Dataset, name: str, k: int = -1) -> tuple[float, int, float]:
-    """Return how many modes of a field the data determine at snapshot k, their number, and `left`.
+    """Return the number of a field's modes that data determine at snapshot k, of all, and `left`.
 
-    `left` is the root mean square over all modes of the remaining share of the prior standard
-    deviation: a mode with the share s counts 1 - s^2 among those that were told.
+    `left` is the root mean square over all modes of the ratio s of posterior to prior standard
+    deviation. Each mode contributes 1 - s^2 to the number of determined modes.
     """
     modes = data[f"{name}_modes"]
     count, told = int(modes.attrs["of"]), float(modes.values[k])
@@ -54,10 +54,9 @@ def modes_told(data: xr.Dataset, name: str, k: int = -1) -> tuple[float, int, fl
 
 
 def note(data: xr.Dataset, name: str) -> Array | None:
-    """Return a note of the law over time, shape (samples,); None if the run has none.
+    """Return a note of the law over time, shape (samples,), or None if the run does not have it.
 
-    A note whose name clashes with that of a variable is stored under another one: see
-    `Layout.dataset`.
+    A note with the name of another variable is stored under a different name, see `Layout.dataset`.
     """
     key = f"{NOTE}{name}" if f"{NOTE}{name}" in data else name
     about = (str(data.attrs.get(kind, "")) for kind in ("fields", "state"))
@@ -69,7 +68,7 @@ def note(data: xr.Dataset, name: str) -> Array | None:
 
 
 def groups(data: xr.Dataset) -> dict[str, list[str]]:
-    """Return a mapping from unknown to the labels of its numbers: one, or one per region."""
+    """Return a mapping from each unknown to the labels of its numbers: one, or one per region."""
     found: dict[str, list[str]] = {}
     for label in scalars(data):
         found.setdefault(label.partition("[")[0], []).append(label)
@@ -77,25 +76,25 @@ def groups(data: xr.Dataset) -> dict[str, list[str]]:
 
 
 def unit_of(data: xr.Dataset, name: str) -> str:
-    """Return the unit of a variable as the dataset states it."""
+    """Return the unit of a variable in the dataset."""
     return str(data[name].attrs.get("units", ""))
 
 
 def shown_unit(unit: str) -> str:
-    """Return a unit as figures show it; empty for 1."""
+    """Return a unit in the notation of figures; empty for 1."""
     for plain, pretty in (("degC", "°C"), ("**", "^"), ("^2", "²"), ("^3", "³")):
         unit = unit.replace(plain, pretty)
     return "" if unit == "1" else unit
 
 
 def labelled(name: str, unit: str) -> str:
-    """Return the label of an axis."""
+    """Return the label of an axis: a name with its unit."""
     shown = shown_unit(unit)
     return f"{name} [{shown}]" if shown else name
 
 
 def axis_label(data: xr.Dataset, name: str, text: str = "") -> str:
-    """Return the label of an axis for a variable: its name, or a text, and its unit."""
+    """Return the label of an axis for a variable: `text`, by default its name, with its unit."""
     return labelled(text or name, unit_of(data, name))
 
 
@@ -111,7 +110,7 @@ def time_scale(data: xr.Dataset) -> tuple[float, str]:
 
 
 def time_values(data: xr.Dataset, times: ArrayLike) -> Array:
-    """Return coordinates on a time axis: dates if the run has them, else as `time_scale`."""
+    """Return coordinates on a time axis: dates if the run has them, else scaled by `time_scale`."""
     dates = instants(data, times)
     if dates is None:
         scaled: Array = np.asarray(times, dtype=float) / time_scale(data)[0]
@@ -121,7 +120,7 @@ def time_values(data: xr.Dataset, times: ArrayLike) -> Array:
 
 
 def time_text(data: xr.Dataset, t: float) -> str:
-    """Return one time as text: a date, or a number with its unit."""
+    """Return a time as text: a date, or a number with its unit."""
     if instants(data, []) is not None:
         return when(data, t)
     factor, unit = time_scale(data)
@@ -138,7 +137,7 @@ def scored_from(data: xr.Dataset) -> int:
 
 
 def sensor_names(data: xr.Dataset) -> list[str]:
-    """Return the names of the assimilated and then of the validation sensors."""
+    """Return the names of the assimilated sensors, followed by the validation sensors."""
     return [str(name) for of in ("sensor", "validation") if of in data for name in data[of].values]
 
 
@@ -153,7 +152,7 @@ def sensor_units(data: xr.Dataset) -> dict[str, str]:
 
 
 def sensors_by_unit(data: xr.Dataset) -> dict[str, list[str]]:
-    """Return a mapping from unit to the names of its sensors."""
+    """Return a mapping from each unit to the names of its sensors."""
     found: dict[str, list[str]] = {}
     for name, unit in sensor_units(data).items():
         found.setdefault(unit, []).append(name)
@@ -198,7 +197,7 @@ def figure(rows: int = 1, columns: int = 1, title: str = "") -> tuple[Figure, li
 
 
 def empty(rows: int, columns: int, title: str) -> Figure:
-    """Return an empty figure with the size of a number of panels."""
+    """Return an empty figure with space for rows and columns of panels."""
     size = (PANEL[0] * columns, PANEL[1] * rows)
     drawn = figure_class()(figsize=size, layout="constrained")
     if title:
@@ -207,7 +206,7 @@ def empty(rows: int, columns: int, title: str) -> Figure:
 
 
 def png(drawn: Figure) -> bytes:
-    """Return a figure as an image; `Figure.savefig` would draw it twice, once for its layout."""
+    """Return a figure as PNG image; `Figure.savefig` would draw it twice, once for its layout."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     image = io.BytesIO()
@@ -230,7 +229,7 @@ def time_axis(ax: Axes, data: xr.Dataset) -> None:
         import matplotlib.dates
 
         dates: Any = matplotlib.dates  # has no types
-        # With its default of 5 ticks at least, no interval suits 3 to 5 days, hours or minutes.
+        # With the default of at least 5 ticks, no interval suits 3 to 5 days, hours or minutes.
         locator = dates.AutoDateLocator(minticks=3, maxticks=7)
         ax.xaxis.set_major_locator(locator)
         ax.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
@@ -244,7 +243,7 @@ def finish(ax: Axes, *, legend: bool = True, outside: bool = False) -> Axes:
         if outside:
             ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small", frameon=False)
         else:
-            # loc="best" tests every point drawn, which is too slow for long runs.
+            # loc="best" tests every point, which is too slow for long runs.
             points = sum(np.size(line.get_xdata()) for line in ax.lines)
             place: Any = "best" if points <= MOST_POINTS else "upper right"
             ax.legend(loc=place, fontsize="small", framealpha=0.85, edgecolor="none")
@@ -252,7 +251,7 @@ def finish(ax: Axes, *, legend: bool = True, outside: bool = False) -> Axes:
 
 
 def shades_of(count: int) -> list[Any]:
-    """Return colours for a sequence in time, early to late: viridis without its yellow end."""
+    """Return colours for a sequence in time: viridis without its yellow end."""
     import matplotlib as mpl
 
     shades: list[Any] = list(mpl.colormaps["viridis"](np.linspace(0.0, 0.88, max(count, 2))))
