@@ -1,6 +1,6 @@
 """The live page of a run in a browser, during the run and afterwards.
 
-`serve` starts it; `figures` draws datasets, also for reports.
+`serve` starts the page; `figures` draws datasets, including those of reports.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ __all__ = ["check_installed", "serve"]
 
 
 def check_installed() -> None:
-    """Raise `ConfigurationError` if the page cannot be shown for want of a package."""
+    """Raise `ConfigurationError` if a package that the page requires is not installed."""
     import importlib.util
 
     if any(importlib.util.find_spec(name) is None for name in ("dash", "plotly", "waitress")):
@@ -29,10 +29,10 @@ def serve(path: Path, address: Address) -> Server:
     Parameters
     ----------
     path
-        The run directory, finished or going on; or a folder of such, a fleet's say, of which the
-        page is a table with a link to the page of each run.
+        Directory of a finished or unfinished run; or a folder of run directories, for example of a
+        fleet, whose page is a table with a link to the page of each run.
     address
-        Where to listen.
+        Address of the server.
 
     Raises
     ------

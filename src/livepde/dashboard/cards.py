@@ -1,6 +1,6 @@
-"""Parts of the page made of text: the headline, the verdict, cards of unknowns, tables.
+"""Textual parts of the page: headline, verdict, cards of unknowns, tables.
 
-All text from files goes through Dash components as plain children, which show it unchanged.
+All text from files is passed to Dash components as plain children, which show it unchanged.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from livepde.verdict import Severity
 
 Level = Literal["good", "info", "warn", "bad"]
 
-MOST_SHOWN = 6  # sentences of the verdict that are seen at once
+MOST_SHOWN = 6  # sentences of the verdict that are shown initially
 MOST_CARDS = 12
-MOST_ROWS = 100  # of a table
-LONG = 12  # rows from which a table is closed at first
+MOST_ROWS = 100  # largest number of rows in a table
+LONG = 12  # rows from which a table is initially closed
 RAISED = str.maketrans("+-0123456789", "⁺⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 SEVERITY: dict[Severity, Level] = {"note": "info", "caution": "warn", "do not trust": "bad"}
 SIGNS: dict[Level, str] = {"good": "✓", "info": "i", "warn": "!", "bad": "✕"}
@@ -53,7 +53,7 @@ GAINS: dict[str, Level] = {
 
 
 def pretty(number: str) -> str:
-    """Return a number as people write it.
+    """Return a number in scientific notation with a superscript exponent.
 
     >>> pretty("4.97e-07"), pretty("2.5")
     ('4.97·10⁻⁷', '2.5')
@@ -63,19 +63,19 @@ def pretty(number: str) -> str:
 
 
 def _between(low: str, high: str) -> str:
-    """Return an interval, with its power of ten only once."""
+    """Return an interval as text, with a common power of ten."""
     power, other = low.partition("e")[2], high.partition("e")[2]
     return f"{pretty(low.partition('e')[0] if power == other else low)} to {pretty(high)}"
 
 
 def chip(seen: RunView) -> list[Any]:
-    """Return the status of a run."""
+    """Return the status of a run as text."""
     level, text = STATUS.get(seen.status, ("info", seen.status))
     return [sign(level), html.Span(text)]
 
 
 def facts(seen: RunView) -> str:
-    """Return how far a run is, in a line."""
+    """Return the progress of a run as a line of text."""
     parts = [f"{seen.samples} sample{'s' * (seen.samples != 1)}"]
     if (data := seen.estimates) is not None:
         parts.append(f"newest at {when_axis(data).text(float(data['time'][-1]))}")
@@ -90,14 +90,14 @@ def facts(seen: RunView) -> str:
 
 def _ago(seconds: float) -> str:
     for size, name in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
-        # From two of a unit on, so that 90 minutes are not rounded to hours.
+        # A unit is used from two of it on, so that 90 minutes are not rounded to hours.
         if seconds >= 2 * size:
             return f"{seconds / size:.0f} {name} ago"
     return f"{max(seconds, 0.0):.0f} s ago"
 
 
 def summary(seen: RunView) -> str:
-    """Return a sentence on unknowns, sensors and law."""
+    """Return a sentence on the unknowns, sensors and law of a run."""
     data = seen.dataset
     if data is None:
         return "No estimates yet."
@@ -115,13 +115,13 @@ def summary(seen: RunView) -> str:
 
 
 def gravest(seen: RunView) -> tuple[Level, str]:
-    """Return the level and the sentence of the gravest finding on a run."""
+    """Return the level and the sentence of the most severe finding on a run."""
     levels: tuple[Level, ...] = ("bad", "warn", "good", "info")
     return min(_found(seen), key=lambda item: levels.index(item[0]), default=("info", "–"))
 
 
 def verdict(seen: RunView) -> list[Any]:
-    """Return the findings and failures of a run: a sentence each, the gravest first."""
+    """Return a sentence for each finding and failure of a run, the most severe first."""
     found = _found(seen)
     lines = [html.Li([sign(level), html.Span(text)], className=level) for level, text in found]
     if len(lines) <= MOST_SHOWN + 1:
@@ -131,7 +131,7 @@ def verdict(seen: RunView) -> list[Any]:
 
 
 def _found(seen: RunView) -> list[tuple[Level, str]]:
-    """Return the findings on a run: level and sentence."""
+    """Return the level and sentence of each finding on a run."""
     found = findings(seen.dataset, _failures(seen), seen.checks, seen.doubts)
     return found + [("info", text) for text in _remarks(seen)]
 
@@ -139,11 +139,11 @@ def _found(seen: RunView) -> list[tuple[Level, str]]:
 def findings(
     data: xr.Dataset | None, failures: Iterable[str], checks: Iterable[Check], doubts: Iterable[str]
 ) -> list[tuple[Level, str]]:
-    """Return the level and sentence of failures, failed checks and doubts; or that all is well."""
+    """Return levels and sentences of failures, failed checks and doubts, or of no problems."""
     found: list[tuple[Level, str]] = [("bad", text) for text in failures]
     found += [("bad", f"Expected {c.name} {c.sense} {c.bound_text}, but it is {c.value:.4g}.")
               for c in checks if not c.ok]  # fmt: skip
-    # The notes of a thinned run that ended replace its doubts, without a severity.
+    # For a thinned run that has ended, the notes contain the doubts, without a severity.
     graves = {} if data is None else severities(data)
     found += [(SEVERITY[graves.get(doubt, "caution")], doubt) for doubt in doubts]
     if data is not None and {"bad", "warn"}.isdisjoint(level for level, _ in found):
@@ -152,14 +152,14 @@ def findings(
 
 
 def _failures(seen: RunView) -> Iterator[str]:
-    """Yield sentences on what failed: reading, the process, the source, health, the last step."""
+    """Yield sentences on failures of reading, process, source, health and last step."""
     if seen.problem:
         yield seen.problem
     if seen.status == "stopped":
         text = "The process of this run was killed. To resume it"
         yield f"{text}: `livepde run CASE --out RUN --resume`."
     if seen.status == "silent":
-        # The page holds the newest events only, and this one may be older.
+        # The page has only the newest events, and this event may be older.
         messages = ["", *(f": {one.message}" for one in seen.events if one.kind == "silent")]
         yield f"The source is silent{messages[-1]}."
     if seen.unwell:
@@ -170,7 +170,7 @@ def _failures(seen: RunView) -> Iterator[str]:
 
 
 def _remarks(seen: RunView) -> Iterator[str]:
-    """Yield sentences that only inform: irregular rows, thinned estimates, notes of the run."""
+    """Yield informative sentences: irregular rows, thinned estimates, notes of the run."""
     if seen.counts:
         reasons: Counter[str] = Counter()
         for (kind, _), number in seen.counts.items():
@@ -183,8 +183,8 @@ def _remarks(seen: RunView) -> Iterator[str]:
 
 
 def sign(level: Level) -> Any:
-    """Return the sign of a level."""
-    hidden: Any = {"aria-hidden": "true"}  # it only repeats the text
+    """Return the symbol of a level."""
+    hidden: Any = {"aria-hidden": "true"}  # the text has the same content
     return html.Span(SIGNS[level], className=f"sign {level}", **hidden)
 
 
@@ -192,7 +192,7 @@ def sign(level: Level) -> Any:
 
 
 def cards(data: xr.Dataset | None, at: float | None) -> list[Any]:
-    """Return a card for each unknown with its value at a time."""
+    """Return a card with the value at a time for each unknown."""
     if data is None or not data.sizes["time"]:
         return []
     labels = scalars(data)
@@ -256,7 +256,7 @@ def _field_card(data: xr.Dataset, name: str, at: float | None) -> Any:
 
 
 def event_tables(seen: RunView) -> list[Any]:
-    """Return the tables of events, irregular rows and checks that are not empty; or a sentence."""
+    """Return the nonempty tables of events, irregular rows and checks, or a sentence."""
     found = []
     if seen.events:
         events = [

@@ -1,6 +1,6 @@
-"""A run as one HTML file: sentences, tables and figures, to keep or to send.
+"""Report of a run as a single HTML file with sentences, tables and figures.
 
-The file is self-contained; its policy forbids a browser to load anything else.
+The file is self-contained; its content security policy forbids to load anything else.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from livepde.runs.journal import Event
 
 TEMPLATE, STYLE = "report.html", "assets/page.css"
 MOST_EVENTS = 500
-MOST_READINGS = 100_000  # samples of a run whose readings are drawn
+MOST_READINGS = 100_000  # largest number of samples for which readings are drawn
 
 
 def write_report(run: Run, target: Path, *, force: bool = False) -> None:
-    """Write the report of a run, also of one that still continues.
+    """Write the report of a run, which may still be in progress.
 
     `force`: replace an existing file.
     Raises `RunError`: the target exists, or cannot be written; the run contains no estimates.
@@ -38,7 +38,7 @@ def write_report(run: Run, target: Path, *, force: bool = False) -> None:
 
 
 def page_of(run: Run) -> str:
-    """Return the report of a run as HTML; see `write_report`."""
+    """Return the report of a run as HTML, see `write_report`."""
     with optional("dashboard", "A report as HTML needs Plotly and Jinja2"):
         from jinja2 import Environment, FileSystemLoader, StrictUndefined
         from plotly.offline import get_plotlyjs
@@ -82,7 +82,7 @@ def page_of(run: Run) -> str:
 
 
 def _contents(run: Run) -> tuple[xr.Dataset, dict[str, Any]]:
-    """Return the estimates of a run, its times and its events."""
+    """Return estimates, times and events of a run."""
     from livepde.dashboard.figures.canvas import when_axis
 
     data, events, counts = run.dataset, list[Event](), dict[tuple[str, str], int]()
@@ -101,7 +101,7 @@ def _contents(run: Run) -> tuple[xr.Dataset, dict[str, Any]]:
 
 
 def _with_readings(data: xr.Dataset, journal: Journal) -> xr.Dataset:
-    """Return the estimates of a run with its readings, if they are not too many to be drawn."""
+    """Return the estimates of a run, with its readings unless these are too many."""
     if len(journal) > MOST_READINGS:
         return data
     names = sensor_names(data)

@@ -1,4 +1,4 @@
-"""The live page: a Dash application over the view of a run, or a table of many runs."""
+"""The live page: a Dash application that shows a run, or a table of many runs."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     import xarray as xr
     from flask import Response
 
-FAST, CATCHING_UP, SLOW = 2000, 300, 10_000  # milliseconds between two looks
-STOPS = 400  # of the slider
-OPEN = ("waiting", "running", "silent")  # a run in which something may happen soon
-PACE = 5000  # milliseconds between two looks
-MOST_RUNS = 500  # rows
-MOST_UNKNOWNS = 4  # columns
-MOST_PAGES = 16  # applications that are kept
+FAST, CATCHING_UP, SLOW = 2000, 300, 10_000  # milliseconds between two updates
+STOPS = 400  # number of stops of the slider
+OPEN = ("waiting", "running", "silent")  # statuses in which the page is updated often
+PACE = 5000  # milliseconds between two updates of the table of runs
+MOST_RUNS = 500  # largest number of rows in the table of runs
+MOST_UNKNOWNS = 4  # largest number of columns for unknowns
+MOST_PAGES = 16  # largest number of applications in memory
 ORDER = ("bad", "warn", "info", "good")
 T = TypeVar("T")
 
@@ -43,8 +43,8 @@ T = TypeVar("T")
 def page(path: Path, prefix: str = "/") -> dash.Dash:
     """Return the page of a run.
 
-    `path`: the run directory, finished or going on.
-    `prefix`: where browsers find the page, as it ends: it may be mounted below another one.
+    `path`: directory of the run, which may still be in progress.
+    `prefix`: end of the page's URL path, since the page may be mounted below another one.
     Raises `RunError`: there is no run.
     """
     view = View(path)
@@ -58,7 +58,7 @@ def page(path: Path, prefix: str = "/") -> dash.Dash:
 
 
 def application(title: str, prefix: str = "/") -> dash.Dash:
-    """Return a page without content that loads nothing from elsewhere."""
+    """Return an empty page that loads nothing from other servers."""
     return dash.Dash(
         "livepde",
         assets_folder=str(Path(__file__).with_name("assets")),
@@ -72,7 +72,7 @@ def application(title: str, prefix: str = "/") -> dash.Dash:
 
 
 def _skeleton() -> Any:
-    """Return the page before anything is known."""
+    """Return the initial layout of the page."""
     sections = [
         html.Section(
             [
@@ -108,7 +108,7 @@ def _skeleton() -> Any:
 
 
 def _timebar() -> Any:
-    """Return the slider that selects the time, and the one of the cuts through solids."""
+    """Return the slider of the time and the slider of the cuts through solids."""
     plain: Any = {"marks": None, "allow_direct_input": False}
     history = dcc.Slider(0, 1, value=1, id="slider", updatemode="drag", disabled=True, **plain)
     cut = dcc.Slider(0.05, 0.95, step=0.05, value=0.5, id="cut", **plain)
@@ -131,7 +131,7 @@ def _aria(**values: str) -> Any:
 
 
 def _look(app: dash.Dash, view: View) -> None:
-    """Update the page from the run at intervals."""
+    """Register the callbacks that update the page at intervals."""
 
     @app.callback(
         Output("news", "data"),
@@ -151,7 +151,7 @@ def _look(app: dash.Dash, view: View) -> None:
 
 
 def _steer(app: dash.Dash, view: View) -> None:
-    """Let it follow the newest estimate, or stay at the time that is asked for."""
+    """Register the callbacks that follow the newest estimate, or hold the selected time."""
 
     @app.callback(
         Output("at", "data"),
@@ -170,7 +170,7 @@ def _steer(app: dash.Dash, view: View) -> None:
         step = (high - low) / STOPS or 1.0
         at = None if dash.ctx.triggered_id == "newest" else before
         if dash.ctx.triggered_id == "slider":
-            at = None if wanted >= high - step / 2 else wanted  # at the end it follows
+            at = None if wanted >= high - step / 2 else wanted  # follows at the end
         moment = high if at is None else at
         label = f"{'newest' if at is None else 'history'}: {when_axis(data).text(moment)}"
         return at, low, high, step, moment, not high > low, label
@@ -205,13 +205,13 @@ def _draw(app: dash.Dash, view: View) -> None:
         data = view.look().dataset
         shown = [] if data is None else panels(data, at, cut)
         names = [item["panel"] for item in there]
-        # With the same panels only figures and captions are sent: frames and focus stay.
+        # If the panels are the same, only figures and captions are sent, which preserves the focus.
         if names == [panel.name for panel in shown]:
             same = (no_update,) * (2 * len(SECTIONS) + 1)
             return (*same, [panel.figure for panel in shown], [panel.about for panel in shown])
         frames = [[_framed(panel) for panel in shown if panel.section == key] for key in SECTIONS]
         flat = data is None or "z" not in data.coords
-        later = [no_update] * len(names)  # they come with their frames
+        later = [no_update] * len(names)  # new frames contain their figures
         return *frames, *(not part for part in frames), flat, later, later
 
 
@@ -232,10 +232,10 @@ def _framed(panel: Panel) -> Any:
 
 
 def harden(app: dash.Dash) -> None:
-    """Tell browsers to load nothing from elsewhere, and to run no script but the page's own."""
+    """Set a policy that allows browsers to load and run only content of this server."""
     scripts = " ".join(app.csp_hashes())
     policy = (
-        # Plotly compiles code for its drawings with WebGL.
+        # Plotly compiles code for WebGL.
         f"default-src 'self'; script-src 'self' 'unsafe-eval' {scripts}; style-src 'self' "
         "'unsafe-inline'; img-src 'self' data: blob:; frame-ancestors 'none'"
     )
@@ -247,7 +247,7 @@ def harden(app: dash.Dash) -> None:
 
 
 class PerRun(Mapping[str, T]):
-    """Values made for runs of a folder when they are asked for; the latest are kept."""
+    """Cache of values for the runs of a folder, computed on demand; the latest are kept."""
 
     def __init__(self, folder: Path, prefix: str, most: int, make: Callable[[str], T]) -> None:
         self.folder, self.prefix = folder, prefix
@@ -260,15 +260,15 @@ class PerRun(Mapping[str, T]):
         return len(run_names(self.folder))
 
     def __getitem__(self, key: str) -> T:
-        if key not in set(self):  # so that no path leads out of the folder
+        if key not in set(self):  # prevents paths out of the folder
             raise KeyError(key)
         return self._made(key.removeprefix(self.prefix))
 
 
 def overview_page(folder: Path) -> WSGIApplication:
-    """Return the page of a folder of runs, such as a fleet's: a table, and the page of each run.
+    """Return the page of a folder of runs, such as a fleet: a table, and the page of each run.
 
-    `folder`: it holds run directories. Runs that begin later appear, too.
+    `folder`: folder of run directories, to which new runs may be added.
     """
     views = PerRun(folder, "", MOST_RUNS, lambda name: View(folder / name))
     app = application(f"{folder.resolve().name} – livepde")
@@ -291,14 +291,14 @@ def overview_page(folder: Path) -> WSGIApplication:
         server: WSGIApplication = page(folder / name, f"/run/{quote(name)}/").server
         return server
 
-    pages: Any = PerRun(folder, "/run/", MOST_PAGES, of)  # of a dict it uses `in` and []
+    pages: Any = PerRun(folder, "/run/", MOST_PAGES, of)  # only `in` and [] are used
     return DispatcherMiddleware(app.server, pages)
 
 
 def overview_table(views: Mapping[str, View]) -> Any:
-    """Return a table of runs, those with the gravest verdict first."""
+    """Return a table of runs, the most severe verdict first."""
     seen = {name: views[name].look() for name in list(views)[:MOST_RUNS]}
-    labels: dict[str, str] = {}  # unknown -> title of its column; those of the last run first
+    labels: dict[str, str] = {}  # unknown -> title of its column, beginning with the last run
     for one in seen.values():
         if (data := one.dataset) is not None:
             labels = {label: _title(data, label) for label in scalars(data)} | labels

@@ -1,4 +1,4 @@
-"""View of a run directory: read bit by bit during the run, and afterwards."""
+"""View of a run directory, which is read incrementally during the run and afterwards."""
 
 from __future__ import annotations
 
@@ -24,36 +24,36 @@ from livepde.runs.journal import Event
 
 T = TypeVar("T")
 
-# Errors of sensors -> name of their readings in the dataset of a view, which no unknown has.
+# Variable of errors -> name of the readings in the dataset of a view, which no unknown can have.
 READINGS = {
     "innovation": "readings of sensors",
     "validation_error": "readings of validation sensors",
 }
-ROWS = 2000  # estimates that are kept to be drawn
-NOTABLE = 500  # failed steps and jumps that are kept beside them
-FIELDS = 400  # snapshots
-SHOWN = 500  # events
-BYTES = 64 * 2**20  # of snapshots
-AT_ONCE = 20_000  # estimates read in one go
+ROWS = 2000  # largest number of estimates in memory
+NOTABLE = 500  # largest number of additional failed steps and jumps
+FIELDS = 400  # largest number of snapshots
+SHOWN = 500  # largest number of events
+BYTES = 64 * 2**20  # largest size of all snapshots
+AT_ONCE = 20_000  # largest number of estimates per update
 OFTEN = 0.5  # seconds within which a journal is not read again
-HEARING = ("silent", "heard")  # events of the source
-QUIET = 10.0  # seconds without news after which it is asked whether anyone still writes
+HEARING = ("silent", "heard")  # kinds of events of the source
+QUIET = 10.0  # seconds without a write after which the lock of the writer is checked
 
 
 class Spread(Generic[T]):
-    """Items by number, at most `most`, spread evenly; the first and the newest are among them."""
+    """At most `most` evenly spread items by number, including the first and the newest."""
 
     def __init__(self, most: int) -> None:
         self.most = most
         self.gap = 1
         self._items: dict[int, T] = {}
-        self._settled = 0  # the number up to which items stay
+        self._settled = 0  # number of the last permanent item
 
     def add(self, number: int, item: T) -> None:
-        """Take one, with a number that is larger than those before, or the last one again."""
+        """Add an item with a larger number than all before, or replace the last item."""
         newest = next(reversed(self._items), number)
         if newest > self._settled and newest != number:
-            # The newest item is dropped if it is less than a gap after the last one that stays.
+            # The newest item is dropped if it is less than a gap after the last permanent item.
             if newest - self._settled < self.gap and len(self._items) > 1:
                 del self._items[newest]
             else:
@@ -78,35 +78,35 @@ class Spread(Generic[T]):
 class RunView:
     """Contents of the live page of a run."""
 
-    version: int = 0  # number that changes with the contents
+    version: int = 0  # changes with the contents
     title: str = ""
-    # "waiting" (for the first sample), "running", "silent" (its source), "stopped" (unfinished, but
-    # without a writer), "finished", "interrupted" or "failed"; "unreadable" with a `problem`
+    # "waiting" (for the first sample), "running", "silent" (source), "stopped" (unfinished, without
+    # a writer), "finished", "interrupted", "failed", or "unreadable" (see `problem`).
     status: str = "waiting"
-    dataset: xr.Dataset | None = None  # estimates, thinned; None before the first
+    dataset: xr.Dataset | None = None  # thinned estimates; None before the first
     samples: int = 0  # number of estimates
-    gap: int = 1  # one in so many estimates is in the dataset
-    reading: bool = False  # true while there is more to read
-    events: Sequence[Event] = ()  # of the journal, as the next
+    gap: int = 1  # the dataset contains one in `gap` estimates
+    reading: bool = False  # whether there are more records to read
+    events: Sequence[Event] = ()  # events and counts of the journal
     counts: Mapping[tuple[str, str], int] = field(default_factory=dict)
-    unwell: str = ""  # reason why the run is not well, as in /health; empty if it is
+    unwell: str = ""  # reason why the run is unhealthy, as in /health; empty if it is healthy
     doubts: Sequence[str] = ()  # findings against the estimates
     notes: Sequence[str] = ()  # further notes of the run
     checks: Sequence[Check] = ()
     written: float = 0.0  # time of the last write, in seconds since 1970
-    ended: str = ""  # date when the run ended, "" before
+    ended: str = ""  # date of the end of the run; empty before
     problem: str = ""
 
     @property
     def estimates(self) -> xr.Dataset | None:
-        """The dataset if it has an estimate."""
+        """The dataset if it contains an estimate, else None."""
         return None if self.dataset is None or not self.dataset.sizes["time"] else self.dataset
 
 
 def with_readings(data: xr.Dataset, readings: Array) -> xr.Dataset:
-    """Return a dataset with the readings of its sensors and validation sensors, `READINGS`.
+    """Add the variables `READINGS`, readings of sensors and validation sensors, to a dataset.
 
-    `readings`: shape (time, sensors), those for validation last.
+    `readings`: shape (time, sensors), with validation sensors last.
     """
     parts = np.split(readings, [data.sizes["sensor"]], axis=1)
     return data.assign(
@@ -121,8 +121,8 @@ def with_readings(data: xr.Dataset, readings: Array) -> xr.Dataset:
 class View:
     """The current contents of a run directory, for any number of clients.
 
-    Memory and the cost of each update are bounded, whatever the length of the run: only new records
-    of a journal are read, and those in memory are thinned.
+    Memory and cost of each update are bounded independently of the length of the run: only new
+    records of a journal are read, and records in memory are thinned.
 
     Raises `RunError`: there is no run.
     """
@@ -146,7 +146,7 @@ class View:
                 self._failures = 0
             except (RunError, ValueError, TypeError, KeyError, IndexError) as error:
                 self._failures += 1
-                if self._failures > 1:  # the first time it may be just being made
+                if self._failures > 1:  # at first, its creation may be in progress
                     why = error if isinstance(error, RunError) else f"it is damaged ({error})."
                     problem, self._mark = f"The run cannot be read: {why}", None
                     self._seen = replace(
@@ -165,11 +165,11 @@ class View:
         self._notable: Spread[Record] = Spread(NOTABLE)
         self._fields: Spread[Record] = Spread(FIELDS)
         self._number = 0
-        self._readings: dict[int, Array] = {}  # of the records that are kept
+        self._readings: dict[int, Array] = {}  # readings of the records in memory
 
     def _read(self) -> RunView:
         run = runs.open(self.path)
-        if run.record.get("started") != self._started:  # another run in the same place
+        if run.record.get("started") != self._started:  # a new run at the same path
             self._begin(run)
         journal = self.path / JOURNAL
         live = journal.is_file()
@@ -193,12 +193,12 @@ class View:
         else:
             seen = replace(seen, dataset=run.dataset, samples=run.dataset.sizes["time"])
         seen = _judged(seen, run)
-        self._mark = mark  # last, so that after an error all is read again
+        self._mark = mark  # set last, so that everything is read again after an error
         return seen
 
     def _follow(self, seen: RunView, path: Path) -> RunView:
         with Journal.open(path) as journal:
-            # The last one again: its fields may have been kept after it.
+            # The last record is read again, since its fields may have been stored later.
             new = [*islice(journal.after(max(self._number - 1, 0)), AT_ONCE)]
             readings = dict(journal.values(new[0][0], new[-1][0])) if new else {}
             layout, count = journal.layout, journal.estimated
@@ -229,7 +229,7 @@ class View:
         self._number = number
         self._readings[number] = np.array([values.get(name, np.nan) for name in names])
         if record.snapshot is not None:
-            # Fields take most of the memory, so that their number depends on their size.
+            # Fields need most of the memory, so that their number depends on their size.
             size = 8 * sum(values.size for values in record.snapshot.profiles.values())
             self._fields.most = max(2, min(FIELDS, BYTES // max(size, 1)))
             self._fields.add(number, record)
@@ -253,11 +253,11 @@ class View:
 
 
 def _judged(seen: RunView, run: runs.Run) -> RunView:
-    """Return the contents with findings; of an ended run with its notes and checks."""
+    """Return the contents with findings, and for an ended run with its notes and checks."""
     found = [] if seen.dataset is None else runs.doubts(seen.dataset)
     if run.status == "running":
         return replace(seen, doubts=found, notes=[], checks=[], ended="")
-    # The dataset is thinned, while what the run itself has said is of all its samples.
+    # The dataset is thinned, while the findings of the run itself use all its samples.
     if found and seen.gap > 1:
         found = run.notes
     notes = [note for note in run.notes if note not in found]
