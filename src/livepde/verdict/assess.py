@@ -64,18 +64,18 @@ PRIOR = 1e-4  # p-value of the distance from the prior mean below which there is
 LARGER = 1.5  # residual scatter over the configured noise above which there is a note, and ...
 SMALLER = 0.5  # ... below which there is one
 NOISIER = 3.0  # scatter of a sensor over the typical scatter above which there is a note
-FAR = 3.0  # standard deviations of the noise between a stuck sensor and its prediction
+STUCK_DISTANCE = 3.0  # standard deviations of the noise between a stuck sensor and its prediction
 REFUSED = 0.02  # share of rejected readings above which there is a finding
-MENDED = 128  # samples without evidence after which an earlier fault counts as past
+RECOVERY_SAMPLES = 128  # samples without evidence after which an earlier fault counts as past
 BRIEF = 10  # most contradicting readings of a short disturbance, such as after a pause
-STANDS = 10  # equal readings in a row of a stuck sensor
+STUCK_READINGS = 10  # equal readings in a row of a stuck sensor
 MOVES = 1.0  # shift, in standard deviations, from which an estimate is not usable
 EXPLAINED = 0.5  # share of the misfit from which its first cause accounts for it
 FACTOR = 2.0  # largest plausible error of the scale of a sensor or an input
-LONGEST = 0.25  # largest plausible delay of a sensor, as a share of the run
+LONGEST_LAG = 0.25  # largest plausible delay of a sensor, as a share of the run
 SEEN = 4.0  # standard errors from which an amplitude is detectable
-BEYOND = 2.0  # shift, in standard deviations, that exceeds the interval
-UNSEEN = 3  # most sentences on undetectable errors
+OUTSIDE = 2.0  # shift, in standard deviations, that exceeds the interval
+MOST_UNDETECTABLE = 3  # most sentences on undetectable errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,40 +107,40 @@ class Position:
 
 def assess(dictionary: Dictionary, at: Position) -> Verdict:
     """Return the verdict on one member."""
-    seen = int(at.ledger.seen)
-    if seen < FEWEST:
-        untested = (too_few("innovations", seen), *dictionary.left_out)
+    count = int(at.ledger.seen)
+    if count < FEWEST:
+        untested = (too_few("innovations", count), *dictionary.left_out)
         return Verdict.of((), untested, judged=False)
     evidence = causes_of(at.ledger)
     findings = list(_misfit(dictionary, at, evidence))
     if not findings:
         findings += _records(at, evidence)
     findings += [*_noise(at), *_stuck(at), *_aside(at), *_disturbed(at), *_refused(at), *_prior(at)]
-    return Verdict.of(findings, dictionary.left_out, _unseen(dictionary, at))
+    return Verdict.of(findings, dictionary.left_out, _undetectable(dictionary, at))
 
 
-def _unseen(dictionary: Dictionary, at: Position) -> list[str]:
+def _undetectable(dictionary: Dictionary, at: Position) -> list[str]:
     """Return sentences on undetectable sensor errors that would shift an estimate significantly.
 
     An error below `SEEN` standard errors is undetectable. Its size is limited to the amplitude of
     its direction, which is a typical size.
     """
     # The information on each amplitude, sum g g, is the inverse square of its standard error.
-    den = at.ledger.sums[1, 0].sum(axis=1)
-    hidden = np.minimum(SEEN / np.sqrt(np.maximum(den, 1e-300)), 1.0)
-    found = []
+    information = at.ledger.sums[1, 0].sum(axis=1)
+    amplitude = np.minimum(SEEN / np.sqrt(np.maximum(information, 1e-300)), 1.0)
+    shifts = []
     for d, direction in enumerate(dictionary.directions):
         if direction.kind not in ("offset", "gain", "lag", "position"):
             continue
         if f"{direction.kind}[{direction.subject}]" in at.moved:  # it is an estimated unknown
             continue
-        for name, moved in at.moved.items():
-            shift = float(hidden[d] * abs(moved[0, d]))
-            if shift > BEYOND:
-                found.append((shift, d, name))
+        for name, sensitivity in at.moved.items():
+            shift = float(amplitude[d] * abs(sensitivity[0, d]))
+            if shift > OUTSIDE:
+                shifts.append((shift, d, name))
     undetected = []
-    for shift, d, name in sorted(found, reverse=True)[:UNSEEN]:
-        text, remedy = _words(dictionary.directions[d], float(hidden[d]), at)
+    for shift, d, name in sorted(shifts, reverse=True)[:MOST_UNDETECTABLE]:
+        text, remedy = _description(dictionary.directions[d], float(amplitude[d]), at)
         undetected.append(
             f"Undetectable: {text}, which would shift {name} by {shift:.1f} standard deviations. "
             f"{remedy}"
@@ -152,20 +152,20 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
     """Yield the finding on innovations that correlate with a possible cause or with each other."""
     # By Ville's inequality, the mean e-value exceeds 1/alpha with a probability of at most alpha.
     limit = -math.log(CAUSES)
-    recent = _mended(at, evidence)
+    recent = _only_past_evidence(at, evidence)
     if evidence.total < limit:
         yield from _following(at, -1 if recent else 0)
         return
     order = _ranked(evidence)
-    if recent and _recovered(at, evidence, order):
+    if recent and _unshifted(at, evidence, order):
         count = int(at.ledger.age[-1])
         text, _ = FINDINGS["past"].filled(count=count)
         yield Finding("past", "note", text, evidence=float(count))
         return
     # Autocorrelated noise explains the evidence: no cause is named, but the intervals are wider.
     if evidence.whitened < limit:
-        worst = float(evidence.correlation.max(initial=0.0))
-        text, _ = FINDINGS["following, causes"].filled(correlation=worst)
+        correlation = float(evidence.correlation.max(initial=0.0))
+        text, _ = FINDINGS["following, causes"].filled(correlation=correlation)
         e = _e_value(evidence.total)
         yield Finding("following", "caution", text, evidence=e, measure="e-value")
         return
@@ -207,19 +207,19 @@ def _e_value(log_e: float) -> float:
     return math.exp(min(log_e, 700.0))
 
 
-def _mended(at: Position, evidence: CauseEvidence) -> bool:
+def _only_past_evidence(at: Position, evidence: CauseEvidence) -> bool:
     """Return whether only old data contradict the model.
 
     The current restarted windows must be free of evidence. While the longest of them has fewer than
-    `MENDED` samples, so must its predecessor.
+    `RECOVERY_SAMPLES` samples, so must its predecessor.
     """
     ledger = at.ledger
-    if not ledger.epoch[-1] or not (ledger.sound or ledger.age[-1] >= MENDED):
+    if not ledger.epoch[-1] or not (ledger.sound or ledger.age[-1] >= RECOVERY_SAMPLES):
         return False
     return quiet(ledger, evidence.log_e)
 
 
-def _recovered(at: Position, evidence: CauseEvidence, order: Sequence[tuple[int, int]]) -> bool:
+def _unshifted(at: Position, evidence: CauseEvidence, order: Sequence[tuple[int, int]]) -> bool:
     """Return whether no likely cause shifts the current estimate by a standard deviation."""
     limit = -math.log(CAUSES)
     likely = [(w, d) for w, d in order if evidence.log_e[w, d] > limit] or list(order[:NAMED])
@@ -261,7 +261,7 @@ def _possible(
     if direction.kind in ("gain", "channel"):
         return 1.0 / FACTOR <= 1.0 + amount <= FACTOR
     if direction.kind == "lag":
-        return abs(size) * LAG <= LONGEST * float(at.ledger.seen)
+        return abs(size) * LAG <= LONGEST_LAG * float(at.ledger.seen)
     return direction.least <= amount <= direction.most
 
 
@@ -269,7 +269,7 @@ def _cause(
     direction: ScoreDirection, window: int, evidence: CauseEvidence, at: Position, number: int
 ) -> Cause:
     size, share = evidence.size[window, number], evidence.share[window, number]
-    text, remedy = _words(direction, float(size), at)
+    text, remedy = _description(direction, float(size), at)
     if window and direction.kind not in ("jump", "initial"):
         text += f" in the last {int(at.ledger.age[window])} samples"
     share = float(min(max(share, 0.0), 1.0))
@@ -306,12 +306,12 @@ def _setting(direction: ScoreDirection, size: float, at: Position) -> str:
     """
     keys = {"offset": "offset", "gain": "gain", "position": "at_std"}
     if direction.kind in keys:
-        wide = 2.0 * abs(_amount(direction, size, at))
-        return channel_setting(direction.subject, keys[direction.kind], f"{wide:.2g}")
+        std = 2.0 * abs(_amount(direction, size, at))
+        return channel_setting(direction.subject, keys[direction.kind], f"{std:.2g}")
     if direction.kind == "lag":
-        by = f"{size * LAG * float(at.ledger.times[1]):.4g}"
-        late = f'"{by} {at.time_unit}"' if at.time_unit else by
-        return channel_setting(direction.subject, "late", late)
+        lag = f"{size * LAG * float(at.ledger.times[1]):.4g}"
+        value = f'"{lag} {at.time_unit}"' if at.time_unit else lag
+        return channel_setting(direction.subject, "late", value)
     if direction.kind == "channel":
         return channel_setting(
             direction.subject, "factor", f"{1.0 + _amount(direction, size, at):.4g}"
@@ -335,28 +335,28 @@ def _jump(label: str) -> str:
     return f"law.jumps={json.dumps([label.partition('[')[0]])}"
 
 
-def _words(direction: ScoreDirection, size: float, at: Position) -> Sentence:
+def _description(direction: ScoreDirection, size: float, at: Position) -> Sentence:
     """Return a sentence on a cause of a size, with its remedy."""
     name, kind, amount = direction.subject, direction.kind, _amount(direction, size, at)
-    unit, positive, more = direction.unit, size > 0.0, dict[str, str]()
+    unit, positive, values = direction.unit, size > 0.0, dict[str, str]()
     if kind == "lag":
         unit = at.time_unit
     elif kind == "boundary":
         unit, positive = at.unit, amount > 0.0
         kind = "boundary, constant" if name == FIXED else kind
     elif kind == "drift":
-        more["rate"] = f"{'+' if positive else '-'}{amount_of(abs(amount) / DRIFT, unit)}"
+        values["rate"] = f"{'+' if positive else '-'}{amount_of(abs(amount) / DRIFT, unit)}"
     elif kind == "position":
-        more["where"] = _displaced(direction, amount)
+        values["where"] = _displacement(direction, amount)
     elif kind == "initial" and at.start_uncertain:
         kind = "initial, uncertain"
-    found = clause(kind, name, amount, unit, positive=positive, **more)
+    sentence = clause(kind, name, amount, unit, positive=positive, **values)
     if kind in ESTIMATED:
-        return found._replace(remedy=estimating(kind, name, width(amount, direction.unit)))
-    return found
+        return sentence._replace(remedy=estimating(kind, name, width(amount, direction.unit)))
+    return sentence
 
 
-def _displaced(direction: ScoreDirection, amount: float) -> str:
+def _displacement(direction: ScoreDirection, amount: float) -> str:
     """Return a phrase for the displacement of a sensor from its configured position."""
     axis, end = "xyz"[direction.axis], direction.at + amount
     if direction.at * end >= 0.0:
@@ -367,40 +367,40 @@ def _displaced(direction: ScoreDirection, amount: float) -> str:
 
 def _following(at: Position, window: int) -> Iterator[Finding]:
     """Yield the finding on a sensor whose innovations are autocorrelated without a cause."""
-    found = following(at.ledger, window)
-    if found is None:
+    autocorrelated = following(at.ledger, window)
+    if autocorrelated is None:
         return
-    name = at.sensors[found.sensor]
-    size = float(mean_squares(at.ledger)[window, found.sensor])
-    if at.moving and size < 1.0:
+    name = at.sensors[autocorrelated.sensor]
+    mean_square = float(mean_squares(at.ledger)[window, autocorrelated.sensor])
+    if at.moving and mean_square < 1.0:
         sentence = FINDINGS["following, large noise"]
-        text, _ = sentence.filled(name=name, correlation=found.correlation)
-        yield Finding("following", "note", text, name, found.p_value, "p-value")
+        text, _ = sentence.filled(name=name, correlation=autocorrelated.correlation)
+        yield Finding("following", "note", text, name, autocorrelated.p_value, "p-value")
         return
-    text, _ = FINDINGS["following"].filled(name=name, correlation=found.correlation)
-    yield Finding("following", "caution", text, name, found.p_value, "p-value")
+    text, _ = FINDINGS["following"].filled(name=name, correlation=autocorrelated.correlation)
+    yield Finding("following", "caution", text, name, autocorrelated.p_value, "p-value")
 
 
 def _records(at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
     """Yield findings if the unknowns changed, or if sensors imply different values of them."""
     rho = float(evidence.correlation.max(initial=0.0))
     # Ratio of the variance of a mean of AR(1) errors to that of independent errors.
-    wider = (1.0 + rho) / (1.0 - rho)
-    severity: Severity = "caution" if _mended(at, evidence) else "do not trust"
-    change = constancy(at.ledger, wider)
-    if change is not None and change.p_value < RECORD:
-        name = at.unknowns[int(np.argmax(np.abs(change.change)))]
-        text, _ = FINDINGS["constancy"].filled(name=name, after=percent(change.after))
+    variance_ratio = (1.0 + rho) / (1.0 - rho)
+    severity: Severity = "caution" if _only_past_evidence(at, evidence) else "do not trust"
+    changed = constancy(at.ledger, variance_ratio)
+    if changed is not None and changed.p_value < RECORD:
+        name = at.unknowns[int(np.argmax(np.abs(changed.change)))]
+        text, _ = FINDINGS["constancy"].filled(name=name, after=percent(changed.after))
         likely, remedy = LIKELY["jump"].filled(name=name)
         cause = Cause("jump", name, likely, remedy=remedy, setting=_jump(name))
-        p = change.p_value
+        p = changed.p_value
         yield Finding("constancy", severity, text, name, p, "p-value", (cause,))
-    found = disagreement(at.ledger, wider)
-    if found is not None and found[0] < RECORD:
-        name = at.sensors[int(np.argmax(found[1]))]
+    disagreeing = disagreement(at.ledger, variance_ratio)
+    if disagreeing is not None and disagreeing[0] < RECORD:
+        name = at.sensors[int(np.argmax(disagreeing[1]))]
         text, _ = FINDINGS["disagreement"].filled(name=name)
         cause = Cause("position", name, LIKELY["disagreement"].filled(name=name).text)
-        yield Finding("disagreement", severity, text, name, found[0], "p-value", (cause,))
+        yield Finding("disagreement", severity, text, name, disagreeing[0], "p-value", (cause,))
 
 
 def _noise(at: Position) -> Iterator[Finding]:
@@ -426,8 +426,8 @@ def _stuck(at: Position) -> Iterator[Finding]:
     ledger = at.ledger
     # Readings of a steady process repeat. A sensor is stuck if the model also predicts another
     # value.
-    off = np.abs(ledger.value - ledger.last) / at.noise
-    for i in np.flatnonzero((ledger.stuck >= STANDS - 1) & (off > FAR)):
+    distance = np.abs(ledger.value - ledger.last) / at.noise
+    for i in np.flatnonzero((ledger.stuck >= STUCK_READINGS - 1) & (distance > STUCK_DISTANCE)):
         name, count = at.sensors[int(i)], int(ledger.stuck[i]) + 1
         if name in at.aside:  # its readings are not used
             continue
@@ -440,15 +440,15 @@ def _stuck(at: Position) -> Iterator[Finding]:
 
 def _aside(at: Position) -> Iterator[Finding]:
     """Yield a finding for each excluded sensor."""
-    for name, (since, off) in at.aside.items():
+    for name, (excluded, deviation) in at.aside.items():
         text, remedy = FINDINGS["aside"].filled(
             name=name,
-            since=f"{since:g} {at.time_unit}".rstrip(),
-            off=f"{off:+.3g} {at.unit.replace('degC', 'K')}".rstrip(),
+            since=f"{excluded:g} {at.time_unit}".rstrip(),
+            off=f"{deviation:+.3g} {at.unit.replace('degC', 'K')}".rstrip(),
         )
         setting = channel_setting(name, "role", '"ignored"')
         cause = Cause("sensor", name, LIKELY["aside"].filled(name=name).text, setting=setting)
-        yield Finding("aside", "caution", text, name, abs(off), "number", (cause,), remedy)
+        yield Finding("aside", "caution", text, name, abs(deviation), "number", (cause,), remedy)
 
 
 def _disturbed(at: Position) -> Iterator[Finding]:

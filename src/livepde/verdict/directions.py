@@ -160,20 +160,20 @@ def later(stage: ForwardStage, p: Array, now: Now, h: float, loads: Array, lifts
     """
     loads = loads * stage.model.state_space.of_fields
     lifted = lifts.any(axis=1)
-    begun = p.any(axis=1) | loads.any(axis=1) | lifted
-    if not begun.any():
+    nonzero = p.any(axis=1) | loads.any(axis=1) | lifted
+    if not nonzero.any():
         return np.zeros_like(p)
-    if not begun.all():
-        found = np.zeros_like(p)
-        found[begun] = later(stage, p[begun], now, h, loads[begun], lifts[begun])
-        return found
+    if not nonzero.all():
+        responses = np.zeros_like(p)
+        responses[nonzero] = later(stage, p[nonzero], now, h, loads[nonzero], lifts[nonzero])
+        return responses
     free = stage.model.X.free
     factor, rows = stage.linearised(now.u, now.q, h, now.moment)
-    known = (stage.model.mass @ p.T).T / h + loads
+    right_side = (stage.model.mass @ p.T).T / h + loads
     if lifted.any():
-        known[lifted] -= np.asarray((rows @ lifts[lifted].T).T)
-    known *= free
-    solved: Array = factor.solve(known.T).T
+        right_side[lifted] -= np.asarray((rows @ lifts[lifted].T).T)
+    right_side *= free
+    solved: Array = factor.solve(right_side.T).T
     solved *= free
     solved[lifted] += lifts[lifted]
     return solved
@@ -200,26 +200,26 @@ def boundary_lifts(model: Model) -> dict[str, Array]:
     Boundary values that depend on no channel form the additional entry `FIXED`, a unit change.
     """
     # Boundary values are affine in the inputs, so the difference of two states is a lift.
-    zero, known = np.zeros(model.X.dim), dict.fromkeys(model.channels, 0.0)
-    rest, fixed = model.impose(zero, Moment(0.0, Inputs(known))), model.X.free == 0.0
-    found = {}
+    zero, inputs = np.zeros(model.X.dim), dict.fromkeys(model.channels, 0.0)
+    base, fixed = model.impose(zero, Moment(0.0, Inputs(inputs))), model.X.free == 0.0
+    lifts = {}
     for name in model.channels:
-        moved = Moment(0.0, Inputs({**known, name: 1.0}))
-        lift = model.impose(zero, moved) - rest
+        raised = Moment(0.0, Inputs({**inputs, name: 1.0}))
+        lift = model.impose(zero, raised) - base
         if lift.any():
             fixed &= lift == 0.0
-            found[name] = lift
-    return found | ({FIXED: fixed.astype(float)} if fixed.any() else {})
+            lifts[name] = lift
+    return lifts | ({FIXED: fixed.astype(float)} if fixed.any() else {})
 
 
 def flux_loads(model: Model, most: int | None = None) -> dict[str, Array]:
     """Return loads, (n,), of a unit flux through the first `most` boundaries, if they are free."""
-    ones, found = model.state_space.interpolate(1.0), {}
-    for name in [str(one) for one in model.mesh.boundaries or {}][:most]:
-        load = model.bilinear(On(name, mass_form)) @ ones
+    unit, loads = model.state_space.interpolate(1.0), {}
+    for name in [str(boundary) for boundary in model.mesh.boundaries or {}][:most]:
+        load = model.bilinear(On(name, mass_form)) @ unit
         if load.sum() > 0.0 and not load[model.X.free == 0.0].any():
-            found[name] = load
-    return found
+            loads[name] = load
+    return loads
 
 
 def force(model: Model, now: Now) -> Array:
@@ -232,8 +232,8 @@ def force(model: Model, now: Now) -> Array:
 def scaled_channel(model: Model, name: str, now: Now, share: float) -> Array:
     """Return the change of the force if a channel is larger by a share of its value, (n,)."""
     inputs = now.moment.inputs
-    more = Moment(now.moment.t, Inputs({**inputs, name: (1.0 + share) * inputs[name]}))
-    return force(model, now._replace(moment=more)) - force(model, now)
+    scaled = Moment(now.moment.t, Inputs({**inputs, name: (1.0 + share) * inputs[name]}))
+    return force(model, now._replace(moment=scaled)) - force(model, now)
 
 
 def stride(seen: int) -> int:
@@ -292,9 +292,9 @@ class Dictionary:
         self.directions: list[ScoreDirection] = []
         self.parts: dict[str, slice] = {}
         # Sums are stored for each direction, window and sensor.
-        room = MOST_SUMS // (len(WINDOWS) * observed.size) - len(jumps) - len(terms)
-        self._add_sensors(model, observed, noise, room)
-        self.jumps = [place for _, place in jumps]
+        capacity = MOST_SUMS // (len(WINDOWS) * observed.size) - len(jumps) - len(terms)
+        self._add_sensors(model, observed, noise, capacity)
+        self.jumps = [index for _, index in jumps]
         self._add("jump", [ScoreDirection("jump", label, JUMP) for label, _ in jumps])
         self._add("process", [ScoreDirection(term.kind, term.subject) for term in terms])
         # Effects of offsets and drifts, in units of the noise, do not depend on the sample.
@@ -303,7 +303,7 @@ class Dictionary:
             self._constant[:, self.parts[kind]] = CONSTANT[kind] * np.eye(observed.size)
 
     @cached_property
-    def _changing(self) -> IntArray:
+    def _varying(self) -> IntArray:
         """Indices of the sensor errors whose effect depends on the sample."""
         places = [self._places(kind) for kind in self.kinds if kind not in CONSTANT]
         return np.concatenate([*places, np.zeros(0, dtype=np.int64)])
@@ -339,27 +339,27 @@ class Dictionary:
         shifts, step = sensor_shifts(model, observed)
         amplitudes = self._amplitudes(model, observed, noise, room, len(shifts), step)
         self.kinds = tuple(amplitudes)
-        for kind, (size, of, axes) in amplitudes.items():
-            found = [
-                ScoreDirection(kind, name, one, unit, axis)
+        for kind, (size, units, axes) in amplitudes.items():
+            directions = [
+                ScoreDirection(kind, name, amplitude, unit, axis)
                 for axis in range(axes)
-                for name, one, unit in zip(observed.names, size.tolist(), of, strict=True)
+                for name, amplitude, unit in zip(observed.names, size.tolist(), units, strict=True)
             ]
             if kind == "position":
-                found = _within_reach(model, observed, found)
+                directions = _bounded_positions(model, observed, directions)
             elif kind == "averaging":
-                found = _inside(model, observed, found)
-            self._add(kind, found)
+                directions = _inside(model, observed, directions)
+            self._add(kind, directions)
         self.own: IntArray = np.arange(len(self.directions)) % observed.size  # sensors
         # Axes along which sensors may be displaced, and one more for averaging.
-        places = shifts if "position" in amplitudes else []
-        self.shifted = observed.size * len(places)
+        matrices = shifts if "position" in amplitudes else []
+        self.shifted = observed.size * len(matrices)
         if "averaging" in amplitudes:
-            places = [*places, sensor_averages(model, observed)]
-        self.axes = len(places)
+            matrices = [*matrices, sensor_averages(model, observed)]
+        self.axes = len(matrices)
         if self.axes:
             # Restrict the matrices of all axes to the coefficients of the state that they use.
-            rows = sp.csc_array(sp.vstack(places))
+            rows = sp.csc_array(sp.vstack(matrices))
             self._used = np.flatnonzero(np.diff(rows.indptr))
             self._moved = row_product(sp.csr_array(rows[:, self._used]))
 
@@ -385,12 +385,12 @@ class Dictionary:
         `gain`: largest relative error of the scale of a sensor. `reach`: largest displacement, over
         the length of the domain. A jump is at most one prior standard deviation.
         """
-        found = np.full(len(self), np.inf)
-        each = {"gain": gain / GAIN, "position": reach / SHIFT, "jump": 1.0 / JUMP}
-        each["averaging"] = (LONGEST_AVERAGE / AVERAGED) ** 2
-        for kind, most in each.items():
-            found[self.parts.get(kind, slice(0, 0))] = most
-        return found
+        bounds = np.full(len(self), np.inf)
+        largest = {"gain": gain / GAIN, "position": reach / SHIFT, "jump": 1.0 / JUMP}
+        largest["averaging"] = (LONGEST_AVERAGE / AVERAGED) ** 2
+        for kind, bound in largest.items():
+            bounds[self.parts.get(kind, slice(0, 0))] = bound
+        return bounds
 
     def effects(
         self, noise: Array, change: Array, late: Array, moved: Array, answers: Array
@@ -405,52 +405,52 @@ class Dictionary:
         `moved`: changes due to shifts and averages, (members, samples, axes * sensors).
         `answers`: readings of responses to missing terms, (members, samples, terms, sensors).
         """
-        found = np.empty((*noise.shape, len(self)))
-        found[...] = self._constant
-        each = {"lag": LAG * late, "gain": GAIN * change}
-        each |= {"position": moved[..., : self.shifted], "averaging": moved[..., self.shifted :]}
-        if self._changing.size:
-            own = self.own[self._changing]  # each affects only the readings of its own sensor
-            parts = [each[kind] for kind in self.kinds if kind in each]
-            signals = np.concatenate(parts, axis=2) / noise[:, :, own]
-            found[:, :, own, self._changing] = signals
-        found[..., self.parts["process"]] = answers.swapaxes(-1, -2) / noise[..., None]
-        return found
+        effects = np.empty((*noise.shape, len(self)))
+        effects[...] = self._constant
+        by_kind = {"lag": LAG * late, "gain": GAIN * change}
+        by_kind |= {"position": moved[..., : self.shifted], "averaging": moved[..., self.shifted :]}
+        if self._varying.size:
+            own = self.own[self._varying]  # each affects only the readings of its own sensor
+            signals = [by_kind[kind] for kind in self.kinds if kind in by_kind]
+            scaled = np.concatenate(signals, axis=2) / noise[:, :, own]
+            effects[:, :, own, self._varying] = scaled
+        effects[..., self.parts["process"]] = answers.swapaxes(-1, -2) / noise[..., None]
+        return effects
 
 
-def _within_reach(
-    model: Model, observed: Observed, found: list[ScoreDirection]
+def _bounded_positions(
+    model: Model, observed: Observed, directions: list[ScoreDirection]
 ) -> list[ScoreDirection]:
     """Return position directions, bounded by the domain and by the nearest other sensor."""
     at = stated_positions(observed)
     if at is None:
-        return found
+        return directions
     vertices = np.asarray(model.mesh.p)
     low, high = vertices.min(axis=1), vertices.max(axis=1)
-    apart = np.linalg.norm(at[:, None] - at[None], axis=2)
-    apart[apart == 0.0] = np.inf  # the sensor itself, and sensors at the same position
-    reach = np.fmin.reduce(apart, axis=1, initial=np.inf)
+    distances = np.linalg.norm(at[:, None] - at[None], axis=2)
+    distances[distances == 0.0] = np.inf  # the sensor itself, and sensors at the same position
+    reach = np.fmin.reduce(distances, axis=1, initial=np.inf)
     bounded = []
-    for number, one in enumerate(found):
-        sensor, k = number % len(at), one.axis
+    for index, direction in enumerate(directions):
+        sensor, k = index % len(at), direction.axis
         if np.isnan(at[sensor, k]):
-            bounded.append(one)
+            bounded.append(direction)
             continue
         least = max(float(low[k] - at[sensor, k]), -float(reach[sensor]))
         most = min(float(high[k] - at[sensor, k]), float(reach[sensor]))
-        bounded.append(replace(one, least=least, most=most, at=float(at[sensor, k])))
+        bounded.append(replace(direction, least=least, most=most, at=float(at[sensor, k])))
     return bounded
 
 
-def _inside(model: Model, observed: Observed, found: list[ScoreDirection]) -> list[ScoreDirection]:
+def _inside(model: Model, observed: Observed, items: list[ScoreDirection]) -> list[ScoreDirection]:
     """Return the averaging directions on an interval, bounded by its ends."""
     at, (vertices,) = stated_positions(observed), np.asarray(model.mesh.p)
     if at is None:
-        return found
+        return items
     low, high = float(vertices.min()), float(vertices.max())
     most = np.minimum(2.0 * np.minimum(at - low, high - at), LONGEST_AVERAGE * (high - low))
-    each = zip(found, at[:, 0].tolist(), most[:, 0].tolist(), strict=True)
-    return [replace(one, least=0.0, most=longest, at=x) for one, x, longest in each]
+    bounds = zip(items, at[:, 0].tolist(), most[:, 0].tolist(), strict=True)
+    return [replace(direction, least=0.0, most=bound, at=x) for direction, x, bound in bounds]
 
 
 def _leaves(observed: Observed) -> list[Observed]:
@@ -460,7 +460,7 @@ def _leaves(observed: Observed) -> list[Observed]:
     return [observed]
 
 
-def _stated(observed: Observed) -> Points | None:
+def _known_points(observed: Observed) -> Points | None:
     """Return an observation as points if its positions are known and not estimated, else None.
 
     If all its sensors depend directly on the parameter, they do not measure the state at a point.
@@ -474,7 +474,7 @@ def _stated(observed: Observed) -> Points | None:
 
 def stated_positions(observed: Observed) -> Array | None:
     """Return the configured positions, (sensors, d), NaN if unknown; None if all are unknown."""
-    leaves = [(leaf.size, _stated(leaf)) for leaf in _leaves(observed)]
+    leaves = [(leaf.size, _known_points(leaf)) for leaf in _leaves(observed)]
     known = [points.positions for _, points in leaves if points is not None]
     if not known:
         return None
@@ -487,17 +487,17 @@ def _rows_at(observed: Observed, at: Array) -> sp.csr_array:
     """Return the matrix of values at displaced positions; zero for sensors without a position."""
     rows, first = [], 0
     for leaf in _leaves(observed):
-        points, own = _stated(leaf), at[first : first + leaf.size]
-        none = sp.csr_array((leaf.size, observed.state.dim))
-        rows.append(none if points is None else points.rows(observed.state, own, range(leaf.size)))
+        points, own = _known_points(leaf), at[first : first + leaf.size]
+        zero = sp.csr_array((leaf.size, observed.state.dim))
+        rows.append(zero if points is None else points.rows(observed.state, own, range(leaf.size)))
         first += leaf.size
     return sp.csr_array(sp.vstack(rows))
 
 
 def usual_shifts(model: Model, at: Array) -> Array:
     """Return typical position errors, (sensors,), of sensors at positions (sensors, d)."""
-    each = [lengths(model.mesh, axis, column) for axis, column in enumerate(at.T)]
-    return np.asarray(SHIFT * np.max(each, axis=0))
+    widths = [lengths(model.mesh, axis, column) for axis, column in enumerate(at.T)]
+    return np.asarray(SHIFT * np.max(widths, axis=0))
 
 
 def sensor_shifts(model: Model, observed: Observed) -> tuple[list[sp.csr_array], Array]:
@@ -511,7 +511,7 @@ def sensor_shifts(model: Model, observed: Observed) -> tuple[list[sp.csr_array],
     vertices = np.asarray(model.mesh.p)
     low, high = vertices.min(axis=1), vertices.max(axis=1)
     step = usual_shifts(model, at)
-    found = []
+    changes = []
     for axis in range(at.shape[1]):
         ends, width = [], np.zeros(len(at))
         # Central differences, one-sided at the edge of the bounding box, where `width` is smaller.
@@ -525,8 +525,8 @@ def sensor_shifts(model: Model, observed: Observed) -> tuple[list[sp.csr_array],
                 ends.append(_rows_at(observed, moved))
             width += sign * moved[:, axis]
         scale = sp.diags_array(step / np.where(width > 0.0, width, np.inf))
-        found.append(sp.csr_array(scale @ (ends[1] - ends[0])))
-    return found, step
+        changes.append(sp.csr_array(scale @ (ends[1] - ends[0])))
+    return changes, step
 
 
 def averages_on_line(model: Model) -> bool:
@@ -547,8 +547,8 @@ def sensor_averages(model: Model, observed: Observed) -> sp.csr_array:
         return sp.csr_array((observed.size, observed.state.dim))
     (vertices,) = np.asarray(model.mesh.p)
     low, high = float(vertices.min()), float(vertices.max())
-    off = AVERAGED * (high - low) * ((np.arange(POINTS) + 0.5) / POINTS - 0.5)
+    offsets = AVERAGED * (high - low) * ((np.arange(POINTS) + 0.5) / POINTS - 0.5)
     # Near an end of the interval, the average covers a shorter length.
-    half = np.minimum(at - low, high - at)
-    rows = [_rows_at(observed, at + np.clip(x, -half, half)) for x in off.tolist()]
+    distance = np.minimum(at - low, high - at)
+    rows = [_rows_at(observed, at + np.clip(x, -distance, distance)) for x in offsets.tolist()]
     return sp.csr_array(sum(rows[1:], rows[0]) / POINTS - _rows_at(observed, at))

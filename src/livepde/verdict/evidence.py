@@ -79,13 +79,13 @@ class LinearModel:
     T: Array  # quantities of interest as linear functions of xi, (numbers, p)
 
     @cached_property
-    def _known(self) -> tuple[Array, Array]:
+    def _eliminated(self) -> tuple[Array, Array]:
         """R^(-T) J^T [Z z] and R^(-T) T^T, with R^T R = 1 + J^T J."""
         R = scipy.linalg.cholesky(np.eye(self.J.shape[1]) + self.J.T @ self.J)
-        both = self.J.T @ np.column_stack([self.Z, self.z])
-        left = scipy.linalg.solve_triangular(R, both, trans="T")
-        right = scipy.linalg.solve_triangular(R, self.T.T, trans="T")
-        return left, right
+        products = self.J.T @ np.column_stack([self.Z, self.z])
+        solved = scipy.linalg.solve_triangular(R, products, trans="T")
+        numbers = scipy.linalg.solve_triangular(R, self.T.T, trans="T")
+        return solved, numbers
 
     @cached_property
     def squares(self) -> Array:
@@ -95,24 +95,24 @@ class LinearModel:
     @cached_property
     def left(self) -> tuple[Array, Array, float]:
         """Products Z^T P Z, Z^T P z and z^T P z, with P = (1 + J J^T)^-1: unknowns eliminated."""
-        both, _ = self._known
-        taken, rest = both[:, :-1], both[:, -1]
-        S = self.squares - taken.T @ taken
-        s = self.Z.T @ self.z - taken.T @ rest
-        return S, s, float(self.z @ self.z - rest @ rest)
+        products, _ = self._eliminated
+        projected, projected_z = products[:, :-1], products[:, -1]
+        S = self.squares - projected.T @ projected
+        s = self.Z.T @ self.z - projected.T @ projected_z
+        return S, s, float(self.z @ self.z - projected_z @ projected_z)
 
     @cached_property
     def asked(self) -> tuple[Array, Array, Array]:
         """Mean and variance of the numbers if nothing is wrong, and their shift per error."""
-        both, right = self._known
-        shifts: Array = right.T @ both[:, :-1]
-        mean: Array = right.T @ both[:, -1]
-        return mean, (right**2).sum(axis=0), shifts
+        products, numbers = self._eliminated
+        shifts: Array = numbers.T @ products[:, :-1]
+        mean: Array = numbers.T @ products[:, -1]
+        return mean, (numbers**2).sum(axis=0), shifts
 
     def usual(self, columns: IntArray, root: Array) -> float:
         """Return the root mean square effect on a reading of amplitudes with a covariance."""
-        own = self.squares[np.ix_(columns, columns)]
-        return math.sqrt(max(float(((own @ root) * root).sum()), 0.0) / len(self.z))
+        squares = self.squares[np.ix_(columns, columns)]
+        return math.sqrt(max(float(((squares @ root) * root).sum()), 0.0) / len(self.z))
 
 
 class Mixture(NamedTuple):
@@ -137,13 +137,13 @@ class Mixture(NamedTuple):
         low, high = ends.min(axis=0), ends.max(axis=0)  # bracket of the quantile of the mixture
         x = self.weights @ ends
         for _ in range(60):
-            away = (x - self.means) / self.deviations
-            below = self.weights @ scipy.special.ndtr(away)
+            scaled = (x - self.means) / self.deviations
+            below = self.weights @ scipy.special.ndtr(scaled)
             low, high = np.where(below < share, x, low), np.where(below < share, high, x)
             score = scipy.special.ndtri(below)
             if not (np.abs(score - target) > SAME).any():
                 break
-            density = self.weights @ (np.exp(-0.5 * away**2) / self.deviations)
+            density = self.weights @ (np.exp(-0.5 * scaled**2) / self.deviations)
             newton = x - (score - target) * np.exp(-0.5 * score**2) / density
             x = np.where((low < newton) & (newton < high), newton, 0.5 * (low + high))
         return np.asarray(x)
@@ -167,23 +167,23 @@ class _Axes(NamedTuple):
     @classmethod
     def of(cls, model: LinearModel, family: Family, columns: IntArray) -> _Axes:
         S, s, _ = model.left
-        shifts, blocks, places = model.asked[2], [], []
-        for own, root in family.parts:
-            usual = model.usual(own, root) * math.sqrt(len(family.parts))
-            if usual > 0.0:
-                blocks.append(root / usual)
-                places.append(own)
+        shifts, blocks, indices = model.asked[2], [], []
+        for columns_of_part, root in family.parts:
+            size = model.usual(columns_of_part, root) * math.sqrt(len(family.parts))
+            if size > 0.0:
+                blocks.append(root / size)
+                indices.append(columns_of_part)
         if not blocks:
-            nothing = np.zeros(0)
-            return cls(nothing, nothing, shifts[:, :0], S[:0][:, columns])
-        place, L = np.concatenate(places), scipy.linalg.block_diag(*blocks)
-        effect, axes = np.linalg.eigh(L.T @ S[np.ix_(place, place)] @ L)
+            empty = np.zeros(0)
+            return cls(empty, empty, shifts[:, :0], S[:0][:, columns])
+        index, L = np.concatenate(indices), scipy.linalg.block_diag(*blocks)
+        effect, axes = np.linalg.eigh(L.T @ S[np.ix_(index, index)] @ L)
         L = L @ axes
-        shared = L.T @ S[np.ix_(place, columns)]
-        return cls(np.maximum(effect, 0.0), L.T @ s[place], shifts[:, place] @ L, shared)
+        shared = L.T @ S[np.ix_(index, columns)]
+        return cls(np.maximum(effect, 0.0), L.T @ s[index], shifts[:, index] @ L, shared)
 
 
-class _Tried(NamedTuple):
+class _Hypotheses(NamedTuple):
     """Evidence of hypotheses, and their effects on the numbers."""
 
     # Residual sum of squares, and half of the log-determinant, (hypotheses,)
@@ -194,42 +194,42 @@ class _Tried(NamedTuple):
     moves: Callable[[IntArray], tuple[Array, Array]]
 
 
-def _alone(model: LinearModel, axes: _Axes, size: float) -> _Tried:
+def _family_alone(model: LinearModel, axes: _Axes, size: float) -> _Hypotheses:
     D = 1.0 + size**2 * axes.effect
-    gained = size**2 * axes.along / D
+    fitted = size**2 * axes.along / D
 
-    def moves(some: IntArray) -> tuple[Array, Array]:
-        shift, variance = -(axes.moved @ gained), axes.moved**2 @ (size**2 / D)
-        return shift[None].repeat(len(some), axis=0), variance[None].repeat(len(some), axis=0)
+    def moves(chosen: IntArray) -> tuple[Array, Array]:
+        shift, variance = -(axes.moved @ fitted), axes.moved**2 @ (size**2 / D)
+        return shift[None].repeat(len(chosen), axis=0), variance[None].repeat(len(chosen), axis=0)
 
-    return _Tried(
-        np.array([model.left[2] - float(gained @ axes.along)]),
+    return _Hypotheses(
+        np.array([model.left[2] - float(fitted @ axes.along)]),
         np.array([0.5 * float(np.log(D).sum())]),
         moves,
     )
 
 
-def _beside(model: LinearModel, axes: _Axes, causes: Causes, asked: float) -> _Tried:
-    """Return the hypotheses of a family of size `asked` combined with each single cause."""
+def _beside(model: LinearModel, axes: _Axes, causes: Causes, family_size: float) -> _Hypotheses:
+    """Return the hypotheses of a family of size `family_size` combined with each single cause."""
     S, s, _ = model.left
-    usual = np.sqrt(np.diag(model.squares)[causes.columns] / len(model.z))
-    some = np.flatnonzero(usual > 0.0)
-    columns, usual = causes.columns[some], usual[some]
-    size = np.minimum(asked, causes.most[some] * usual) / usual
+    effect = np.sqrt(np.diag(model.squares)[causes.columns] / len(model.z))
+    active = np.flatnonzero(effect > 0.0)
+    columns, effect = causes.columns[active], effect[active]
+    size = np.minimum(family_size, causes.most[active] * effect) / effect
     # The cause borders the matrix of the family, which is diagonal, by one row and column.
-    alone, D = _alone(model, axes, asked), 1.0 + asked**2 * axes.effect
-    u = asked**2 * axes.shared[:, some] / D[:, None]
-    rest = np.maximum(np.diag(S)[columns] - (u * axes.shared[:, some]).sum(axis=0), 0.0)
-    kappa = 1.0 + size**2 * rest
+    alone, D = _family_alone(model, axes, family_size), 1.0 + family_size**2 * axes.effect
+    u = family_size**2 * axes.shared[:, active] / D[:, None]
+    remaining = np.maximum(np.diag(S)[columns] - (u * axes.shared[:, active]).sum(axis=0), 0.0)
+    kappa = 1.0 + size**2 * remaining
     beta = s[columns] - u.T @ axes.along
 
-    def moves(some: IntArray) -> tuple[Array, Array]:
+    def moves(chosen: IntArray) -> tuple[Array, Array]:
         ((shift,), (variance,)) = alone.moves(np.zeros(1, dtype=np.int64))
-        moved = (model.asked[2][:, columns[some]] - axes.moved @ u[:, some]).T
-        gained = (size**2 / kappa)[some, None]
-        return shift - moved * (gained * beta[some, None]), variance + moved**2 * gained
+        moved = (model.asked[2][:, columns[chosen]] - axes.moved @ u[:, chosen]).T
+        posterior = (size**2 / kappa)[chosen, None]
+        return shift - moved * (posterior * beta[chosen, None]), variance + moved**2 * posterior
 
-    return _Tried(
+    return _Hypotheses(
         alone.squares - size**2 * beta**2 / kappa, alone.volume + 0.5 * np.log(kappa), moves
     )
 
@@ -243,37 +243,37 @@ def averaged(model: LinearModel, causes: Causes, families: Sequence[Family]) -> 
     Hypotheses with negligible weight are left out.
     """
     total, (mean, variance, _) = model.left[2], model.asked
-    n, groups = len(model.z), _hypotheses(model, causes, families)
-    tried = [one for group in groups for sizes in group for one in sizes]
-    squares = np.maximum(np.concatenate([one.squares for one in tried]), 0.0)
-    volume = np.concatenate([one.volume for one in tried])
-    told = -0.5 * (NU + n) * np.log((NU + squares) / (NU + total)) - volume
+    n, groups = len(model.z), _grouped_hypotheses(model, causes, families)
+    hypotheses = [item for group in groups for sizes in group for item in sizes]
+    squares = np.maximum(np.concatenate([item.squares for item in hypotheses]), 0.0)
+    volume = np.concatenate([item.volume for item in hypotheses])
+    log_evidence = -0.5 * (NU + n) * np.log((NU + squares) / (NU + total)) - volume
     kinds, counts = _kinds(groups)
     shares = (NOTHING, 0.5 * (1.0 - NOTHING), 0.5 * (1.0 - NOTHING))
-    weights = _tempered(told, kinds, shares, counts)
+    weights = _tempered(log_evidence, kinds, shares, counts)
     level = np.maximum(1.0, (NU + squares) / (NU + n))
     used = ~(weights < NEGLIGIBLE)
-    each = np.split(used, np.cumsum([len(one.squares) for one in tried])[:-1])
-    moves = [one.moves(np.flatnonzero(own)) for one, own in zip(tried, each, strict=True)]
-    shift, more = (np.concatenate(part) for part in zip(*moves, strict=True))
-    return Mixture(weights[used], mean + shift, np.sqrt((variance + more) * level[used, None]))
+    masks = np.split(used, np.cumsum([len(item.squares) for item in hypotheses])[:-1])
+    moves = [item.moves(np.flatnonzero(mask)) for item, mask in zip(hypotheses, masks, strict=True)]
+    shift, added = (np.concatenate(part) for part in zip(*moves, strict=True))
+    return Mixture(weights[used], mean + shift, np.sqrt((variance + added) * level[used, None]))
 
 
-def _hypotheses(
+def _grouped_hypotheses(
     model: LinearModel, causes: Causes, families: Sequence[Family]
-) -> list[list[list[_Tried]]]:
+) -> list[list[list[_Hypotheses]]]:
     """Return blocks of hypotheses: group ("nothing", causes, families) -> variant -> size."""
     none = _Axes.of(model, NO_FAMILY, causes.columns)
     single = [_beside(model, none, causes, size) for size in causes.sizes]
-    several: list[list[_Tried]] = []
+    family_variants: list[list[_Hypotheses]] = []
     for family in families:
         axes = _Axes.of(model, family, causes.columns)
-        several.append([_alone(model, axes, size) for size in family.sizes])
-        several.append([_beside(model, axes, causes, size) for size in family.beside])
-    return [[[_alone(model, none, 0.0)]], [single], several]
+        family_variants.append([_family_alone(model, axes, size) for size in family.sizes])
+        family_variants.append([_beside(model, axes, causes, size) for size in family.beside])
+    return [[[_family_alone(model, none, 0.0)]], [single], family_variants]
 
 
-def _kinds(groups: Sequence[Sequence[Sequence[_Tried]]]) -> tuple[IntArray, list[int]]:
+def _kinds(groups: Sequence[Sequence[Sequence[_Hypotheses]]]) -> tuple[IntArray, list[int]]:
     """Return the kind of each hypothesis, and the number of kinds in each group."""
     kinds, counts = list[IntArray](), [0] * len(groups)
     for number, group in enumerate(groups):
@@ -285,9 +285,9 @@ def _kinds(groups: Sequence[Sequence[Sequence[_Tried]]]) -> tuple[IntArray, list
 
 
 def _tempered(
-    told: Array, kinds: IntArray, shares: Sequence[float], counts: Sequence[int]
+    log_evidence: Array, kinds: IntArray, shares: Sequence[float], counts: Sequence[int]
 ) -> Array:
-    """Return the weights of hypotheses with log-evidence `told`; the first is "nothing".
+    """Return the weights of hypotheses with log-evidence `log_evidence`; the first is "nothing".
 
     The evidence of sizes within a kind is not tempered. The evidence of kinds is, because the right
     kind may be missing.
@@ -298,11 +298,11 @@ def _tempered(
     masses = zip(shares, counts, strict=True)
     prior = np.concatenate([np.full(n, math.log(share / max(n, 1))) for share, n in masses])
     total = np.full(len(prior), -np.inf)
-    np.logaddexp.at(total, kinds, told)
+    np.logaddexp.at(total, kinds, log_evidence)
     of_kind = total - np.log(np.bincount(kinds))
     excess = float((of_kind + prior).max() - of_kind[0] - prior[0])
     eta = 1.0 if excess <= TEMPER else TEMPER / excess
-    weights = (prior + eta * of_kind - total)[kinds] + told
+    weights = (prior + eta * of_kind - total)[kinds] + log_evidence
     return np.asarray(np.exp(weights - scipy.special.logsumexp(weights)))
 
 
@@ -316,20 +316,20 @@ def averaged_causes(ledger: Ledger, moved: Array, most: Array, std: Array) -> Mi
     sums, noise, spread = ledger.sums, ledger.noise, levels(ledger)
     log_e, size, _ = _tested(sums, noise, spread, np.zeros_like(spread))
     # Causes are tested on innovations from which autocorrelation is removed.
-    rho, left = _left(sums, noise, log_e, size)
-    score, information = _regression(sums, left, rho)
-    none = np.zeros((1, len(std)))
-    told, means, variances = [np.zeros(1)], [none], [none]
-    for asked in AMPLITUDES:
-        prior = np.minimum(asked, most)
+    rho, variances_left = _autocorrelation(sums, noise, log_e, size)
+    score, information = _regression(sums, variances_left, rho)
+    zero = np.zeros((1, len(std)))
+    log_evidence, means, variances = [np.zeros(1)], [zero], [zero]
+    for amplitude in AMPLITUDES:
+        prior = np.minimum(amplitude, most)
         variance = 1.0 / (information + prior**-2.0)
-        told.append(_tested(sums, noise, left, rho, prior)[0].ravel())
+        log_evidence.append(_tested(sums, noise, variances_left, rho, prior)[0].ravel())
         means.append((moved * (score * variance).ravel()).T)
         variances.append((moved**2 * variance.ravel()).T)
     count = moved.shape[1]
     kinds = np.concatenate([[0], np.tile(1 + np.arange(count), len(AMPLITUDES))])
     shares = (NOTHING, 1.0 - NOTHING)
-    weights = _tempered(np.concatenate(told), kinds, shares, (1, count))
+    weights = _tempered(np.concatenate(log_evidence), kinds, shares, (1, count))
     deviations = np.sqrt(std**2 + np.concatenate(variances))
     return Mixture(weights, np.concatenate(means), deviations)
 
@@ -385,8 +385,8 @@ def causes_of(ledger: Ledger) -> CauseEvidence:
     total = float(scipy.special.logsumexp(log_e + weights)) if log_e.size else 0.0
     # Repeat the test with AR(1) errors, and use the smaller e-value: misfit that slow noise
     # explains as well is not evidence for a cause.
-    rho, left = _left(sums, noise, log_e, size)
-    white, _, _ = _tested(sums, noise, left, rho)
+    rho, variance = _autocorrelation(sums, noise, log_e, size)
+    white, _, _ = _tested(sums, noise, variance, rho)
     whitened = float(scipy.special.logsumexp(white + weights)) if white.size else 0.0
     return CauseEvidence(log_e, size, share, total, min(total, whitened), rho[0])
 
@@ -421,8 +421,8 @@ def unsuspicious(log_e: Array) -> bool:
     """Return whether no window has evidence against the model; log_e: (windows, directions)."""
     if not log_e.size:
         return True
-    each = scipy.special.logsumexp(log_e, axis=1) - np.log(log_e.shape[1])
-    return bool((each < -np.log(CAUSES)).all())
+    window_log_e = scipy.special.logsumexp(log_e, axis=1) - np.log(log_e.shape[1])
+    return bool((window_log_e < -np.log(CAUSES)).all())
 
 
 def _tested(
@@ -440,8 +440,8 @@ def _tested(
     total = count.sum(axis=1)[:, None]
     # Bayes factor of theta ~ N(0, s^2) under Student's t: the noise level is integrated out.
     k = 1.0 / (1.0 + prior**2 * den)
-    gained = np.minimum(prior**2 * num**2 * k / (NU + rss), 1.0 - 1e-12)
-    log_e = 0.5 * np.log(k) - 0.5 * (NU + total) * np.log1p(-gained)
+    explained = np.minimum(prior**2 * num**2 * k / (NU + rss), 1.0 - 1e-12)
+    log_e = 0.5 * np.log(k) - 0.5 * (NU + total) * np.log1p(-explained)
     log_e = np.where(np.isfinite(log_e), log_e, 0.0)
     size = num / np.where(den > 0.0, den, np.inf)
     # Misfit beyond the noise, bounded below so that no share exceeds one.
@@ -456,26 +456,26 @@ def _regression(sums: Array, spread: Array, rho: Array) -> tuple[Array, Array]:
     Generalised least squares with AR(1) errors, from sums of products at lags 0 and 1.
     """
     num, den, cross, lagged = sums
-    now, before = ((1.0 + rho**2) / spread)[:, None], (rho / spread)[:, None]
-    score = (num * now - cross * before).sum(axis=2)
-    return score, np.maximum((den * now - 2.0 * lagged * before).sum(axis=2), 0.0)
+    diagonal, off_diagonal = ((1.0 + rho**2) / spread)[:, None], (rho / spread)[:, None]
+    score = (num * diagonal - cross * off_diagonal).sum(axis=2)
+    return score, np.maximum((den * diagonal - 2.0 * lagged * off_diagonal).sum(axis=2), 0.0)
 
 
-def _left(sums: Array, noise: Array, log_e: Array, size: Array) -> tuple[Array, Array]:
+def _autocorrelation(sums: Array, noise: Array, log_e: Array, size: Array) -> tuple[Array, Array]:
     """Return autocorrelation and variance after the fit of each window's best direction."""
     _, _, squares, products, pairs = noise
     count = noise[0]
     if log_e.size:
-        rows, best = np.arange(len(log_e)), log_e.argmax(axis=1)
-        theta = size[rows, best][:, None]
-        num, den, cross, lagged = (part[rows, best] for part in sums)
+        rows, direction = np.arange(len(log_e)), log_e.argmax(axis=1)
+        theta = size[rows, direction][:, None]
+        num, den, cross, lagged = (part[rows, direction] for part in sums)
         # Sums of squares of r - theta g, and of its products at lag 1.
         squares = np.maximum(squares - 2.0 * theta * num + theta**2 * den, 0.0)
         products = products - theta * cross + theta**2 * lagged
     rho = (products / np.maximum(squares, 1e-300)) * pairs / (pairs + NU)
     rho = np.clip(rho, 0.0, MOST_CORRELATED)
-    white = (1.0 + rho**2) * squares - 2.0 * rho * products
-    return rho, (np.maximum(white, 0.0) + NU) / (count + NU)
+    whitened = (1.0 + rho**2) * squares - 2.0 * rho * products
+    return rho, (np.maximum(whitened, 0.0) + NU) / (count + NU)
 
 
 def _weights(ledger: Ledger, directions: int) -> Array:
@@ -502,7 +502,7 @@ class Constancy:
     change: Array  # change of the unknowns, in prior standard deviations, (k,)
 
 
-def _record(ledger: Ledger, wider: float) -> tuple[Array, Array]:
+def _whitened_record(ledger: Ledger, wider: float) -> tuple[Array, Array]:
     """Return score, (blocks, sensors, k), and information, in units of the estimated noise."""
     spread = levels(ledger)[0] * wider
     score = ledger.score / spread[:, None]
@@ -512,9 +512,9 @@ def _record(ledger: Ledger, wider: float) -> tuple[Array, Array]:
 def _inverse(F: Array) -> tuple[Array, int]:
     """Return the pseudo-inverse of an information matrix, and its rank."""
     values, axes = np.linalg.eigh(F)
-    told = values > LEAST_SHARE * max(float(values[-1]), 1.0)
-    inverse = (axes[:, told] / values[told]) @ axes[:, told].T
-    return inverse, int(told.sum())
+    determined = values > LEAST_SHARE * max(float(values[-1]), 1.0)
+    inverse = (axes[:, determined] / values[determined]) @ axes[:, determined].T
+    return inverse, int(determined.sum())
 
 
 def constancy(ledger: Ledger, wider: float = 1.0) -> Constancy | None:
@@ -522,35 +522,35 @@ def constancy(ledger: Ledger, wider: float = 1.0) -> Constancy | None:
 
     `wider`: variance of a mean of the errors over that of a mean of independent errors.
     """
-    score, information = (part.sum(axis=1) for part in _record(ledger, wider))
+    score, information = (part.sum(axis=1) for part in _whitened_record(ledger, wider))
     k = score.shape[1]
     # Candidate changes are between the blocks of the record, which have equal lengths.
-    used = int(ledger.seen - 1) // int(ledger.length) + 1
-    if not k or used < 4:
+    blocks = int(ledger.seen - 1) // int(ledger.length) + 1
+    if not k or blocks < 4:
         return None
     F, B = information.cumsum(axis=0), score.cumsum(axis=0)
     inverse, rank = _inverse(F[-1])
     if not rank:
         return None
-    best, at, change, looks = -1.0, 0, np.zeros(k), 0
-    for j in range(min(used, BLOCKS) - 1):
+    best, place, change, candidates = -1.0, 0, np.zeros(k), 0
+    for j in range(min(blocks, BLOCKS) - 1):
         # Near the ends of the record, one side has too little information to detect a change.
-        before = float(np.trace(inverse @ F[j])) / rank
-        if not LEAST < before < 1.0 - LEAST:
+        share = float(np.trace(inverse @ F[j])) / rank
+        if not LEAST < share < 1.0 - LEAST:
             continue
-        looks += 1
+        candidates += 1
         # Score of the first part at the estimate from all blocks: zero mean without a change.
-        c = B[j] - F[j] @ inverse @ B[-1]
+        shifted_score = B[j] - F[j] @ inverse @ B[-1]
         A, _ = _inverse(F[j] - F[j] @ inverse @ F[j])
-        statistic = float(c @ A @ c)
+        statistic = float(shifted_score @ A @ shifted_score)
         if statistic > best:
             # A step d after the change leaves the score c = -(F_j - F_j F^-1 F_j) d.
-            best, at, change = statistic, j, -A @ c
-    if not looks:
+            best, place, change = statistic, j, -A @ shifted_score
+    if not candidates:
         return None
     # Bonferroni bound over the candidate changes.
-    p = min(1.0, looks * chance(best, rank))
-    after = (at + 1) * int(ledger.length) / int(ledger.seen)
+    p = min(1.0, candidates * chance(best, rank))
+    after = (place + 1) * int(ledger.length) / int(ledger.seen)
     return Constancy(p, min(after, 1.0), change)
 
 
@@ -561,19 +561,19 @@ def disagreement(ledger: Ledger, wider: float = 1.0) -> tuple[float, Array] | No
     estimates from single sensors (Cochran 1954). It is chi-square under the model. None if there is
     no record, or if no unknown is determined by two sensors.
     """
-    score, information = (part.sum(axis=0) for part in _record(ledger, wider))
+    score, information = (part.sum(axis=0) for part in _whitened_record(ledger, wider))
     sensors, k = score.shape
     if sensors < 2 or not k:
         return None
     inverse, rank = _inverse(information.sum(axis=0))
-    each, freedom = np.zeros(sensors), -rank
+    statistics, freedom = np.zeros(sensors), -rank
     for i in range(sensors):
-        own, told = _inverse(information[i])
+        inverse_of_sensor, rank_of_sensor = _inverse(information[i])
         # Score of a sensor at the estimate from all sensors.
-        left = score[i] - information[i] @ inverse @ score.sum(axis=0)
-        each[i] = left @ own @ left
-        freedom += told
+        shifted_score = score[i] - information[i] @ inverse @ score.sum(axis=0)
+        statistics[i] = shifted_score @ inverse_of_sensor @ shifted_score
+        freedom += rank_of_sensor
     if freedom < 1:
         return None
-    total = float(each.sum())
-    return chance(total, freedom), each / max(total, 1e-300)
+    total = float(statistics.sum())
+    return chance(total, freedom), statistics / max(total, 1e-300)

@@ -148,34 +148,34 @@ class Finding:
         """The finding with its causes, consequence and remedy, in plain English."""
         parts = [self.text]
         if self.causes:
-            parts += self._likely()
-        moved = [(name, size) for name, size in self.shift.items() if abs(size) >= 0.5]
-        if moved:
-            each = [f"{name} by {size:+.1f}" for name, size in moved[:3]]
-            parts.append(f"Correcting this would shift {', '.join(each)} standard deviations.")
+            parts += self._cause_sentences()
+        shifts = [(name, size) for name, size in self.shift.items() if abs(size) >= 0.5]
+        if shifts:
+            phrases = [f"{name} by {size:+.1f}" for name, size in shifts[:3]]
+            parts.append(f"Correcting this would shift {', '.join(phrases)} standard deviations.")
         remedy = self.remedy or (self.causes[0].remedy if self.causes else "")
         if remedy:
             parts.append(remedy)
         return " ".join(parts)
 
-    def _likely(self) -> list[str]:
+    def _cause_sentences(self) -> list[str]:
         """Return sentences on the likely causes; candidates if none explains half of the misfit."""
         first, *others = self.causes
         if first.share < HALF:
-            each = [f"{one.text}{_shown(one.share)}" for one in self.causes[:CANDIDATES]]
-            return [f"No single cause explains this. Candidates: {'; '.join(each)}."]
+            candidates = [f"{one.text}{_share(one.share)}" for one in self.causes[:CANDIDATES]]
+            return [f"No single cause explains this. Candidates: {'; '.join(candidates)}."]
         text = first.text
         if not text.startswith(first.subject or " "):
             text = text[:1].upper() + text[1:]
-        found = [f"{text}{_shown(first.share, 'explains {}')}."]
-        found += [f"Alternatively, {one.text}{_shown(one.share)}." for one in others[:1]]
-        return found
+        sentences = [f"{text}{_share(first.share, 'explains {}')}."]
+        sentences += [f"Alternatively, {one.text}{_share(one.share)}." for one in others[:1]]
+        return sentences
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> Finding:
-        own = {name: value for name, value in stored.items() if name != "sentence"}
-        causes = tuple(map(Cause.from_dict, own["causes"]))
-        return cls(**{**own, "causes": causes, "evidence": _number(own["evidence"])})
+        fields = {name: value for name, value in stored.items() if name != "sentence"}
+        causes = tuple(map(Cause.from_dict, fields["causes"]))
+        return cls(**{**fields, "causes": causes, "evidence": _number(fields["evidence"])})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the finding as a dictionary for JSON."""
@@ -186,7 +186,7 @@ class Finding:
         return {**vars(self), **changed, "sentence": self.sentence}
 
 
-def _shown(share: float, words: str = "{}") -> str:
+def _share(share: float, words: str = "{}") -> str:
     """Return a share in parentheses; empty if not known."""
     return "" if math.isnan(share) else f" ({words.format(percent(share))})"
 
@@ -225,31 +225,31 @@ def flat(label: str, left: float) -> Finding:
 
 def _after_misfit(findings: Iterable[Finding]) -> list[Finding]:
     """Return findings; a severe misfit becomes the reason for intervals of flat unknowns."""
-    given = list(findings)
-    if not any((one.what, one.severity) == ("misfit", "do not trust") for one in given):
-        return given
-    found = []
-    for one in given:
-        if one.what == "flat":
+    findings_list = list(findings)
+    if not any((item.what, item.severity) == ("misfit", "do not trust") for item in findings_list):
+        return findings_list
+    reworded = []
+    for item in findings_list:
+        if item.what == "flat":
             text, remedy = FINDINGS["flat, misfit"].filled(
-                label=one.subject, left=percent(one.evidence)
+                label=item.subject, left=percent(item.evidence)
             )
-            one = replace(one, text=text, remedy=remedy)
-        found.append(one)
-    return found
+            item = replace(item, text=text, remedy=remedy)
+        reworded.append(item)
+    return reworded
 
 
 def _ranked(findings: Iterable[Finding], errors: ModelErrors) -> list[Finding]:
     """Return findings with severities from misfit and effect, led by the finding "effect"."""
-    given = [finding for finding in findings if finding.what != "effect"]
-    doubted = any(finding.what in DOUBTS for finding in given)
+    others = [finding for finding in findings if finding.what != "effect"]
+    doubted = any(finding.what in DOUBTS for finding in others)
     level = errors.level(doubted=doubted)
     severity = NAMES[level]
     ranked = [
-        replace(one, severity=severity)
-        if one.what in RANKED and one.severity != "note" and not _gross(one)
-        else one
-        for one in given
+        replace(item, severity=severity)
+        if item.what in RANKED and item.severity != "note" and not _gross(item)
+        else item
+        for item in others
     ]
     text = errors.sentence(doubted=doubted)
     effect = Finding("effect", severity, text, evidence=errors.effect, remedy=errors.remedy)
@@ -266,20 +266,20 @@ def _graver(finding: Finding) -> Finding:
     return replace(finding, severity="do not trust") if _gross(finding) else finding
 
 
-def _merged(causes: Sequence[Cause], known: Sequence[Cause]) -> tuple[Cause, ...]:
+def _merged_causes(causes: Sequence[Cause], known: Sequence[Cause]) -> tuple[Cause, ...]:
     """Return fitted causes and the known causes of a run, sorted by their shares."""
-    before = {(one.kind, one.subject): one for one in known}
+    known_by_key = {(one.kind, one.subject): one for one in known}
     # A fitted cause without a setting adopts remedy and setting of the known cause. A setting that
     # corrects a column depends on the fitted size, so it is kept.
     causes = [
-        replace(one, remedy=named.remedy, setting=named.setting)
-        if not one.setting and (named := before.get((one.kind, one.subject)))
+        replace(one, remedy=match.remedy, setting=match.setting)
+        if not one.setting and (match := known_by_key.get((one.kind, one.subject)))
         else one
         for one in causes
     ]
     # An offset or a gain of an input is the same cause as its boundary value or channel.
-    said = {(kind, one.subject) for one in causes for kind in (one.kind, "boundary", "channel")}
-    others = [one for one in known if (one.kind, one.subject) not in said]
+    covered = {(kind, one.subject) for one in causes for kind in (one.kind, "boundary", "channel")}
+    others = [one for one in known if (one.kind, one.subject) not in covered]
     # The sort is stable: at equal shares, fitted causes precede causes from the linear model.
     return tuple(sorted([*causes, *others], key=lambda one: -one.share)[:NAMED])
 
@@ -364,8 +364,8 @@ class Verdict:
         """
         texts = {finding.text for finding in self.findings}
         new = [finding for finding in more if finding.text not in texts]
-        later = {(one.what, one.subject) for one in new if one.subject or one.what in ONCE}
-        kept = [one for one in self.findings if (one.what, one.subject) not in later]
+        replaced = {(item.what, item.subject) for item in new if item.subject or item.what in ONCE}
+        kept = [item for item in self.findings if (item.what, item.subject) not in replaced]
         return self._with(findings=[*kept, *new])
 
     def with_errors(self, errors: ModelErrors) -> Verdict:
@@ -377,8 +377,8 @@ class Verdict:
         return self._with(untested=(*self.untested, untested))
 
     def _with(self, **parts: Any) -> Verdict:
-        own = {name: value for name, value in vars(self).items() if name != "level"}
-        return Verdict.of(**(own | parts))
+        fields = {name: value for name, value in vars(self).items() if name != "level"}
+        return Verdict.of(**(fields | parts))
 
     def with_causes(self, causes: Sequence[Cause]) -> Verdict:
         """Return the verdict with fitted causes of its misfit, the likeliest first.
@@ -390,20 +390,20 @@ class Verdict:
             if not causes or not causes[0].share >= HALF:
                 return self
             text, _ = FINDINGS["misfit, columns"]
-            found = Finding("misfit", "caution", text, causes[0].subject, causes=tuple(causes))
-            return self.with_findings([_graver(found)])
-        ranked = _merged(causes, misfit.causes)
+            added = Finding("misfit", "caution", text, causes[0].subject, causes=tuple(causes))
+            return self.with_findings([_graver(added)])
+        ranked = _merged_causes(causes, misfit.causes)
         first = (*misfit.causes, *ranked)[0]
         same = (ranked[0].kind, ranked[0].subject) == (first.kind, first.subject)
         shift = misfit.shift if same else {}
-        better = _graver(replace(misfit, subject=ranked[0].subject, causes=ranked, shift=shift))
-        return self._with(findings=[better, *(one for one in self.findings if one is not misfit)])
+        updated = _graver(replace(misfit, subject=ranked[0].subject, causes=ranked, shift=shift))
+        return self._with(findings=[updated, *(one for one in self.findings if one is not misfit)])
 
     @property
     def every_sentence(self) -> list[str]:
         """A sentence if the run is not judged, and one for each finding, the worst first."""
-        why = f" ({self.untested[0]})" if self.untested else ""
-        first = [] if self.judged else [f"Not judged: the model was not tested{why}."]
+        reason = f" ({self.untested[0]})" if self.untested else ""
+        first = [] if self.judged else [f"Not judged: the model was not tested{reason}."]
         return list(dict.fromkeys([*first, *(finding.sentence for finding in self.findings)]))
 
     @property
@@ -439,7 +439,7 @@ class Shifts(Generic[Number]):
 
     def by(self, kind: str) -> dict[str, Number]:
         """Return label -> shift due to one kind of error."""
-        return {label: shift for (label, of), shift in self.unknowns.items() if of == kind}
+        return {label: shift for (label, cause), shift in self.unknowns.items() if cause == kind}
 
     def named(self) -> dict[str, Number]:
         """Return column name in tables and files -> number, which may be NaN."""
@@ -468,23 +468,23 @@ def discretised(shifts: Shifts[float]) -> Iterator[Finding]:
     sizes = {kind: abs(shifts.sizes[kind]) for kind in REFINE if kind in shifts.sizes}
     if not total > SHIFTED or not sizes:
         return
-    parts = _named(sizes)
-    each = [f"{REFINE[kind][0]} by {sizes[kind]:.1f}{_listed(shifts.by(kind))}" for kind in parts]
-    text, _ = FINDINGS["discretisation"].filled(total=total, each=", ".join(each))
+    parts = _main_kinds(sizes)
+    texts = [f"{REFINE[kind][0]} by {sizes[kind]:.1f}{_listed(shifts.by(kind))}" for kind in parts]
+    text, _ = FINDINGS["discretisation"].filled(total=total, each=", ".join(texts))
     remedy = " ".join(REFINE[kind][1] for kind in parts)
     # The reported variance includes the shifts. Beyond `DECIDES` deviations, the interval depends
     # more on the mesh and the step than on the data.
-    unsure = total > DECIDES or sizes.get("input", 0.0) > GUESSED
-    severity: Severity = "caution" if unsure else "note"
+    dominant = total > DECIDES or sizes.get("input", 0.0) > GUESSED
+    severity: Severity = "caution" if dominant else "note"
     yield Finding("discretisation", severity, text, evidence=total, remedy=remedy)
 
 
-def _named(sizes: Mapping[str, float]) -> list[str]:
+def _main_kinds(sizes: Mapping[str, float]) -> list[str]:
     """Return the kinds of shifts of at least `SHARED`, but at least one, the largest first."""
     # All kinds may be below `SHARED`, because the total adds them.
-    least = min(max(sizes.values()), SHARED)
+    threshold = min(max(sizes.values()), SHARED)
     kinds = sorted(sizes, key=sizes.__getitem__, reverse=True)
-    return [kind for kind in kinds if sizes[kind] >= least]
+    return [kind for kind in kinds if sizes[kind] >= threshold]
 
 
 def held_inputs(shifts: Shifts[float]) -> Iterator[Finding]:

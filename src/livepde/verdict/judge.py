@@ -104,8 +104,8 @@ class Judge:
             "C": unknowns**2 if self.recorded else 0,
         }
         ends = np.cumsum(list(sizes.values())).tolist()
-        each = zip(sizes.items(), ends, strict=True)
-        self._at = {name: slice(end - size, end) for (name, size), end in each}
+        layout = zip(sizes.items(), ends, strict=True)
+        self._at = {name: slice(end - size, end) for (name, size), end in layout}
         self.numbers = int(ends[-1])
         self.batch = batch_of(self.numbers)
         self._eye = np.eye(rank)[None]
@@ -134,9 +134,9 @@ class Judge:
         rows[np.arange(members), waiting] = self._row(sample, M)
         # The update of this sample will multiply M by W^T, and predictions by their maps of the
         # rows of [U C].
-        one = self._eye[:, :r]
+        identity = self._eye[:, :r]
         after = changed(ledger, seen=ledger.seen + 1, waiting=ledger.waiting + 1, rows=rows)
-        return one if members == 1 else np.repeat(one, members, axis=0), after
+        return identity if members == 1 else np.repeat(identity, members, axis=0), after
 
     def _row(self, sample: ScoredSample, M: Array) -> Array:
         """Return the numbers of a sample, (members, numbers)."""
@@ -145,10 +145,10 @@ class Judge:
         row[:, 0] = sample.at.t
         for name in ("used", "d", "noise", "z", "predicted"):
             row[:, at[name]] = getattr(sample, name)
-        for name, part in (("Y", sample.Y), ("M", M)):
+        for name, matrix in (("Y", sample.Y), ("M", M)):
             start, stop = at[name].start, at[name].stop
-            row[:, start : start + part[0].size] = part.reshape(members, -1)
-            row[:, start + part[0].size : stop] = 0.0  # if the square root has fewer rows
+            row[:, start : start + matrix[0].size] = matrix.reshape(members, -1)
+            row[:, start + matrix[0].size : stop] = 0.0  # if the square root has fewer rows
         if self.dictionary.axes:
             row[:, at["moved"]] = self.dictionary.moved(sample.u)
         if self.terms:  # interpolated later for the whole batch
@@ -168,46 +168,46 @@ class Judge:
         members, at, due = len(ledger.seen), self._at, ledger.due
         # Sum only as many rows as any member has.
         batch = max(int(ledger.waiting.max(initial=0)), 1)
-        rows, there = ledger.rows[:, :batch], np.arange(batch) < ledger.waiting[:, None]
-        ledger = self._with_interval(ledger, rows, there)
-        used = rows[:, :, at["used"]] * there[:, :, None]
+        rows, present = ledger.rows[:, :batch], np.arange(batch) < ledger.waiting[:, None]
+        ledger = self._with_interval(ledger, rows, present)
+        used = rows[:, :, at["used"]] * present[:, :, None]
         Y = rows[:, :, at["Y"]].reshape(members, batch, self.rank, self.sensors)
         f, growth = self._effects(ledger, rows, used, due)
-        before, w = self._coordinates(ledger, rows, there, _in_windows(Y @ f, growth))
+        before, w = self._coordinates(ledger, rows, present, _in_windows(Y @ f, growth))
         # Stack innovations and g before whitening: (members, batch, sensors, 1 + columns).
         d = rows[:, :, at["d"], None]
-        found = np.concatenate([d, _in_windows(f, growth) + Y.swapaxes(-1, -2) @ before], axis=-1)
+        stacked = np.concatenate([d, _in_windows(f, growth) + Y.swapaxes(-1, -2) @ before], axis=-1)
         # T = (1 + Y^T Y)^(-1/2) = 1 + X scale X^T whitens the innovations of a sample.
         X, scale = _whitening(Y)
-        found += X @ (scale * (X.swapaxes(-1, -2) @ found))
+        stacked += X @ (scale * (X.swapaxes(-1, -2) @ stacked))
         # A single outlier must not be evidence for a cause (Huber's loss).
-        found[..., 0] = ledger.clipped(found[..., 0])
-        if not there.all():
-            found *= there[:, :, None, None]
+        stacked[..., 0] = ledger.clipped(stacked[..., 0])
+        if not present.all():
+            stacked *= present[:, :, None, None]
         # Sums over the waiting samples, in windows that continue or begin with them.
-        parts: dict[str, Any] = summed(ledger, due, found, used)
+        updates: dict[str, Any] = summed(ledger, due, stacked, used)
         # The record uses raw residuals about the prior mean, d + Y^T a. Its scores do not depend on
         # the current estimate, so blocks of different times can be added.
         if self.recorded:
-            parts |= blocked(ledger, *self._record(rows, Y[:, :, : self.unknowns], used))
+            updates |= blocked(ledger, *self._record(rows, Y[:, :, : self.unknowns], used))
         z, last = rows[:, :, at["z"]], rows[np.arange(members), np.maximum(ledger.waiting - 1, 0)]
-        some = ledger.waiting[:, None] > 0
-        shown = np.isfinite(z) & there[:, :, None]
+        has_samples = ledger.waiting[:, None] > 0
+        shown = np.isfinite(z) & present[:, :, None]
         refused = shown & ~(used > 0.0)
         times = np.concatenate([last[:, at["t"]], ledger.times[:, 1:]], axis=1)
-        parts |= self._stuck(ledger, np.where(shown, z, np.nan)) | {
+        updates |= self._stuck(ledger, np.where(shown, z, np.nan)) | {
             "sound": _sound(ledger, due),
             "shown": ledger.shown + np.stack([shown.sum(axis=1), refused.sum(axis=1)], axis=1),
             "waiting": np.zeros_like(ledger.waiting),
             "age": np.where(due, 0, ledger.age) + ledger.waiting[:, None],
             "epoch": ledger.epoch + (due & (ledger.age > 0)),
-            "last": np.where(some, last[:, at["predicted"]], ledger.last),
-            "times": np.where(some, times, ledger.times),
+            "last": np.where(has_samples, last[:, at["predicted"]], ledger.last),
+            "times": np.where(has_samples, times, ledger.times),
         }
-        return M @ w, changed(ledger, **parts)
+        return M @ w, changed(ledger, **updates)
 
     def _coordinates(
-        self, ledger: Ledger, rows: Array, there: Mask, effect: Array
+        self, ledger: Ledger, rows: Array, present: Mask, effect: Array
     ) -> tuple[Array, Array]:
         """Return w before the update of each waiting sample, and w - Y f of the last sample.
 
@@ -215,11 +215,11 @@ class Judge:
         sample keep their w.
         """
         M = rows[:, :, self._at["M"]].reshape(*rows.shape[:2], self.rank, self.rank)
-        before, w, whole = np.empty_like(effect), ledger.w, bool(there.all())
+        before, w, complete = np.empty_like(effect), ledger.w, bool(present.all())
         for k in range(effect.shape[1]):
             np.matmul(M[:, k], w, out=before[:, k])
             after = before[:, k] - effect[:, k]
-            w = after if whole else np.where(there[:, k, None, None], after, w)
+            w = after if complete else np.where(present[:, k, None, None], after, w)
         return before, w
 
     def _record(self, rows: Array, Y: Array, used: Array) -> tuple[Array, Array]:
@@ -229,18 +229,18 @@ class Judge:
         """
         at, k = self._at, self.unknowns
         Y = _sensitivity(rows[:, :, at["C"]].reshape(*rows.shape[:2], k, k), Y)
-        told: Array = rows[:, :, at["d"]] + (rows[:, :, None, at["a"]] @ Y)[:, :, 0]
-        return Y * used[:, :, None], told * used
+        residuals: Array = rows[:, :, at["d"]] + (rows[:, :, None, at["a"]] @ Y)[:, :, 0]
+        return Y * used[:, :, None], residuals * used
 
-    def _with_interval(self, ledger: Ledger, rows: Array, there: Mask) -> Ledger:
+    def _with_interval(self, ledger: Ledger, rows: Array, present: Mask) -> Ledger:
         """Return the ledger with its first interval, as the usual one, and first predictions."""
         if np.isfinite(ledger.times[:, 1]).all() and np.isfinite(ledger.first).all():
             return ledger
         times = np.concatenate([ledger.times[:, :1], rows[:, :, 0]], axis=1)
-        steps = np.where(there, np.diff(times, axis=1), np.nan)
+        steps = np.where(present, np.diff(times, axis=1), np.nan)
         steps = np.concatenate([ledger.times[:, 1:], steps], axis=1)
-        known = np.isfinite(steps).argmax(axis=1)[:, None]
-        unit = np.take_along_axis(steps, known, axis=1)
+        first_known = np.isfinite(steps).argmax(axis=1)[:, None]
+        unit = np.take_along_axis(steps, first_known, axis=1)
         predicted = rows[:, 0, self._at["predicted"]]
         first = np.where(np.isfinite(ledger.first), ledger.first, predicted)
         return changed(ledger, times=np.concatenate([times[:, :1], unit], axis=1), first=first)
@@ -258,8 +258,8 @@ class Judge:
         value = np.take_along_axis(z, latest, axis=1)  # latest finite value
         same = np.abs(z[:, 1:] - value[:, :-1]) <= SAME * np.abs(z[:, 1:])
         changes = np.where(seen[:, 1:] & ~same, order[1:], 0).max(axis=1)
-        since = (seen[:, 1:] & (order[1:] > changes[:, None])).sum(axis=1)
-        stuck = np.where(changes > 0, 0, ledger.stuck) + since
+        repetitions = (seen[:, 1:] & (order[1:] > changes[:, None])).sum(axis=1)
+        stuck = np.where(changes > 0, 0, ledger.stuck) + repetitions
         return {"stuck": stuck, "value": value[:, -1]}
 
     def _begin_batch(self, ledger: Ledger, sample: ScoredSample) -> tuple[Array, Ledger]:
@@ -269,15 +269,15 @@ class Judge:
         members, r, _ = sample.M.shape
         w = np.zeros((members, r, ledger.w.shape[2]))
         if full.any():
-            found, settled = self.summed_up(ledger, sample.M)
-            w[full] = found[full]
-            ledger = where(full, settled, ledger)
+            w_full, summed_ledger = self.summed_up(ledger, sample.M)
+            w[full] = w_full[full]
+            ledger = where(full, summed_ledger, ledger)
         w = self._begin_windows(ledger, sample, ledger.due & begins[:, None], w)
-        kept = np.zeros_like(ledger.w)
-        kept[:, :r] = w[:, : self.rank]
-        chosen = begins[:, None, None]
-        M = np.where(chosen, self._eye[:, :r], sample.M)
-        return M, changed(ledger, w=np.where(chosen, kept, ledger.w))
+        padded = np.zeros_like(ledger.w)
+        padded[:, :r] = w[:, : self.rank]
+        mask = begins[:, None, None]
+        M = np.where(mask, self._eye[:, :r], sample.M)
+        return M, changed(ledger, w=np.where(mask, padded, ledger.w))
 
     def _begin_windows(self, ledger: Ledger, sample: ScoredSample, due: Mask, w: Array) -> Array:
         """Return w with initial values in windows that begin: zero except for jumps."""
@@ -293,9 +293,9 @@ class Judge:
             # ... but a jump of an unknown is an initial shift C^T w = e of the estimate.
             units = JUMP * np.eye(sample.C.shape[2])[:, jumps]
             for k in np.flatnonzero(due[:, 1:].any(axis=1)).tolist():
-                moved = np.linalg.lstsq(sample.C[k].T, units, rcond=None)[0]
+                shift = np.linalg.lstsq(sample.C[k].T, units, rcond=None)[0]
                 for window in (1 + np.flatnonzero(due[k, 1:])).tolist():
-                    w[k, :, window, self._jump] = moved
+                    w[k, :, window, self._jump] = shift
         return w.reshape(members, r, -1)
 
     def _effects(self, ledger: Ledger, rows: Array, used: Array, due: Mask) -> tuple[Array, Array]:
@@ -324,9 +324,9 @@ class Judge:
     def _answers(self, ledger: Ledger) -> Array:
         """Return readings due to missing terms at waiting samples, (members, batch, numbers)."""
         known = ledger.rows[:, :, self._at["answers"]]
-        since = (ledger.rows[:, :, 0] - ledger.reached[:, :1])[:, :, None]
-        low, slope = ledger.readings.reshape(len(known), 2, 1, -1).swapaxes(0, 1)
-        return np.where(np.isnan(known), low + since * slope, known)
+        elapsed = (ledger.rows[:, :, 0] - ledger.reached[:, :1])[:, :, None]
+        start, slope = ledger.readings.reshape(len(known), 2, 1, -1).swapaxes(0, 1)
+        return np.where(np.isnan(known), start + elapsed * slope, known)
 
     def _extend_answers(self, ledger: Ledger, sample: ScoredSample) -> Ledger:
         """Return the ledger with responses of the process that extend to the time of a sample.
@@ -343,12 +343,12 @@ class Judge:
         for k in np.flatnonzero(~_reached(ledger, t)).tolist():
             # The mean of the first predictions approximates the equilibrium state without loss.
             first = ledger.first[k, np.isfinite(ledger.first[k])]
-            rest = float(first.sum()) / max(len(first), 1)
+            equilibrium = float(first.sum()) / max(len(first), 1)
             # The usual interval, or else the time since the first sample.
-            unit, since = float(ledger.times[k, 1]), t - float(ledger.rows[k, 0, 0])
+            unit, elapsed = float(ledger.times[k, 1]), t - float(ledger.rows[k, 0, 0])
             if not np.isfinite(unit):
-                unit = since if since > 0.0 else 1.0
-            now = Now(sample.u[k], q[k], sample.at.member(k), unit, rest)
+                unit = elapsed if elapsed > 0.0 else 1.0
+            now = Now(sample.u[k], q[k], sample.at.member(k), unit, equilibrium)
             if not np.isfinite(reached[k, 1]):
                 p[k] = process.start()
                 readings[k] = process.readings(p[k], now), np.zeros_like(readings[k, 1])
@@ -357,8 +357,8 @@ class Judge:
             begin = float(reached[k, 1])
             h = max(stride(int(ledger.seen[k])) * unit, t - begin)
             p[k] = process.advance(p[k], now, h)
-            low = readings[k, 0] + (begin - reached[k, 0]) * readings[k, 1]
-            readings[k] = low, (process.readings(p[k], now) - low) / h
+            start = readings[k, 0] + (begin - reached[k, 0]) * readings[k, 1]
+            readings[k] = start, (process.readings(p[k], now) - start) / h
             reached[k] = begin, begin + h
         return changed(ledger, rows=rows, process=p, readings=readings, reached=reached)
 
@@ -376,13 +376,13 @@ def _in_windows(effect: Array, growth: Array) -> Array:
 
 def _sound(ledger: Ledger, due: Mask) -> Mask:
     """Return whether the longest window was free of evidence when it last ended."""
-    ends = due[:, -1] & (ledger.age[:, -1] > 0)
-    if not ends.any():
+    ending = due[:, -1] & (ledger.age[:, -1] > 0)
+    if not ending.any():
         return ledger.sound
     sound = ledger.sound.copy()
-    for k in np.flatnonzero(ends).tolist():
-        one = ledger.of_member(k)
-        sound[k] = quiet(one, causes_of(one).log_e)
+    for k in np.flatnonzero(ending).tolist():
+        member = ledger.of_member(k)
+        sound[k] = quiet(member, causes_of(member).log_e)
     return sound
 
 

@@ -113,15 +113,15 @@ class Ledger:
         `rank`, `batch`, `numbers`: rows of the square root, samples that are summed together, and
         numbers per sample.
         """
-        never, zero = np.full((1, sensors), np.nan), np.zeros(1, dtype=np.int64)
+        no_value, zero = np.full((1, sensors), np.nan), np.zeros(1, dtype=np.int64)
         return cls(
             seen=zero,
             waiting=zero,
             rows=np.zeros((1, batch, numbers)),
             w=np.zeros((1, rank, windows * directions)),
             times=np.full((1, 2), np.nan),
-            first=never,
-            last=never,
+            first=no_value,
+            last=no_value,
             age=np.zeros((1, windows), dtype=np.int64),
             epoch=np.zeros((1, windows), dtype=np.int64),
             sums=np.zeros((1, 4, windows, directions, sensors)),
@@ -137,7 +137,7 @@ class Ledger:
             sound=np.zeros(1, dtype=bool),
             shown=np.zeros((1, 2, sensors), dtype=np.int64),
             stuck=np.zeros((1, sensors), dtype=np.int64),
-            value=never,
+            value=no_value,
         )
 
     def of_member(self, k: int) -> Ledger:
@@ -187,8 +187,8 @@ def summed(old: Ledger, due: Mask, whitened: Array, used: Array) -> dict[str, Ar
     row = np.concatenate([before.swapaxes(1, 2)[:, None], whitened], axis=1)
     present = np.concatenate([old.present[:, None], used], axis=1)
     # Row of the latest value of each sensor: sensors may have values in different samples.
-    place = np.arange(row.shape[1])[:, None]
-    newest = np.maximum.accumulate(np.where(present > 0.0, place, 0), axis=1)
+    index = np.arange(row.shape[1])[:, None]
+    newest = np.maximum.accumulate(np.where(present > 0.0, index, 0), axis=1)
     now, earlier = row[:, 1:], row[:, :-1]
     if not (present > 0.0).all():
         earlier = np.take_along_axis(row, newest[:, :-1, :, None], axis=1)
@@ -196,18 +196,18 @@ def summed(old: Ledger, due: Mask, whitened: Array, used: Array) -> dict[str, Ar
     # Weights of g in the sums of g_k r_k and of g_k r_(k-1) + g_(k-1) r_k.
     weights = np.zeros((2, *row.shape[:3]))
     weights[0, :, 1:], weights[1, :, 1:] = now[..., 0], earlier[..., 0]
-    each = np.arange(members)[:, None, None], newest[:, :-1], np.arange(sensors)
-    np.add.at(weights[1], each, now[..., 0])
+    indices = np.arange(members)[:, None, None], newest[:, :-1], np.arange(sensors)
+    np.add.at(weights[1], indices, now[..., 0])
     crossed = weights.transpose(1, 3, 0, 2) @ row.swapaxes(1, 2)  # (members, sensors, 2, columns)
     squares = np.einsum("mbsc,mbsc->msc", now, now)
     lagged = np.einsum("mbsc,mbsc->msc", now, earlier)
-    found = np.stack([crossed[:, :, 0], squares, crossed[:, :, 1], lagged], axis=1)
-    sums = found[..., 1:].reshape(members, 4, sensors, windows, directions)
+    stacked = np.stack([crossed[:, :, 0], squares, crossed[:, :, 1], lagged], axis=1)
+    sums = stacked[..., 1:].reshape(members, 4, sensors, windows, directions)
     r = now[..., 0].sum(axis=1)
-    parts = [used.sum(axis=1), r, squares[..., 0], lagged[..., 0], pair.sum(axis=1)]
+    counts = [used.sum(axis=1), r, squares[..., 0], lagged[..., 0], pair.sum(axis=1)]
     return {
         "sums": old.sums * kept[:, None, :, None, None] + sums.transpose(0, 1, 3, 4, 2),
-        "noise": old.noise * kept[:, None, :, None] + np.stack(parts, axis=1)[:, :, None],
+        "noise": old.noise * kept[:, None, :, None] + np.stack(counts, axis=1)[:, :, None],
         "before": np.take_along_axis(row, newest[:, -1:, :, None], axis=1)[:, 0].swapaxes(1, 2),
         "present": np.maximum(old.present, used.max(axis=1)),
     }
@@ -279,8 +279,8 @@ class InputLedger:
 
     def gaps(self, names: Sequence[str], missing: Array) -> dict[str, tuple[float, bool]]:
         """Return channel -> (duration of its gap, whether it continues), for channels in a gap."""
-        each = zip(names, self.held.tolist(), (missing > 0.0).tolist(), strict=True)
-        return {name: (held, again) for name, held, again in each if held or again}
+        channels = zip(names, self.held.tolist(), (missing > 0.0).tolist(), strict=True)
+        return {name: (held, continues) for name, held, continues in channels if held or continues}
 
     def findings(self, names: Sequence[str], shifts: Shifts[float]) -> Iterator[Finding]:
         """Yield findings on channels without a value at the start or in many samples (`HELD`).
@@ -288,8 +288,8 @@ class InputLedger:
         `shifts`: shifts of the estimate, including those due to interpolation of inputs.
         """
         samples = max(int(self.counts[0]), 1)
-        each = shifts.by("input").items()
-        by = ", ".join(f"{label} by {-shift:+.2g}" for label, shift in each)
+        input_shifts = shifts.by("input").items()
+        phrase = ", ".join(f"{label} by {-shift:+.2g}" for label, shift in input_shifts)
         for name in itertools.compress(names, self.unstated.tolist()):
             text, remedy = FINDINGS["input, start"].filled(name=name)
             yield Finding("input", "note", text, name, remedy=remedy)
@@ -297,8 +297,8 @@ class InputLedger:
             share = count / samples
             if share <= HELD:
                 continue
-            sentence = FINDINGS["input, gaps" if by else "input, gaps, unknown shift"]
-            text, remedy = sentence.filled(name=name, count=count, samples=samples, shifts=by)
+            sentence = FINDINGS["input, gaps" if phrase else "input, gaps, unknown shift"]
+            text, remedy = sentence.filled(name=name, count=count, samples=samples, shifts=phrase)
             yield Finding("input", "caution", text, name, share, remedy=remedy)
 
 
@@ -388,12 +388,12 @@ class ValidationLedger:
         if not spread > 0.0:
             return None
         slope = (pz / count - mean_p * mean_z) / spread
-        rest = max(math.sqrt(spread), 1e-300)
-        for unit, taken, scale, origin in UNITS:
-            off = abs(mean_z - (scale * mean_p + origin))
-            if abs(slope / scale - 1.0) < 4.0 * SIMILAR and off < rest:
+        tolerance = max(math.sqrt(spread), 1e-300)
+        for unit, expected, scale, origin in UNITS:
+            deviation = abs(mean_z - (scale * mean_p + origin))
+            if abs(slope / scale - 1.0) < 4.0 * SIMILAR and deviation < tolerance:
                 text, remedy = LIKELY["unit"].filled(
-                    name=name, unit=unit, expected=taken, table=table_of(name)
+                    name=name, unit=unit, expected=expected, table=table_of(name)
                 )
                 setting = channel_setting(name, "unit", f'"{unit}"')
                 return Cause("unit", name, text, remedy=remedy, setting=setting)

@@ -52,9 +52,9 @@ class Allowed:
     @property
     def effect(self) -> float:
         """Largest error of the value, relative to its size or to `usual`, whichever is larger."""
-        off = max(abs(self.low - self.value), abs(self.high - self.value))
+        error = max(abs(self.low - self.value), abs(self.high - self.value))
         size = max(self._size, self.usual)
-        return off / size if size > 0.0 else math.inf
+        return error / size if size > 0.0 else math.inf
 
     @property
     def _size(self) -> float:
@@ -63,9 +63,9 @@ class Allowed:
     def about(self, value: float, plain_low: float, plain_high: float) -> Allowed:
         """Return the interval of a later estimate: the plain one, widened by the same factors."""
 
-        def end(wide: float, plain: float, now: float) -> float:
-            away = plain - self.value
-            return value + (wide - self.value) * ((now - value) / away if away else 1.0)
+        def end(wide: float, plain: float, moved: float) -> float:
+            distance = plain - self.value
+            return value + (wide - self.value) * ((moved - value) / distance if distance else 1.0)
 
         low = end(self.low, self.plain_low, plain_low)
         high = end(self.high, self.plain_high, plain_high)
@@ -77,13 +77,13 @@ class Allowed:
         """The unknown with its interval, and its effect as a percentage."""
         unit = f" {self.unit}" if self.unit else ""
         if self._size < self.usual:
-            off = f"{in_percent(USUAL * self.effect)} of its prior standard deviation"
+            size = f"{in_percent(USUAL * self.effect)} of its prior standard deviation"
         elif self.effect < 1.0:
-            off = in_percent(self.effect)
+            size = in_percent(self.effect)
         else:
-            off = f"{self.effect:.2g} times its value"
+            size = f"{self.effect:.2g} times its value"
         return (
-            f"{self.label} is between {self.low:.4g} and {self.high:.4g}{unit} (error up to {off})"
+            f"{self.label} is between {self.low:.4g} and {self.high:.4g}{unit} (error up to {size})"
         )
 
 
@@ -117,28 +117,28 @@ class ModelErrors:
     @property
     def asked(self) -> list[Allowed]:
         """Unknowns of the model, by decreasing effect."""
-        own = [one for one in self.unknowns if not one.of_sensor]
-        return sorted(own, key=lambda one: -one.effect)
+        of_model = [unknown for unknown in self.unknowns if not unknown.of_sensor]
+        return sorted(of_model, key=lambda unknown: -unknown.effect)
 
     @property
     def differ(self) -> bool:
         """Whether an interval differs from the plain one by more than a tenth of its width."""
 
-        def far(one: Allowed) -> bool:
-            ends = (one.low - one.plain_low, one.high - one.plain_high)
-            width = one.plain_high - one.plain_low
+        def differs(unknown: Allowed) -> bool:
+            ends = (unknown.low - unknown.plain_low, unknown.high - unknown.plain_high)
+            width = unknown.plain_high - unknown.plain_low
             return max(map(abs, ends)) > (DIFFERENT - 1.0) * width
 
-        return any(map(far, self.unknowns))
+        return any(map(differs, self.unknowns))
 
     def __getitem__(self, label: str) -> Allowed:
         """Return the unknown with the given label."""
-        return next(one for one in self.unknowns if one.label == label)
+        return next(unknown for unknown in self.unknowns if unknown.label == label)
 
     @property
     def effect(self) -> float:
         """Largest relative effect on an unknown of the model; 0 without unknowns."""
-        return max((one.effect for one in self.asked), default=0.0)
+        return max((unknown.effect for unknown in self.asked), default=0.0)
 
     def about(self, now: Mapping[str, tuple[float, float, float]]) -> ModelErrors:
         """Return the errors at later estimates: label -> (value, plain low, plain high)."""
@@ -161,12 +161,12 @@ class ModelErrors:
     @property
     def wide(self) -> float:
         """Largest effect on an unknown whose interval is much wider than noise alone implies."""
-        return max((one.effect for one in self.asked if one.wider > WIDER), default=0.0)
+        return max((unknown.effect for unknown in self.asked if unknown.wider > WIDER), default=0.0)
 
     @property
     def useless(self) -> list[str]:
         """Labels of the unknowns of the model whose interval is too wide to use."""
-        return [one.label for one in self.asked if one.effect > USELESS]
+        return [unknown.label for unknown in self.asked if unknown.effect > USELESS]
 
     def sentence(self, *, doubted: bool) -> str:
         """Return a sentence on misfit and effect."""
@@ -176,11 +176,11 @@ class ModelErrors:
         if self.failed:
             return f"The fit failed. {fit}"
         # List the unknowns with the largest effects.
-        some = [one.text for one in self.asked[:MOST]]
-        rest = len(self.asked) - MOST
-        more = f" The table lists {rest} more." if rest > 0 else ""
-        why = "model errors" if doubted else "model errors that these data cannot reveal"
-        return f"{fit} Allowing for {why}, {', '.join(some)}.{more}" if some else fit
+        texts = [unknown.text for unknown in self.asked[:MOST]]
+        unlisted = len(self.asked) - MOST
+        more = f" The table lists {unlisted} more." if unlisted > 0 else ""
+        reason = "model errors" if doubted else "model errors that these data cannot reveal"
+        return f"{fit} Allowing for {reason}, {', '.join(texts)}.{more}" if texts else fit
 
     @property
     def remedy(self) -> str:
@@ -197,9 +197,9 @@ class ModelErrors:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the errors as a dictionary for JSON."""
-        own = {**asdict(self), "sensors": dict(self.sensors)}
-        found: dict[str, Any] = _without_nonfinite(own)
-        return found
+        fields = {**asdict(self), "sensors": dict(self.sensors)}
+        finite: dict[str, Any] = _without_nonfinite(fields)
+        return finite
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any] | None) -> ModelErrors | None:
