@@ -49,7 +49,7 @@ def flatten(value: Any, prefix: str = "state") -> dict[str, Any]:
     kind: Any = type(value)
     if isinstance(value, tuple):
         parts = dict(enumerate(value))
-    elif (names := _parts(kind)) is not None:
+    elif (names := _field_rules(kind)) is not None:
         parts = {name: getattr(value, name) for name, _, _ in names}
     else:
         return {prefix: value}
@@ -60,7 +60,7 @@ def flatten(value: Any, prefix: str = "state") -> dict[str, Any]:
 
 
 @lru_cache(maxsize=256)
-def _parts(kind: type) -> tuple[tuple[str, int, bool], ...] | None:
+def _field_rules(kind: type) -> tuple[tuple[str, int, bool], ...] | None:
     """Return the name, growing axis and `begins_anew` of each field of a dataclass, or None."""
     if not is_dataclass(kind):
         return None
@@ -85,24 +85,24 @@ def rebuild(
             rebuild(item, leaves, f"{prefix}.{k}", grows) for k, item in enumerate(template)
         )
     kind: Any = type(template)
-    parts = _parts(kind)
-    if parts is not None:
-        found = {}
-        for name, axis, anew in parts:
-            part = _anew if anew else rebuild
-            found[name] = part(getattr(template, name), leaves, f"{prefix}.{name}", axis)
-        return kind(**found)
+    rules = _field_rules(kind)
+    if rules is not None:
+        values = {}
+        for name, axis, lenient in rules:
+            restore = _or_template if lenient else rebuild
+            values[name] = restore(getattr(template, name), leaves, f"{prefix}.{name}", axis)
+        return kind(**values)
     array = leaves[prefix]
     if not isinstance(template, np.ndarray):
         return kind(array.item())
     if array.dtype != template.dtype:
         raise ValueError(f"{prefix} is of type {array.dtype}, needs {template.dtype}")
-    if array.shape != template.shape and _others(array, grows) != _others(template, grows):
+    if array.shape != template.shape and _fixed_axes(array, grows) != _fixed_axes(template, grows):
         raise ValueError(f"{prefix} has shape {array.shape}, needs {template.shape}")
     return array
 
 
-def _anew(template: Any, leaves: Mapping[str, Array], prefix: str, grows: int) -> Any:
+def _or_template(template: Any, leaves: Mapping[str, Array], prefix: str, grows: int) -> Any:
     try:
         return rebuild(template, leaves, prefix, grows)
     except ValueError:
@@ -113,7 +113,7 @@ def _anew(template: Any, leaves: Mapping[str, Array], prefix: str, grows: int) -
         return np.zeros(shape)
 
 
-def _others(array: Array, axis: int) -> list[int]:
+def _fixed_axes(array: Array, axis: int) -> list[int]:
     """Return the lengths of all axes except the first and `axis`."""
     return [length for k, length in enumerate(array.shape) if k not in (0, axis)]
 
@@ -121,14 +121,14 @@ def _others(array: Array, axis: int) -> list[int]:
 def packed(header: Mapping[str, Any], leaves: Mapping[str, Any]) -> bytes:
     """Return a buffer that contains header and leaves."""
     arrays = [np.asarray(leaf, order="C") for leaf in leaves.values()]
-    described = zip(leaves, (a.dtype.str for a in arrays), (a.shape for a in arrays), strict=True)
-    text = _text(json.dumps(dict(header)), tuple(described))
+    layouts = zip(leaves, (a.dtype.str for a in arrays), (a.shape for a in arrays), strict=True)
+    text = _text(json.dumps(dict(header)), tuple(layouts))
     # -n % ALIGNED bytes pad n bytes to the next multiple.
-    parts: list[Any] = [text, bytes(-len(text) % ALIGNED)]
+    chunks: list[Any] = [text, bytes(-len(text) % ALIGNED)]
     for array in arrays:
-        parts += [array, bytes(-array.nbytes % ALIGNED)]
+        chunks += [array, bytes(-array.nbytes % ALIGNED)]
     # A single join avoids copies of the states of a shard, which are large.
-    return b"".join([START.pack(MAGIC, len(text), _digest(*parts)), *parts])
+    return b"".join([START.pack(MAGIC, len(text), _digest(*chunks)), *chunks])
 
 
 def unpacked(content: bytes, where: str) -> tuple[dict[str, Any], dict[str, Array]]:
@@ -142,14 +142,14 @@ def unpacked(content: bytes, where: str) -> tuple[dict[str, Any], dict[str, Arra
         if magic != MAGIC or digest != _digest(body):
             raise ValueError("it begins or adds up otherwise")
         text = bytes(body[:length])
-        header, described = _read(text)
+        header, layouts = _read(text)
         # All arrays are views of one copy, since `content` is read-only.
-        numbers = bytearray(body[length + -length % ALIGNED :])
-        leaves, at = {}, 0
-        for name, kind, shape in described:
-            array = np.ndarray(shape, kind, numbers, at)
+        data = bytearray(body[length + -length % ALIGNED :])
+        leaves, offset = {}, 0
+        for name, kind, shape in layouts:
+            array = np.ndarray(shape, kind, data, offset)
             leaves[name] = array
-            at += array.nbytes + -array.nbytes % ALIGNED
+            offset += array.nbytes + -array.nbytes % ALIGNED
     except (struct.error, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise RunError(
             f"{where} is not a checkpoint of this version of livepde, or it is damaged: {error}."
@@ -158,32 +158,32 @@ def unpacked(content: bytes, where: str) -> tuple[dict[str, Any], dict[str, Arra
 
 
 def _digest(*parts: Any) -> bytes:
-    found = hashlib.blake2b(digest_size=DIGEST)
-    for part in parts:
-        found.update(part)
-    return found.digest()
+    digest = hashlib.blake2b(digest_size=DIGEST)
+    for chunk in parts:
+        digest.update(chunk)
+    return digest.digest()
 
 
 @lru_cache(maxsize=FEW)
-def _text(header: str, described: tuple[tuple[str, str, tuple[int, ...]], ...]) -> bytes:
+def _text(header: str, layouts: tuple[tuple[str, str, tuple[int, ...]], ...]) -> bytes:
     """Return header and array descriptions as text, cached since successive states repeat them."""
-    for name, kind, _ in described:
+    for name, kind, _ in layouts:
         if np.dtype(kind).kind not in PLAIN:
             raise TypeError(f"{name}: a checkpoint holds arrays of numbers and texts, not {kind}.")
-    return f"[{header}, {json.dumps(described)}]".encode()
+    return f"[{header}, {json.dumps(layouts)}]".encode()
 
 
 @lru_cache(maxsize=FEW)
 def _read(text: bytes) -> tuple[dict[str, Any], list[tuple[str, np.dtype[Any], tuple[int, ...]]]]:
     """Return header and array descriptions from a text of `_text`, after validating types."""
-    header, described = json.loads(text)
-    found = []
-    for name, kind, shape in described:
+    header, layouts = json.loads(text)
+    validated = []
+    for name, kind, shape in layouts:
         dtype, lengths = np.dtype(str(kind)), tuple(int(length) for length in shape)
         if dtype.kind not in PLAIN or min(lengths, default=0) < 0 or math.prod(lengths) > MOST:
             raise ValueError(f"'{name}' is not an array of numbers")
-        found.append((str(name), dtype, lengths))
-    return dict(header), found
+        validated.append((str(name), dtype, lengths))
+    return dict(header), validated
 
 
 def write(path: str | os.PathLike[str], content: bytes) -> None:
@@ -242,11 +242,11 @@ class Fingerprint:
     def leaves(self) -> dict[str, Any]:
         """Leaves for a checkpoint."""
         texts = {f"{PREFIX}{part}.text": np.array(text) for part, text in self.texts.items()}
-        return texts | {f"{PREFIX}{part}": each for part, each in self.numbers.items()}
+        return texts | {f"{PREFIX}{part}": values for part, values in self.numbers.items()}
 
     def differing(self, leaves: Mapping[str, Array]) -> str:
         """Return a description of the differences from a checkpoint; empty if there are none."""
-        differ = [part for part in NAMES if not self._same(part, leaves)]
+        differ = [part for part in NAMES if not self._unchanged(part, leaves)]
         if {"unknowns", "start"} & set(differ):
             differ = [part for part in differ if part not in EVALUATED]
         return ", and another ".join(NAMES[part] for part in differ)
@@ -258,25 +258,25 @@ class Fingerprint:
 
         `errors`: errors of each initial state, shape (errors, n) each.
         """
-        whole = [np.concatenate([np.ravel(one) for one in each]) for each in (q0, u0, errors)]
-        start = np.concatenate(_start(*whole))
+        stacked = [np.concatenate([np.ravel(array) for array in each]) for each in (q0, u0, errors)]
+        start = np.concatenate(_start_sums(*stacked))
         return replace(self, numbers={**self.numbers, "start": start})
 
-    def _same(self, part: str, leaves: Mapping[str, Array]) -> bool:
+    def _unchanged(self, part: str, leaves: Mapping[str, Array]) -> bool:
         text, numbers = leaves.get(f"{PREFIX}{part}.text"), leaves.get(f"{PREFIX}{part}")
         if text is None or numbers is None or str(text) != self.texts[part]:
             return False
-        return _alike(self.numbers[part], numbers)
+        return _equal_sums(self.numbers[part], numbers)
 
 
-def _alike(one: Array, other: Array) -> bool:
+def _equal_sums(first: Array, second: Array) -> bool:
     """Return whether sums agree to rounding of their terms, and the same sums are not finite."""
-    if one.shape != other.shape:
+    if first.shape != second.shape:
         return False
-    finite = np.isfinite(one).all(axis=1)
-    if not np.array_equal(finite, np.isfinite(other).all(axis=1)):
+    finite = np.isfinite(first).all(axis=1)
+    if not np.array_equal(finite, np.isfinite(second).all(axis=1)):
         return False
-    a, b = one[finite], other[finite]
+    a, b = first[finite], second[finite]
     size = np.maximum(a[:, 1], b[:, 1])
     return bool((np.abs(a - b) <= ROUNDING * size[:, None]).all())
 
@@ -290,36 +290,36 @@ def fingerprint(
     `q0`, `u0`: latent parameters and state at the start, without boundary values.
     """
     model, places = problem.model, _places(problem, q0, u0)
-    valued = [(model.latent.value(q), u, at) for q, u, at in places]
+    physical_places = [(model.latent.value(q), u, at) for q, u, at in places]
     control = replace(problem.control, start=math.nan)
     sensors = [problem.observed] if validation is None else [problem.observed, validation]
     process = [_sums(model.mass @ _weights(model.X.dim)), _sums(model.X.free.astype(float))]
-    shown: list[Array] = []
-    for one in sensors:
-        noise = _sums(np.zeros(0) if one.noise is None else one.noise)
-        shown += [noise, *_evaluated(OF_SENSORS, one, valued)]
+    sensor_sums: list[Array] = []
+    for observed in sensors:
+        noise = _sums(np.zeros(0) if observed.noise is None else observed.noise)
+        sensor_sums += [noise, *_function_sums(OF_SENSORS, observed, physical_places)]
     options = [
         (part.name, part.size, part.unknown.prior, part.evolution)
         for part in model.latent.parts.values()
     ]
-    own: dict[str, tuple[Any, Iterable[Array]]] = {
-        "model": ((model.channels, model.X.dim), process + _evaluated(OF_MODEL, model, places)),
-        "unknowns": (options, _of_priors(model)),
-        "sensors": ([one.names for one in sensors], shown),
+    identifying: dict[str, tuple[Any, Iterable[Array]]] = {
+        "model": ((model.channels, model.X.dim), process + _function_sums(OF_MODEL, model, places)),
+        "unknowns": (options, _prior_sums(model)),
+        "sensors": ([observed.names for observed in sensors], sensor_sums),
         "law": (law, ()),
         "steps": ((control, problem.input_noise), ()),
-        "start": ((), _start(q0, u0, problem.initial_errors)),
+        "start": ((), _start_sums(q0, u0, problem.initial_errors)),
     }
     texts, numbers = {}, {}
-    for part, (stated_options, sums) in own.items():
-        told: list[float] = []
-        texts[part] = _described(stated_options, told)
-        stated = np.array([(value, abs(value)) for value in told]).reshape(-1, 2)
-        numbers[part] = np.concatenate([stated, *sums])
+    for part, (stated_options, sums) in identifying.items():
+        values: list[float] = []
+        texts[part] = _described(stated_options, values)
+        value_rows = np.array([(value, abs(value)) for value in values]).reshape(-1, 2)
+        numbers[part] = np.concatenate([value_rows, *sums])
     return Fingerprint(texts, numbers)
 
 
-def _start(q0: Array, u0: Array, errors: Array) -> list[Array]:
+def _start_sums(q0: Array, u0: Array, errors: Array) -> list[Array]:
     """Return sums of q0, of u0 and, if there are any, of the errors of u0."""
     return [_sums(q0), _sums(u0), *([_sums(errors.ravel())] if errors.size else [])]
 
@@ -340,12 +340,12 @@ def _weights(size: int) -> Array:
 def _places(problem: Problem, q0: Array, u0: Array) -> list[Place]:
     """Return two points of evaluation: the start, and parameters and state near it."""
     inputs = Inputs({name: 1.0 + 0.3 * k for k, name in enumerate(problem.channels)})
-    first, second = (Moment(t, inputs) for t in TIMES)
+    moment1, moment2 = (Moment(t, inputs) for t in TIMES)
     u = u0 + 0.1 * max(1.0, float(np.abs(u0).max(initial=0.0))) * _weights(len(u0))[:, 0]
     q = q0.copy()
     for part in problem.model.latent.parts.values():
         q[part.part] += 0.3 * part.unknown.prior.latent_std
-    return [(q0, u0, first), (q, u, second)]
+    return [(q0, u0, moment1), (q, u, moment2)]
 
 
 OF_MODEL: tuple[Callable[..., Any], ...] = (
@@ -362,14 +362,14 @@ OF_SENSORS: tuple[Callable[..., Any], ...] = (
 )
 
 
-def _evaluated(
-    functions: Iterable[Callable[..., Any]], of: Model | Observed, places: Iterable[Place]
+def _function_sums(
+    functions: Iterable[Callable[..., Any]], subject: Model | Observed, places: Iterable[Place]
 ) -> list[Array]:
     """Return sums of the functions of a model or of sensors at each place."""
-    return [_tried(function, of, *place) for place in places for function in functions]
+    return [_sums_or_nan(function, subject, *place) for place in places for function in functions]
 
 
-def _of_priors(model: Model) -> Iterator[Array]:
+def _prior_sums(model: Model) -> Iterator[Array]:
     """Iterate over sums of the priors of the unknowns."""
     latent = model.latent
     yield _sums(latent.prior)
@@ -379,7 +379,7 @@ def _of_priors(model: Model) -> Iterator[Array]:
         yield _sums(np.where(np.isfinite(bound), bound, 0.0))
 
 
-def _tried(function: Callable[..., Any], *arguments: Any) -> Array:
+def _sums_or_nan(function: Callable[..., Any], *arguments: Any) -> Array:
     """Return the sums of the values of a function; NaN if it raises an error."""
     try:
         return _sums(function(*arguments))
@@ -401,17 +401,17 @@ def _described(value: Any, numbers: list[float]) -> str:
         numbers.extend(np.asarray(value, dtype=float).ravel().tolist())
         return f"#{value.shape}"
     if isinstance(value, Mapping):
-        parts = [f"{name}: {_described(each, numbers)}" for name, each in value.items()]
+        parts = [f"{name}: {_described(item, numbers)}" for name, item in value.items()]
     elif isinstance(value, Sequence):
-        parts = [_described(each, numbers) for each in value]
+        parts = [_described(item, numbers) for item in value]
     else:
-        parts = [f"{name}={_described(each, numbers)}" for name, each in _options(value)]
+        parts = [f"{name}={_described(item, numbers)}" for name, item in _options(value)]
     return f"{type(value).__name__}({', '.join(parts)})"
 
 
 def _options(value: Any) -> list[tuple[str, Any]]:
     """Return names and values of the options of a dataclass, without `begins_anew` fields."""
     if is_dataclass(value):
-        given = [item for item in fields(value) if not item.metadata.get("begins_anew")]
-        return [(item.name, getattr(value, item.name)) for item in given if item.init]
+        settings = [item for item in fields(value) if not item.metadata.get("begins_anew")]
+        return [(item.name, getattr(value, item.name)) for item in settings if item.init]
     return []

@@ -68,22 +68,22 @@ def with_epoch(data: xr.Dataset) -> xr.Dataset:
     attrs = since(unit, data.attrs.get("origin"))
     if not attrs:
         return data
-    found = data.copy(deep=False)
+    described = data.copy(deep=False)
     for name in TIMES:
-        found[name] = found[name].copy(deep=False)
-        found[name].attrs = {**found[name].attrs, **attrs, OWN: unit}
-    return found
+        described[name] = described[name].copy(deep=False)
+        described[name].attrs = {**described[name].attrs, **attrs, OWN: unit}
+    return described
 
 
 def without_epoch(data: xr.Dataset) -> xr.Dataset:
     """Undo `with_epoch` for a dataset that was read with its times as numbers."""
     if OWN not in data["time"].attrs:
         return data
-    found = data.copy(deep=False)
+    plain = data.copy(deep=False)
     for name in TIMES:
-        if name in found.coords:
-            found[name].attrs = {"units": data["time"].attrs[OWN]} if name == "time" else {}
-    return found
+        if name in plain.coords:
+            plain[name].attrs = {"units": data["time"].attrs[OWN]} if name == "time" else {}
+    return plain
 
 
 def when(data: xr.Dataset, t: float) -> str:

@@ -20,33 +20,33 @@ def negative_diffusion(M: Form, A: Form, B: Form, prior: Array, component: int) 
     without a mass term, whose sign is arbitrary. `prior`: mean of the unknowns.
     """
 
-    def pairing(of: int, tested: int, u: float) -> Array:
+    def pairing(trial: int, tested: int, u: float) -> Array:
         """Return the factor of a pair in A and B."""
-        return A.factor(of, tested, u, q=prior) + B.factor(of, tested, u)
+        return A.factor(trial, tested, u, q=prior) + B.factor(trial, tested, u)
 
     slopes, sign = _owners(M, "grad"), _sign_of_mass(M, component)
-    own = [k for k, of in slopes.items() if of == component]
-    growing = [k for k in own if sign and _negative(pairing, sign, k)]
-    others = [k for k in slopes if k not in own]
-    return bool(growing) and not _coupled(M, pairing, growing, others)
+    of_component = [k for k, trial in slopes.items() if trial == component]
+    negative = [k for k in of_component if sign and _negative(pairing, sign, k)]
+    others = [k for k in slopes if k not in of_component]
+    return bool(negative) and not _coupled(M, pairing, negative, others)
 
 
-def _coupled(M: Form, pairing: Pairing, growing: list[int], others: list[int]) -> bool:
+def _coupled(M: Form, pairing: Pairing, negative: list[int], others: list[int]) -> bool:
     """Return whether the growing slopes are coupled to others, or there are higher derivatives."""
     pairs = [(k, k) for k, (_, part) in enumerate(M.owners("u")) if part not in LOWER]
-    pairs += [pair for k in growing for j in others for pair in ((k, j), (j, k))]
+    pairs += [pair for k in negative for j in others for pair in ((k, j), (j, k))]
     return any(pairing(*pair, 1.0).any() for pair in pairs)
 
 
 def _negative(pairing: Pairing, sign: float, k: int) -> bool:
     """Return whether a diffusivity is negative for small, moderate and large values of u."""
-    each = (sign * pairing(k, k, u) for u in (0.1, 1.0, 10.0))
-    return all(bool((one < 0.0).any() and (one <= 0.0).all()) for one in each)
+    factors = (sign * pairing(k, k, u) for u in (0.1, 1.0, 10.0))
+    return all(bool((factor < 0.0).any() and (factor <= 0.0).all()) for factor in factors)
 
 
 def _owners(M: Form, part: str) -> dict[int, int]:
     """Return index of a value (`part` "value") or slope ("grad") -> index of its component."""
-    return {k: of for k, (of, what) in enumerate(M.owners("u")) if what == part}
+    return {k: component for k, (component, kind) in enumerate(M.owners("u")) if kind == part}
 
 
 def _sign_of_mass(M: Form, component: int) -> float:

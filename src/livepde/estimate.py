@@ -95,19 +95,19 @@ class Estimate(Shown):
 
         def __getattr__(self, name: str) -> Any:
             # Python calls this only for names that are not in __dict__: the belief is read once.
-            held = self.__dict__
-            read = held.get("_read") if name == "belief" else None
+            attributes = self.__dict__
+            read = attributes.get("_read") if name == "belief" else None
             if read is not None:
-                held["belief"] = read()
-                held.pop("_read", None)  # another thread may have been faster
-            if name not in held:
+                attributes["belief"] = read()
+                attributes.pop("_read", None)  # another thread may have been faster
+            if name not in attributes:
                 raise AttributeError(f"an Estimate has no attribute '{name}'.")
-            return held[name]
+            return attributes[name]
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes for pickle and copies, with values instead of functions."""
         # Functions of a law cannot be pickled and refer to its arrays: their results are stored.
-        own = {
+        values = {
             "belief": self.belief,
             "verdict": self.verdict,
             "diagnostics": self.diagnostics,
@@ -116,7 +116,7 @@ class Estimate(Shown):
             "space": self.space.described,
             "state_space": None,
         }
-        return {k: v for k, v in vars(self).items() if k != "_read"} | own
+        return {k: v for k, v in vars(self).items() if k != "_read"} | values
 
     def _shown(self) -> tuple[str, Mapping[str, str]]:
         rows = {}
@@ -257,14 +257,14 @@ class Estimate(Shown):
 
 def read_together(estimates: Sequence[Estimate]) -> None:
     """Compute the deferred beliefs and diagnostics of several estimates together."""
-    parts = [vars(estimate) for estimate in estimates]
+    attributes = [vars(estimate) for estimate in estimates]
     for name, function in (("belief", "_read"), ("diagnostics", "diagnose")):
         # Another thread may read some of them at the same time.
-        each = ((own, own.get(function)) for own in parts if name not in own)
-        unread = [(own, read) for own, read in each if read is not None]
-        for (own, _), value in zip(unread, together([read for _, read in unread]), strict=True):
-            own[name] = value
-            own.pop("_read", None)
+        deferred = ((held, held.get(function)) for held in attributes if name not in held)
+        unread = [(held, read) for held, read in deferred if read is not None]
+        for (held, _), value in zip(unread, together([read for _, read in unread]), strict=True):
+            held[name] = value
+            held.pop("_read", None)
 
 
 def _number(value: float) -> float | None:

@@ -66,7 +66,7 @@ def future_times(times: Array, given: object, t: float, control: Advance) -> lis
             f"forecast: two times are more than {MOST_SUBSTEPS} substeps of dt_max = "
             f"{control.dt_max:g} apart; give times in between, or a longer dt_max."
         )
-    return [float(one) for one in times]
+    return [float(time) for time in times]
 
 
 def ahead(
@@ -81,7 +81,7 @@ def ahead(
 
     The intervals are consecutive; the first may have zero length.
     """
-    names = tuple(name for each in sensors for name in each.names)
+    names = tuple(name for observed in sensors for name in observed.names)
     z, std = np.full((2, len(intervals), len(names)), np.nan)
     status = Status()
     for k, interval in enumerate(intervals):
@@ -91,13 +91,13 @@ def ahead(
         if not status.ok:
             break
         belief = problem.physical(law.belief(work, state))
-        seen = [_seen(each, belief, interval.end) for each in sensors]
-        z[k], std[k] = (np.concatenate(parts) for parts in zip(*seen, strict=True))
+        readings = [_predicted(observed, belief, interval.end) for observed in sensors]
+        z[k], std[k] = (np.concatenate(parts) for parts in zip(*readings, strict=True))
     times = np.array([interval.t1 for interval in intervals])
     return Forecast(t=times, names=names, z=z, z_std=std, status=status)
 
 
-def _seen(sensors: Observed, belief: Belief, moment: Moment) -> tuple[Array, Array]:
+def _predicted(sensors: Observed, belief: Belief, moment: Moment) -> tuple[Array, Array]:
     """Return the predicted readings of a belief, and their standard deviations."""
     z = sensors.predict(belief.u, belief.q, moment)
     rows = seen_rows(sensors, belief, moment)

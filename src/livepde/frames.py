@@ -61,23 +61,23 @@ def estimates(data: xr.Dataset) -> pd.DataFrame:
 
     errors, verdict = model_errors(data), json.loads(data.attrs.get("verdict", "{}"))
     allowed = errors.unknowns if errors is not None else ()
-    ends_of = {one.label: (one.low, one.high, one.effect) for one in allowed}
+    by_label = {unknown.label: (unknown.low, unknown.high, unknown.effect) for unknown in allowed}
     labels, rows = scalars(data) if data.sizes["time"] else [], []
     for label in labels:
         ends = interval_95(data, label)
         values = (data[label][-1], data[f"{label}_std"][-1], *(end[-1] for end in ends))
         row: dict[str, Any] = dict(zip(STATISTICS, map(float, values), strict=True))
-        row |= dict(zip(ALLOWED, ends_of.get(label, (math.nan,) * 3), strict=True))
+        row |= dict(zip(ALLOWED, by_label.get(label, (math.nan,) * 3), strict=True))
         row |= {"unit": data[label].attrs.get("units", ""), "level": verdict.get("level", "")}
         if any("reference" in data[name].attrs for name in labels):
             row["reference"] = float(data[label].attrs.get("reference", math.nan))
             row["error"] = relative_error(data, label)
         rows.append(row)
     columns = [*STATISTICS, *ALLOWED, "unit", "level"]
-    found = pd.DataFrame(rows, pd.Index(labels, name="unknown"), None if rows else columns)
+    table = pd.DataFrame(rows, pd.Index(labels, name="unknown"), None if rows else columns)
     if errors is not None:
-        found.attrs["misfit"] = errors.misfit
-    return found
+        table.attrs["misfit"] = errors.misfit
+    return table
 
 
 def times(data: xr.Dataset) -> pd.Index[Any]:
@@ -115,14 +115,14 @@ def over_time(data: xr.Dataset, variable: str, dimension: str) -> dict[str, Arra
 
 def with_estimates(data: xr.Dataset) -> xr.Dataset:
     """Add dates, interval ends and the variable `estimates` to the dataset of a run."""
-    found: dict[str, Any] = {}
+    intervals: dict[str, Any] = {}
     labels = scalars(data)
     for name in [*labels, *field_names(data)]:
         if f"{name}_std" in data and f"{name}_low" not in data:
-            sides = zip(("low", "high"), interval_95(data, name), strict=True)
+            pairs = zip(("low", "high"), interval_95(data, name), strict=True)
             about = data[f"{name}_std"]
-            found |= {f"{name}_{side}": (about.dims, x, about.attrs) for side, x in sides}
-    data = data.assign(found)
+            intervals |= {f"{name}_{side}": (about.dims, x, about.attrs) for side, x in pairs}
+    data = data.assign(intervals)
     dates = instants(data, data["time"].values)
     if dates is not None:
         data = data.assign_coords({DATE: ("time", dates.tz_localize(None))})
@@ -147,9 +147,9 @@ def covariance_of(belief: Belief, space: FunctionSpace) -> pd.DataFrame:
 
     rows = list(space.labels.values())
     factor = _factor(belief)[rows]
-    rest = np.zeros(len(rows)) if belief.rest is None else belief.rest[rows]
+    omitted = np.zeros(len(rows)) if belief.rest is None else belief.rest[rows]
     names = pd.Index(list(space.labels), name="unknown")
-    return pd.DataFrame(factor @ factor.T + np.diag(rest**2), names, names)
+    return pd.DataFrame(factor @ factor.T + np.diag(omitted**2), names, names)
 
 
 def draws(
@@ -168,8 +168,8 @@ def draws(
     q = np.empty_like(shift)
     for name, unknown in space.unknowns.items():
         part = space.part(name)
-        moved = unknown.prior.transform.shifted(belief.q[part], shift[:, part], 1.0)
-        q[:, part] = np.clip(moved, *unknown.prior.bounds)
+        shifted = unknown.prior.transform.shifted(belief.q[part], shift[:, part], 1.0)
+        q[:, part] = np.clip(shifted, *unknown.prior.bounds)
     u_factor = belief.u_factor
     return q, belief.u + (0.0 if u_factor is None else xi @ u_factor.T)
 
@@ -223,20 +223,20 @@ def predictive(
 
     n, values = len(expected), measured.to_numpy()
     drawn = expected + std * np.random.default_rng(seed).standard_normal(expected.shape)
-    shown = {name: (("draw", "time"), drawn[..., k]) for k, name in enumerate(measured)}
+    readings = {name: (("draw", "time"), drawn[..., k]) for k, name in enumerate(measured)}
     rows, columns = (np.isfinite(values) & np.isfinite(std)).nonzero()
     scale = std[rows, columns]
     e = (values[rows, columns] - expected[:, rows, columns]) / scale
     density = -0.5 * e**2 - np.log(scale) - 0.5 * math.log(2.0 * math.pi)
     # ArviZ rejects readings with equal density for all draws, as at a known initial state.
-    told = np.ptp(density, axis=0) > 1e-12 * np.abs(density).max(axis=0, initial=1.0)
-    about = {
-        "time": ("reading", measured.index[rows[told]]),
-        "sensor": ("reading", measured.columns[columns[told]].to_numpy(dtype=str)),
+    kept = np.ptp(density, axis=0) > 1e-12 * np.abs(density).max(axis=0, initial=1.0)
+    coords = {
+        "time": ("reading", measured.index[rows[kept]]),
+        "sensor": ("reading", measured.columns[columns[kept]].to_numpy(dtype=str)),
     }
     groups = {
-        "posterior_predictive": xr.Dataset(shown, {"time": measured.index}),
-        "log_likelihood": xr.Dataset({"readings": (("draw", "reading"), density[:, told])}, about),
+        "posterior_predictive": xr.Dataset(readings, {"time": measured.index}),
+        "log_likelihood": xr.Dataset({"readings": (("draw", "reading"), density[:, kept])}, coords),
     }
     return {
         name: group.assign_coords(draw=np.arange(n)).expand_dims(chain=[0])
@@ -258,13 +258,13 @@ def layout_of(
     `ignored`: names of validation sensors that never affect the verdict.
     """
     components = model.state_space.fields.items()
-    places, units = _of_sensors(observed, validation)
-    stated = {*units.values()} - {""}
-    several = len(stated) > 1
+    places, units = _places_and_units(observed, validation)
+    named_units = {*units.values()} - {""}
+    mixed = len(named_units) > 1
     points = model.mesh.p[:, vertex_order(model)]
     return Layout(
         time_unit=model.time_unit,
-        sensor_unit="" if several else "".join(stated),
+        sensor_unit="" if mixed else "".join(named_units),
         coordinates={axis: x.tolist() for axis, x in zip("xyz", points, strict=False)},
         cells={kind: corners.tolist() for kind, corners in cells(model.mesh).items()},
         sensors=list(observed.names),
@@ -278,7 +278,7 @@ def layout_of(
         places=places,
         comments=_comments(model),
         attrs={"ignored": "\n".join(ignored)} if ignored else {},
-        sensor_units=units if several else {},
+        sensor_units=units if mixed else {},
     )
 
 
@@ -289,20 +289,20 @@ def _numbers(space: FunctionSpace) -> dict[str, dict[str, Any]]:
         unknown = space.unknown_of(label)
         unit: dict[str, Any] = {"units": unknown.unit}
         plain = isinstance(unknown.prior, Normal)  # the value is the mean, not only the median
-        numbers[label] = {**unit, **_prior(unknown), **({} if plain else {"comment": MEDIAN})}
+        numbers[label] = {**unit, **_prior_attrs(unknown), **({} if plain else {"comment": MEDIAN})}
         numbers[f"{label}_std"] = {**unit, **({} if plain else {"comment": FIRST_ORDER})}
         numbers |= dict.fromkeys(interval_ends(label, unknown, 0.0, 0.0), unit)
         numbers[f"{label}_left"] = {"long_name": "share of the prior standard deviation"}
     return numbers
 
 
-def _of_sensors(*groups: Observed | None) -> tuple[dict[str, Any], dict[str, str]]:
+def _places_and_units(*groups: Observed | None) -> tuple[dict[str, Any], dict[str, str]]:
     """Return sensor -> position, for sensors at one point, and sensor -> unit."""
     places: dict[str, Any] = {}
     units: dict[str, str] = {}
-    for one in filter(None, groups):
-        places |= {name: at.tolist() for name, at in one.places.items()}
-        units |= dict(zip(one.names, one.units, strict=True))
+    for observed in filter(None, groups):
+        places |= {name: at.tolist() for name, at in observed.places.items()}
+        units |= dict(zip(observed.names, observed.units, strict=True))
     return places, units
 
 
@@ -323,10 +323,10 @@ def vertex_order(model: Model) -> Any:
 
 def _units(model: Model) -> dict[str, str]:
     unknowns = {**model.state_space.unknowns, **model.parameter_space.unknowns}
-    found = {name: unknown.unit for name, unknown in unknowns.items()}
+    units = {name: unknown.unit for name, unknown in unknowns.items()}
     for name, block in model.state_space.fields.items():
-        found |= dict.fromkeys(block.variables(name), found[name])
-    return found
+        units |= dict.fromkeys(block.variables(name), units[name])
+    return units
 
 
 def interval_ends(name: str, unknown: Any, values: Any, std: Any) -> dict[str, Any]:
@@ -337,13 +337,13 @@ def interval_ends(name: str, unknown: Any, values: Any, std: Any) -> dict[str, A
     return {f"{name}_low": low, f"{name}_high": high}
 
 
-def _prior(unknown: Any) -> dict[str, float]:
+def _prior_attrs(unknown: Any) -> dict[str, float]:
     """Return the prior and finite bounds of a scalar unknown, as attributes of its variable."""
     bounds = zip(("lower_bound", "upper_bound"), unknown.prior.bounds, strict=True)
-    found = {name: float(bound) for name, bound in bounds if np.isfinite(bound)}
+    attributes = {name: float(bound) for name, bound in bounds if np.isfinite(bound)}
     if not unknown.evolution.moves:  # the variance of a moving unknown may increase again
-        found["prior_std"] = float(unknown.prior.std)
-    return found
+        attributes["prior_std"] = float(unknown.prior.std)
+    return attributes
 
 
 def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:
@@ -361,48 +361,48 @@ def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:
                 "rmse": float(np.sqrt((errors**2).mean())) if len(errors) else np.nan,
                 "count": float(len(errors)),
             }
-    for name, which in refused_readings(data).items():
-        rows[f"innovation:{name}"]["refused"] = float(which.sum())
+    for name, refused in refused_readings(data).items():
+        rows[f"innovation:{name}"]["refused"] = float(refused.sum())
     return rows
 
 
 def snapshot_of(model: Model, belief: Belief) -> Snapshot:
     """Return the fields of a belief at the vertices, with their determined modes."""
-    space, told, left_out = model.parameter_space, {}, {}
+    space, determined, left_out = model.parameter_space, {}, {}
     for name, field in space.fields.items():
-        left = belief.modes_left(space.part(name))
-        if len(left):
+        ratios = belief.modes_left(space.part(name))
+        if len(ratios):
             # The weight of a mode is the share by which the data have reduced its prior variance.
-            told[name] = float(np.maximum(1.0 - left**2, 0.0).sum()), len(left)
+            determined[name] = float(np.maximum(1.0 - ratios**2, 0.0).sum()), len(ratios)
             left_out[name] = belief.left_out(field.at_vertices, space.part(name))
     order, rows = vertex_order(model), [*space.labels.values()]
     ordered = {name: values[order] for name, values in _profiles(model, belief).items()}
     if belief.q_factor is None or len(rows) < 2:
-        return Snapshot(ordered, told, None, left_out)
-    return Snapshot(ordered, told, correlation_of(belief.q_factor[rows]), left_out)
+        return Snapshot(ordered, determined, None, left_out)
+    return Snapshot(ordered, determined, correlation_of(belief.q_factor[rows]), left_out)
 
 
 def _profiles(model: Model, belief: Belief) -> dict[str, Array]:
     """Return values and standard deviations of all fields at the vertices."""
-    found: dict[str, Array] = {}
+    profiles: dict[str, Array] = {}
     for name, block in model.state_space.fields.items():
         part = model.state_space.part(name)
-        found |= _split(name, block, block.at_vertices @ belief.u[part])
+        profiles |= _components(name, block, block.at_vertices @ belief.u[part])
         if belief.u_factor is not None:
             squares = (block.at_vertices @ belief.u_factor[part]) ** 2
-            found |= _split(name, block, np.sqrt(squares.sum(axis=1)), "_std")
+            profiles |= _components(name, block, np.sqrt(squares.sum(axis=1)), "_std")
     for name, field in model.parameter_space.fields.items():
         part = model.parameter_space.part(name)
-        found[name] = field.at_vertices @ belief.q[part]
+        profiles[name] = field.at_vertices @ belief.q[part]
         std = belief.deviation(field.at_vertices, part)
         if std is not None:
-            found[f"{name}_std"] = std
+            profiles[f"{name}_std"] = std
             unknown = model.parameter_space.unknowns[name]
-            found |= interval_ends(name, unknown, found[name], std)
-    return found
+            profiles |= interval_ends(name, unknown, profiles[name], std)
+    return profiles
 
 
-def _split(name: str, block: FieldBlock, values: Array, end: str = "") -> dict[str, Array]:
+def _components(name: str, block: FieldBlock, values: Array, end: str = "") -> dict[str, Array]:
     """Return the values at the vertices as variables, one for each component of a vector."""
     names = block.variables(name)
     rows = values.reshape(len(names), -1)

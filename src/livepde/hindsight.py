@@ -60,15 +60,15 @@ class Hindsight:
         """Return the data of a fixed-interval smoother; None without samples."""
         if self._opening is None:
             return None
-        last = len(self._estimates) - 1
-        kept = {n for k, (n, *_) in enumerate(self._estimates) if k in (0, last)}
-        kept |= {n for n, *_ in self._estimates[::fields_every]}
+        final = len(self._estimates) - 1
+        with_fields = {n for k, (n, *_) in enumerate(self._estimates) if k in (0, final)}
+        with_fields |= {n for n, *_ in self._estimates[::fields_every]}
         return FixedInterval(
             opening=self._opening,
             intervals=self._intervals,
             q=self._q,
             jumps=self._jumps,
-            fields=kept,
+            fields=with_fields,
         )
 
     def dataset(self, result: Result, problem: Problem, beliefs: Iterable[Belief]) -> xr.Dataset:
@@ -82,12 +82,12 @@ class Hindsight:
     ) -> Iterator[Record]:
         count = len(self._estimates)
         # A sample whose step failed has the belief of the last accepted sample.
-        said = groupby(reversed(list(enumerate(self._estimates))), key=lambda item: item[1][0])
-        for (_, estimates), belief in zip(said, beliefs, strict=False):  # t0 may have no estimate
-            known = problem.physical(belief)
+        groups = groupby(reversed(list(enumerate(self._estimates))), key=lambda item: item[1][0])
+        for (_, estimates), belief in zip(groups, beliefs, strict=False):  # t0 may have no estimate
+            physical = problem.physical(belief)
             for k, (_, t, status) in estimates:
                 keeps = k % result.fields_every == 0 or k == count - 1
-                yield from result._records([(self._estimate(result, t, known, status), keeps)])
+                yield from result._records([(self._estimate(result, t, physical, status), keeps)])
 
     @staticmethod
     def _estimate(result: Result, t: float, belief: Belief, status: Status) -> Estimate:
@@ -130,9 +130,9 @@ class LinearReadings:
             self._factor, self._weights = factor, self._shifts @ inverse.T
             self._known = inverse @ factor
         # The remainder is the uncertainty of the state given the unknowns.
-        left = rows - rows @ self._known
+        remainder = rows - rows @ self._known
         self._readings.append(predicted + self._weights @ rows.T)
-        self._std.append(np.sqrt(noise**2 + (left * left).sum(axis=1)))
+        self._std.append(np.sqrt(noise**2 + (remainder * remainder).sum(axis=1)))
 
     @property
     def readings(self) -> Array:
@@ -150,15 +150,15 @@ def with_smoothed(data: xr.Dataset, smoothed: xr.Dataset) -> xr.Dataset:
 
     `smoothed`: dataset of the same samples from `Identifier.smoothed`.
     """
-    attrs, found = data.attrs, dict[str, Any]()
-    own = {*attrs["scalars"].split("\n"), *attrs["fields"].split(), *attrs["state"].split()}
+    attrs, variables = data.attrs, dict[str, Any]()
+    run_names = {*attrs["scalars"].split("\n"), *attrs["fields"].split(), *attrs["state"].split()}
     for key, variable in smoothed.data_vars.items():
-        name = key if key in own else bare(str(key))
-        if name in own:
-            found[f"{name}{SMOOTHED}{str(key).removeprefix(str(name))}"] = variable.variable
-    data = data.assign(found)
-    for name in (key for key in found if f"{key}_std" in data and f"{key}_low" not in data):
-        about = data[f"{name}_std"]
+        name = key if key in run_names else bare(str(key))
+        if name in run_names:
+            variables[f"{name}{SMOOTHED}{str(key).removeprefix(str(name))}"] = variable.variable
+    data = data.assign(variables)
+    for name in (key for key in variables if f"{key}_std" in data and f"{key}_low" not in data):
+        deviation = data[f"{name}_std"]
         for end, values in zip(INTERVAL_ENDS, interval_95(data, name), strict=True):
-            data[f"{name}{end}"] = (about.dims, values, about.attrs)
+            data[f"{name}{end}"] = (deviation.dims, values, deviation.attrs)
     return data

@@ -312,9 +312,9 @@ class Identifier(StreamRuns):
             An input has no value yet. In later gaps the last value is held and counted. The
             position of a moving sensor may be missing and is never held.
         """
-        return self._taken(t, z, inputs)[0]
+        return self._process(t, z, inputs)[0]
 
-    def _taken(
+    def _process(
         self, t: Any, z: Readings, inputs: Mapping[str, float] | None
     ) -> tuple[Estimate, Interval]:
         """Process one sample; return the estimate and the interval passed to the law."""
@@ -323,18 +323,18 @@ class Identifier(StreamRuns):
         measured, noise, validation, named = self._channels.parse(z, inputs)
         self._check_weighs(noise)
         values, held = self._filled(named)
-        unstated = self._begun_by(values, t) if self._state is None else ()
+        unstated = self._initialise(values, t) if self._state is None else ()
         # Spin-up: inputs drive the state, readings are only compared with it.
-        used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
-        before, names = self._so_far, self._channels.inputs
+        assimilated = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
+        earlier, names = self._so_far, self._channels.inputs
         missing = np.array(list(map(held.__contains__, names)), dtype=float)
-        gaps = before.gaps.gaps(names, missing)
-        now = End(t=t, inputs=values, z=used, noise=noise, gaps=gaps)
+        gaps = earlier.gaps.gaps(names, missing)
+        end = End(t=t, inputs=values, z=assimilated, noise=noise, gaps=gaps)
         # The interval of a first sample at the initial time is empty: both its ends are the sample.
-        interval = Interval.between(before.last if t > before.t else now, now)
-        parts = self.law, self._work, self.problem
-        self._state, report = stepped(*parts, self._state, interval)
-        self._so_far = before.after(now, report.status, missing, self.problem.control, origin)
+        interval = Interval.between(earlier.last if t > earlier.t else end, end)
+        context = self.law, self._work, self.problem
+        self._state, report = stepped(*context, self._state, interval)
+        self._so_far = earlier.after(end, report.status, missing, self.problem.control, origin)
         held = (*held, *unstated)
         estimate = self._estimate(t, measured, validation, values, report, held, scored=True)
         return estimate, replace(interval, parts=report.parts)
@@ -343,8 +343,8 @@ class Identifier(StreamRuns):
         """Return all inputs, and the names of missing inputs that hold their last value."""
         values, missing = self._channels.filled(named, self._so_far.known)
         # A value that holds until the next reading is not missing.
-        known = self.problem.control.held.last
-        return values, tuple(name for name in missing if name not in known) if known else missing
+        held = self.problem.control.held.last
+        return values, tuple(name for name in missing if name not in held) if held else missing
 
     def _opening(self, inputs: Inputs, t: float) -> Inputs:
         """Return the inputs at the initial time, given `inputs` of the first sample, at time t."""
@@ -352,7 +352,7 @@ class Identifier(StreamRuns):
             return inputs
         return Inputs({**inputs, **self._stated})
 
-    def _begun_by(self, values: Inputs, t: float) -> tuple[str, ...]:
+    def _initialise(self, values: Inputs, t: float) -> tuple[str, ...]:
         """Initialise the state by the inputs of a first sample; raise `SampleError` if not finite.
 
         Return the channels of the model without a known value at the initial time.
@@ -421,24 +421,24 @@ class Identifier(StreamRuns):
         # A stored estimate keeps only the small state of the law; mean and factors are computed on
         # first access.
         latent, judge = self.law.deferred(self._work, self._state)
-        problem, error = self.problem, validation
-        read = latent if self.model.latent.plain else then(latent, problem.physical)
+        problem, errors = self.problem, validation
+        belief_of = latent if self.model.latent.plain else then(latent, problem.physical)
         if self.validation is not None:
-            belief = read()
-            read = lambda: belief  # noqa: E731
+            belief = belief_of()
+            belief_of = lambda: belief  # noqa: E731
             predicted = self.validation.predict(belief.u, belief.q, Moment(t, inputs))
-            error = validation - predicted
+            errors = validation - predicted
             if scored and t >= self.assimilate_from:
                 # Variance of the predicted values, without the noise of the sensors.
                 rows = seen_rows(self.validation, belief, Moment(t, inputs))
-                variance = np.zeros(len(error)) if rows is None else (rows * rows).sum(axis=1)
+                variance = np.zeros(len(errors)) if rows is None else (rows * rows).sum(axis=1)
                 scores = self._so_far.validation.add(validation, predicted, variance)
                 self._so_far = replace(self._so_far, validation=scores)
         return Estimate.deferred(
-            read,
+            belief_of,
             t=t,
             innovation=measured - report.predicted,
-            validation_error=error,
+            validation_error=errors,
             status=report.status,
             steps=report.steps,
             diagnose=report.diagnose,
@@ -453,21 +453,21 @@ class Identifier(StreamRuns):
         self, judge: Callable[[], Verdict], diagnose: Callable[[], Diagnostics[float]]
     ) -> Callable[[], Verdict]:
         """Return a function for the law's verdict with findings on steps, validation and gaps."""
-        taken = self._so_far
-        validation, gaps, steps = taken.validation, taken.gaps, taken.steps
-        known, ignored = self.validation, self.ignored
-        names, units = ((), ()) if known is None else (known.names, known.units)
+        so_far = self._so_far
+        validation, gaps, steps = so_far.validation, so_far.gaps, so_far.steps
+        observed, ignored = self.validation, self.ignored
+        names, units = ((), ()) if observed is None else (observed.names, observed.units)
         inputs = self._channels.inputs
-        assumed = self._assumed
-        if not names and not steps.irregular and gaps.silent and not assumed:
+        zero_start = self._assumed
+        if not names and not steps.irregular and gaps.silent and not zero_start:
             return judge
 
         def found() -> Verdict:
-            held = gaps.findings(inputs, diagnose().shifts)
+            held_findings = gaps.findings(inputs, diagnose().shifts)
             verdict = judge().with_findings(
-                [*steps.findings(), *validation.findings(names, ignored, units), *held]
+                [*steps.findings(), *validation.findings(names, ignored, units), *held_findings]
             )
-            return with_assumed_start(verdict) if assumed else verdict
+            return with_assumed_start(verdict) if zero_start else verdict
 
         return found
 
@@ -483,14 +483,14 @@ class Identifier(StreamRuns):
             raise MissingInputError(
                 f"No estimate before the first sample: it brings the inputs {list(self.inputs)}."
             )
-        nothing = np.full(self.observed.size, np.nan)
-        hidden = np.full(self.validation.size if self.validation else 0, np.nan)
+        no_innovation = np.full(self.observed.size, np.nan)
+        no_validation = np.full(self.validation.size if self.validation else 0, np.nan)
         belief = self._belief()
-        taken = self._so_far
-        predicted = self.observed.predict(belief.u, belief.q, Moment(taken.t, taken.inputs))
-        known = partial(self.law.diagnosed, self._work, self._state)
-        report = Report(Status(), predicted, diagnose=known)
-        return self._estimate(taken.t, nothing, hidden, taken.inputs, report, ())
+        so_far = self._so_far
+        predicted = self.observed.predict(belief.u, belief.q, Moment(so_far.t, so_far.inputs))
+        diagnose = partial(self.law.diagnosed, self._work, self._state)
+        report = Report(Status(), predicted, diagnose=diagnose)
+        return self._estimate(so_far.t, no_innovation, no_validation, so_far.inputs, report, ())
 
     def _settled(self, estimate: Estimate, *, columns: bool = True) -> Estimate:
         """Return the last estimate after a refit of all stored samples, for the end of a run.
@@ -508,15 +508,15 @@ class Identifier(StreamRuns):
         state = self.law.settled(self._work, self._state)
         latent, judge = self.law.final(self._work, state, columns=columns)
         if state is self._state:
-            known = partial(self.law.diagnosed, self._work, state)
-            return replace(estimate, judge=self._judge(judge, known))
+            diagnose_now = partial(self.law.diagnosed, self._work, state)
+            return replace(estimate, judge=self._judge(judge, diagnose_now))
 
         def diagnose() -> Diagnostics[float]:
             # Diagnostics of the last sample are kept; the replaced ones depend on the new estimate.
-            now = self.law.diagnosed(self._work, state)
-            before = estimate.diagnostics
+            new = self.law.diagnosed(self._work, state)
+            last = estimate.diagnostics
             return replace(
-                before, shifts=now.shifts, log_evidence=now.log_evidence, bounded=now.bounded
+                last, shifts=new.shifts, log_evidence=new.log_evidence, bounded=new.bounded
             )
 
         return replace(
@@ -575,18 +575,18 @@ class Identifier(StreamRuns):
         array([20., 20.])
         """
         taken, unit = self._so_far, self.model.time_unit
-        given: Any = times
+        stated_times: Any = times
         if np.iterable(times) and stamp_of(next(iter(times), None)) is not None:
-            given = [taken.counted(time, unit)[0] for time in times]
-        found = np.atleast_1d(numbers(taken.counted(given, unit)[0], "forecast: times"))
-        t = future_times(found, given, taken.t, self.problem.control)
+            stated_times = [taken.counted(time, unit)[0] for time in times]
+        requested = np.atleast_1d(numbers(taken.counted(stated_times, unit)[0], "forecast: times"))
+        t = future_times(requested, stated_times, taken.t, self.problem.control)
         planned = self._channels.planned(inputs, t, taken.t, taken.known)
         state, last = self._state, taken.last
         if state is None:
             opening = self._opening(planned[0], t[0])
             state, last = self._start(opening), replace(last, inputs=opening)
-        blank = np.full(self.observed.size, np.nan)
-        ends = [End(t=when, inputs=then, z=blank) for when, then in zip(t, planned, strict=True)]
+        empty = np.full(self.observed.size, np.nan)
+        ends = [End(t=when, inputs=then, z=empty) for when, then in zip(t, planned, strict=True)]
         intervals = [Interval.between(start, stop) for start, stop in pairwise([last, *ends])]
         sensors = self._channels.sensors
         return ahead(self.law, self._work, self.problem, sensors, state, intervals)
@@ -633,8 +633,8 @@ class Identifier(StreamRuns):
         """Continue from the bytes of `dump`; `where` names them in the errors listed at `load`."""
         header, leaves = checkpoint.unpacked(content, where)
         # The identifier does not change until all parts of the checkpoint have been read.
-        mine = self._header()
-        for key, value in mine.items():
+        own_header = self._header()
+        for key, value in own_header.items():
             if header.get(key) != value:
                 if key == "format":
                     raise RunError(
@@ -645,14 +645,14 @@ class Identifier(StreamRuns):
                     f"{where} was saved with {key} = {header.get(key)!r}; this identifier has "
                     f"{value!r}. Build it as it was when it was saved."
                 )
-        if differs := self.fingerprint.differing(leaves):
+        if changes := self.fingerprint.differing(leaves):
             raise RunError(
-                f"{where} was saved with another {differs}. Build the identifier as it was then, "
+                f"{where} was saved with another {changes}. Build the identifier as it was then, "
                 "or start a new run."
             )
         state = None
         try:
-            taken = self._so_far.restored(leaves, self.inputs)
+            so_far = self._so_far.restored(leaves, self.inputs)
             if header["begun"]:
                 template = self.law.init(self._work, self._q0, self._u0)
                 state = checkpoint.rebuild(template, leaves)
@@ -661,6 +661,6 @@ class Identifier(StreamRuns):
                 f"{where} does not fit this identifier ({error}): build it with the law's options "
                 "as they were when it was saved."
             ) from error
-        self._state, self._so_far = state, taken
+        self._state, self._so_far = state, so_far
         if state is None and not self.inputs:
-            self._begin(taken.inputs)
+            self._begin(so_far.inputs)

@@ -271,8 +271,8 @@ class Model(Shown):
         mesh, order, inputs = self.mesh, self.order, self.inputs
         if more:  # terms of slow sensors; their derivatives use the complex step
             integrands = integrands if isinstance(integrands, Sequence) else [integrands]
-            given = isinstance(derivative, Sequence)
-            derivative = derivative if given else [derivative] * len(integrands)
+            stated = isinstance(derivative, Sequence)
+            derivative = derivative if stated else [derivative] * len(integrands)
             integrands, derivative = [*integrands, *more], [*derivative, *(None for _ in more)]
         return Form(name, integrands, spaces, mesh, order, nonlinear, derivative, inputs, parameter)
 
@@ -287,14 +287,14 @@ class Model(Shown):
         spaces = {"q": self.parameter_space, "u": x, "v": x}
         computed = self._coefficients(coefficients, dA)
         terms = computed.expanded(A) if computed else A
-        own = self._at_sensors.unknown_response
-        self.physical_A = self.linear_A = self._form("A", terms, spaces, "u", dA, "q", own)
+        own_terms = self._at_sensors.unknown_response
+        self.physical_A = self.linear_A = self._form("A", terms, spaces, "u", dA, "q", own_terms)
         # Coefficients that are numbers, with A as a form in unknowns and coefficients; else None.
         self.coefficients = computed if computed and computed.numeric else None
         self.computed = tuple(computed.names) if computed else ()  # names of all coefficients
         if self.coefficients is not None:
-            more = spaces | {"q": self.coefficients.space}
-            self.linear_A = self._form("A", A, more, "u", None, "q", own)
+            arguments = spaces | {"q": self.coefficients.space}
+            self.linear_A = self._form("A", A, arguments, "u", None, "q", own_terms)
         self.form_A = compose(self.physical_A, self.latent)
 
     def _coefficients(
@@ -303,13 +303,13 @@ class Model(Shown):
         if function is None:
             return None
         if self.parameter_space.single or dA is not None:
-            what = "named unknowns" if self.parameter_space.single else "no dA"
-            raise ModelError(f"coefficients require {what}.")
-        typical = self.latent.value(self.latent.prior)
-        found = Coefficients(self.parameter_space, function, typical)
-        if taken := sorted(set(found.names) & set(self.parameter_space.names)):
-            raise ModelError(f"coefficients: '{taken[0]}' is an unknown; choose another name.")
-        return found
+            requirement = "named unknowns" if self.parameter_space.single else "no dA"
+            raise ModelError(f"coefficients require {requirement}.")
+        prior_value = self.latent.value(self.latent.prior)
+        coefficients = Coefficients(self.parameter_space, function, prior_value)
+        if clashes := sorted(set(coefficients.names) & set(self.parameter_space.names)):
+            raise ModelError(f"coefficients: '{clashes[0]}' is an unknown; choose another name.")
+        return coefficients
 
     def with_unknowns(self, more: Mapping[str, Unknown]) -> Model:
         """Return a copy of the model with more unknowns, such as sensor offsets, not in its forms.
@@ -317,10 +317,10 @@ class Model(Shown):
         Raises `ModelError`: this model has one unknown without a name, or a name is taken.
         """
         space = self.parameter_space
-        taken = sorted(set(space.names) & set(more))
-        if space.single or taken:
-            what = f"the name '{taken[0]}' is taken" if taken else "its one unknown has no name"
-            raise ModelError(f"with_unknowns: {what}; write parameter={{name: unknown, ...}}.")
+        clashes = sorted(set(space.names) & set(more))
+        if space.single or clashes:
+            text = f"the name '{clashes[0]}' is taken" if clashes else "its one unknown has no name"
+            raise ModelError(f"with_unknowns: {text}; write parameter={{name: unknown, ...}}.")
         unknowns = {**cast(Mapping[str, Unknown], self.parameter), **more}
         return Model(self.state, unknowns, **self._parts, **self._about)
 
@@ -342,11 +342,11 @@ class Model(Shown):
         Raises `ModelError`: the model has dA or dB, which would lack the derivative of the terms.
         """
         parts = dict(self._parts)
-        for name, more in (("A", A), ("B", B)):
-            if more and parts[f"d{name}"] is not None:
+        for name, added_terms in (("A", A), ("B", B)):
+            if added_terms and parts[f"d{name}"] is not None:
                 raise ModelError(f"with_terms: the model has d{name}; add the terms to {name}.")
-            given = parts[name] if isinstance(parts[name], Sequence) else [parts[name]]
-            parts[name] = [*given, *more]
+            terms = parts[name] if isinstance(parts[name], Sequence) else [parts[name]]
+            parts[name] = [*terms, *added_terms]
         parts["inputs"] = dict.fromkeys([*self.inputs, *inputs], "") | self._input_units
         about, added = dict(self._about), ", with added conditions and sources"
         if about["formula"] and not about["formula"].endswith(added):
@@ -355,9 +355,9 @@ class Model(Shown):
 
     def with_constant_inputs(self, values: Mapping[str, float]) -> Model:
         """Return a copy of the model with constant values of some inputs."""
-        if other := sorted(set(values) - set(self.inputs)):
+        if unknown := sorted(set(values) - set(self.inputs)):
             raise ModelError(
-                f"with_constant_inputs: the model has no input '{other[0]}'; it has "
+                f"with_constant_inputs: the model has no input '{unknown[0]}'; it has "
                 f"{list(self.inputs)}."
             )
 
@@ -370,9 +370,9 @@ class Model(Shown):
                 return [bound(item) for item in part]
             return with_constants(part, values) if callable(part) else part
 
-        left = {name: unit for name, unit in self._input_units.items() if name not in values}
+        free = {name: unit for name, unit in self._input_units.items() if name not in values}
         # These parts never read channels.
-        kept = {name: self._parts[name] for name in ("coefficients", "sensors")} | {"inputs": left}
+        kept = {name: self._parts[name] for name in ("coefficients", "sensors")} | {"inputs": free}
         parts = {name: bound(part) for name, part in self._parts.items() if name not in kept}
         return Model(self.state, self.parameter, **parts, **kept, **self._about)
 
@@ -391,9 +391,9 @@ class Model(Shown):
         return Model(finer(self.state), finer(self.parameter), **self._parts, **self._about)
 
     def _check_parameter(self) -> None:
-        both = set(self.parameter_space.blocks) & set(self.state_space.blocks)
-        if both and not self.state_space.single:
-            raise ModelError(f"state and unknowns are both called {sorted(both)}: rename one.")
+        shared = set(self.parameter_space.blocks) & set(self.state_space.blocks)
+        if shared and not self.state_space.single:
+            raise ModelError(f"state and unknowns are both called {sorted(shared)}: rename one.")
         self._check_names()
         for name, block in self.parameter_space.fields.items():
             if block.field.weight is not unweighted:
@@ -408,11 +408,11 @@ class Model(Shown):
         """Warn if the diffusion is negative at the prior mean, as in u_t = -k u_xx."""
         components, A, B = list(self.state_space.blocks), self.physical_A, self.form_B
         for name in self.state_space.fields:
-            number = components.index(name)
-            if negative_diffusion(self.form_M, A, B, self.parameter_space.prior, number):
-                what = "the model" if self.state_space.single else f"'{name}'"
+            component = components.index(name)
+            if negative_diffusion(self.form_M, A, B, self.parameter_space.prior, component):
+                text = "the model" if self.state_space.single else f"'{name}'"
                 warnings.warn(
-                    f"the diffusion of {what} is negative at the prior mean, which is ill-posed: "
+                    f"the diffusion of {text} is negative at the prior mean, which is ill-posed: "
                     "small disturbances grow without bound. In the weak form of u_t = k u_xx the "
                     "term is + k * dot(grad(u), grad(v)): change its sign in A or B.",
                     stacklevel=4,
@@ -435,8 +435,8 @@ class Model(Shown):
     def order(self) -> int:
         """Quadrature order: stated by the fields, or exact for A(u) q with polynomial factors."""
         states = [block.field for block in self.state_space.fields.values()]
-        if given := [field.quadrature for field in states if field.quadrature is not None]:
-            return max(given)
+        if orders := [field.quadrature for field in states if field.quadrature is not None]:
+            return max(orders)
         degrees = [block.field.element.maxdeg for block in self.parameter_space.fields.values()]
         # The degrees of the factors add up: u, its test function, and q.
         return max(field.order for field in states) + max([int(d) for d in degrees], default=0)
@@ -570,14 +570,14 @@ class Model(Shown):
         """Return the source in X*, shape (n,)."""
         # The last source that does not depend on time, with its inputs, or None if it depends on no
         # inputs. Threads share this pair: it is read once and replaced as a whole.
-        known = self._source
-        if known is not None and (known[0] is None or known[0] is moment.inputs):
-            return known[1]
-        source, read = self.form_F.traced("v", moment)
+        cached = self._source
+        if cached is not None and (cached[0] is None or cached[0] is moment.inputs):
+            return cached[1]
+        source, channels = self.form_F.traced("v", moment)
         source.setflags(write=False)
-        if not read:
+        if not channels:
             self._source = (None, source)
-        elif "t" not in read and isinstance(moment.inputs, Inputs):  # `Inputs` are immutable
+        elif "t" not in channels and isinstance(moment.inputs, Inputs):  # `Inputs` are immutable
             self._source = (moment.inputs, source)
         return source
 
@@ -597,8 +597,8 @@ class Model(Shown):
 
     @property
     def _input_units(self) -> dict[str, str]:
-        given = self._parts["inputs"]
-        return dict(given) if isinstance(given, Mapping) else dict.fromkeys(self.inputs, "")
+        inputs = self._parts["inputs"]
+        return dict(inputs) if isinstance(inputs, Mapping) else dict.fromkeys(self.inputs, "")
 
     @property
     def channel_units(self) -> dict[str, str]:
@@ -623,18 +623,18 @@ class Model(Shown):
         values: dict[str, Array] = {}
         allowed: dict[str, float] = {}
         for name, block in self.state_space.fields.items():
-            given = u0.get(name) if isinstance(u0, Mapping) else u0
-            if given is None:
+            initial = u0.get(name) if isinstance(u0, Mapping) else u0
+            if initial is None:
                 continue
-            own = u[self.state_space.part(name)]
-            inside = block.at_vertices @ own
+            coefficients = u[self.state_space.part(name)]
+            at_vertices = block.at_vertices @ coefficients
             # The second term allows for rounding in a uniform state.
-            spread = 1e-3 * float(np.ptp(inside)) + 1e-9 * float(np.abs(inside).max())
-            for channel, there in block.traces(given, own):
-                values[channel] = np.append(values.get(channel, []), there)
+            spread = 1e-3 * float(np.ptp(at_vertices)) + 1e-9 * float(np.abs(at_vertices).max())
+            for channel, trace in block.traces(initial, coefficients):
+                values[channel] = np.append(values.get(channel, []), trace)
                 allowed[channel] = min(spread, allowed.get(channel, spread))
-        fits = {channel: np.ptp(there) <= allowed[channel] for channel, there in values.items()}
-        return {channel: float(there.mean()) for channel, there in values.items() if fits[channel]}
+        fits = {channel: np.ptp(trace) <= allowed[channel] for channel, trace in values.items()}
+        return {channel: float(trace.mean()) for channel, trace in values.items() if fits[channel]}
 
     def initial(self, u0: Any, moment: Moment = START) -> Array:
         """Return coefficients of u0: a number, a function of x, coefficients, or a mapping."""
@@ -651,15 +651,15 @@ class Model(Shown):
             Coefficients with a wrong shape, or an unknown component.
         """
         components = self.state_space.fields
-        if isinstance(u0, Mapping) and (left := [name for name in components if name not in u0]):
+        if isinstance(u0, Mapping) and (missing := [name for name in components if name not in u0]):
             raise ModelError(
-                f"u0 has no value for {left}: give one for each component of the state, "
+                f"u0 has no value for {missing}: give one for each component of the state, "
                 f"{list(components)}; one number is that of all of them."
             )
-        found = self.state_space.interpolate(u0)
-        if not np.isfinite(found).all():
+        coefficients = self.state_space.interpolate(u0)
+        if not np.isfinite(coefficients).all():
             raise ModelError("u0 has values that are not finite: give finite values.")
-        return found
+        return coefficients
 
     def initial_state(self, q: Array, moment: Moment = START) -> Array:
         """Return coefficients of the initial state for latent parameters q."""

@@ -52,29 +52,29 @@ class ScalarReadout:
 
     def _deviations(self, belief: Belief) -> tuple[list[float], list[float]]:
         """Return standard deviations, and their ratios to prior standard deviations."""
-        factor, nothing = belief.q_factor, [math.nan] * len(self._unknowns)
+        factor, unknown = belief.q_factor, [math.nan] * len(self._unknowns)
         if factor is None:
-            return nothing, nothing
+            return unknown, unknown
         # Rows of a column-major matrix are summed in another order and round differently.
-        chosen = factor[self._rows]
-        after = np.sqrt(np.add.reduce(chosen * chosen, axis=1))
-        std = after
+        rows = factor[self._rows]
+        without_rest = np.sqrt(np.add.reduce(rows * rows, axis=1))
+        std = without_rest
         if not factor.flags.c_contiguous:
             std = np.sqrt(np.add.reduce(factor * factor, axis=1))[self._rows]
         if belief.rest is not None:
             std = np.hypot(std, belief.rest[self._rows])
         if belief.prior_factor is None:
-            return std.tolist(), nothing
+            return std.tolist(), unknown
         if self._prior[0] is not belief.prior_factor:
-            self._prior = belief.prior_factor, self._before(belief.prior_factor)
-        pairs = zip(after.tolist(), self._prior[1], strict=True)
+            self._prior = belief.prior_factor, self._prior_deviations(belief.prior_factor)
+        pairs = zip(without_rest.tolist(), self._prior[1], strict=True)
         return std.tolist(), [share / before for share, before in pairs]
 
-    def _before(self, prior: Array) -> list[float]:
+    def _prior_deviations(self, prior: Array) -> list[float]:
         """Return prior standard deviations, NaN where they are zero."""
-        before = np.linalg.norm(prior[self._rows], axis=1)
-        found: list[float] = np.where(before > 0.0, before, np.nan).tolist()
-        return found
+        deviations = np.linalg.norm(prior[self._rows], axis=1)
+        positive: list[float] = np.where(deviations > 0.0, deviations, np.nan).tolist()
+        return positive
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,11 +184,11 @@ def marginals_at(
     `deviation`: function (rows, part) -> standard deviation of rows @ coefficients[part], or None.
     """
     block, part, unknown = space.fields[name], space.part(name), space.unknown_of(name)
-    at, one = coordinates_of(points, len(block.box[0]), name)
+    at, single = coordinates_of(points, len(block.box[0]), name)
     rows = block.probe(at, f"estimate['{name}'].at: point")
     values, std = rows @ coefficients[part], deviation(rows, part)
     std = np.full_like(values, np.nan) if std is None else std
-    shape = () if one else (at.shape[1],)
+    shape = () if single else (at.shape[1],)
     if block.vector:
         values, std = (x.reshape(-1, at.shape[1]).T for x in (values, std))
         shape = (*shape, values.shape[1])
@@ -200,14 +200,14 @@ def marginals_at(
 def coordinates_of(points: ArrayLike, axes: int, name: str) -> tuple[Array, bool]:
     """Return coordinates of points, shape (axes, points), and whether they are a single point."""
     try:
-        given = np.asarray(points, dtype=float)
+        array = np.asarray(points, dtype=float)
     except (TypeError, ValueError):
-        given = np.zeros((0, 0, 0))
-    one = given.ndim == 0 or (given.ndim == 1 and axes > 1)
-    columns = given.reshape(-1, 1) if axes == 1 and given.ndim < 2 else np.atleast_2d(given)
+        array = np.zeros((0, 0, 0))
+    single = array.ndim == 0 or (array.ndim == 1 and axes > 1)
+    columns = array.reshape(-1, 1) if axes == 1 and array.ndim < 2 else np.atleast_2d(array)
     if columns.ndim != 2 or columns.shape[1] != axes:
         shapes = "(points,)" if axes == 1 else f"({axes},) or (points, {axes})"
         raise ConfigurationError(
             f"estimate['{name}'].at: got points {points!r:.60}; expected numbers, shape {shapes}."
         )
-    return columns.T, one
+    return columns.T, single

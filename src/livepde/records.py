@@ -72,31 +72,31 @@ class Snapshot:
 
     def to_bytes(self) -> bytes:
         """Return names and sizes as JSON, a zero byte, and the numbers."""
-        head: dict[str, Any] = {"told": self.told, "left_out": self.left_out}
-        head["profiles"] = {name: len(values) for name, values in self.profiles.items()}
+        header: dict[str, Any] = {"told": self.told, "left_out": self.left_out}
+        header["profiles"] = {name: len(values) for name, values in self.profiles.items()}
         body = [values.tobytes() for values in self.profiles.values()]
         if self.correlation is not None:
-            head["correlation"] = len(self.correlation)
+            header["correlation"] = len(self.correlation)
             body.append(self.correlation.tobytes())
         # JSON never contains a zero byte: the first one marks its end.
-        return json.dumps(head).encode() + b"\0" + b"".join(body)
+        return json.dumps(header).encode() + b"\0" + b"".join(body)
 
     @classmethod
     def from_bytes(cls, content: bytes) -> Snapshot:
         """Return the snapshot stored by `to_bytes`; other bytes raise errors of various types."""
         text, body = content.split(b"\0", 1)
-        head = json.loads(text)
-        sizes = [*head["profiles"].values()]
-        n = head.get("correlation")
+        header = json.loads(text)
+        sizes = [*header["profiles"].values()]
+        size = header.get("correlation")
         numbers = np.frombuffer(body)
-        if len(numbers) != sum(sizes) + (n or 0) ** 2:
+        if len(numbers) != sum(sizes) + (size or 0) ** 2:
             raise ValueError("fields of another size than declared")
-        *parts, rest = np.split(numbers, np.cumsum(sizes))
+        *parts, correlations = np.split(numbers, np.cumsum(sizes))
         return cls(
-            dict(zip(head["profiles"], parts, strict=True)),
-            {name: (float(told), int(count)) for name, (told, count) in head["told"].items()},
-            None if n is None else rest.reshape(n, n),
-            {str(name): float(share) for name, share in head.get("left_out", {}).items()},
+            dict(zip(header["profiles"], parts, strict=True)),
+            {name: (float(told), int(count)) for name, (told, count) in header["told"].items()},
+            None if size is None else correlations.reshape(size, size),
+            {str(name): float(share) for name, share in header.get("left_out", {}).items()},
         )
 
 
@@ -144,10 +144,10 @@ class RecordArrays:
         """Convert records to arrays; return `RecordArrays` unchanged."""
         if isinstance(records, cls):
             return records
-        found = cls()
+        arrays = cls()
         for record in records:
-            found.append(record)
-        return found
+            arrays.append(record)
+        return arrays
 
     def __len__(self) -> int:
         return len(self._t)
@@ -156,8 +156,8 @@ class RecordArrays:
         count = len(self._t)
         # All values are converted first, so that an invalid value does not change the store.
         notes = {name: float(value) for name, value in record.notes.items()}
-        found = (record.numbers, record.innovation, record.validation_error)
-        numbers, innovation, error = (np.asarray(part, dtype=float).tobytes() for part in found)
+        fields = (record.numbers, record.innovation, record.validation_error)
+        numbers, innovation, error = (np.asarray(part, dtype=float).tobytes() for part in fields)
         for name, value in notes.items():
             column = self._notes.get(name)
             if column is None:
@@ -182,11 +182,11 @@ class RecordArrays:
         return RecordArrays.of([*earlier, replace(last, numbers=numbers, snapshot=snapshot)])
 
     def __iter__(self) -> Iterator[Record]:
-        kept = dict(self.snapshots())
+        snapshots = dict(self.snapshots())
         rows = zip(self.numbers, self.innovation, self.validation_error, strict=True)
         notes = self.notes
         for k, (numbers, innovation, error) in enumerate(rows):
-            said = {name: float(column[k]) for name, column in notes.items()}
+            notes_here = {name: float(column[k]) for name, column in notes.items()}
             yield Record(
                 t=self._t[k],
                 numbers=numbers,
@@ -194,8 +194,8 @@ class RecordArrays:
                 validation_error=error,
                 status=self._status[k],
                 steps=self._steps[k],
-                notes={name: value for name, value in said.items() if not math.isnan(value)},
-                snapshot=kept.get(k),
+                notes={name: value for name, value in notes_here.items() if not math.isnan(value)},
+                snapshot=snapshots.get(k),
             )
 
     def _table(self, values: array[float]) -> Array:
@@ -230,11 +230,11 @@ class RecordArrays:
     @property
     def notes(self) -> dict[str, Array]:
         """Name of a note -> its values, shape (samples,), NaN where missing."""
-        found = {}
+        notes = {}
         for name, values in self._notes.items():
-            found[name] = np.full(len(self), np.nan)
-            found[name][: len(values)] = values
-        return found
+            notes[name] = np.full(len(self), np.nan)
+            notes[name][: len(values)] = values
+        return notes
 
     @property
     def last_snapshot(self) -> int:
@@ -294,10 +294,10 @@ class Layout:
         import xarray as xr
 
         rows = RecordArrays.of(records)
-        times, kept = rows.t, [*rows.snapshots()]
+        times, snapshots = rows.t, [*rows.snapshots()]
         if last is not None:
-            kept.append((-1, last))
-        coords = self._coordinates(times, times[[k for k, _ in kept]])
+            snapshots.append((-1, last))
+        coords = self._coordinates(times, times[[k for k, _ in snapshots]])
         data: dict[str, Any] = {
             kind: (("cell", "corner"), np.array(corners, dtype=np.int32))
             for kind, corners in self.cells.items()
@@ -305,22 +305,22 @@ class Layout:
         numbers = np.reshape(rows.numbers, (len(rows), len(self.numbers)))
         for (name, attrs), values in zip(self.numbers.items(), numbers.T, strict=True):
             data[name] = ("time", values, dict(attrs))
-        data |= self._snapshots([snapshot for _, snapshot in kept])
+        data |= self._snapshots([snapshot for _, snapshot in snapshots])
         if "correlation" in data:
             coords["unknown"] = ("unknown", list(self.scalars))
         data |= self._of_sensors(rows)
         data["status"] = ("time", rows.status, dict(STATUS_FLAGS))
         data["steps"] = ("time", rows.steps, {"long_name": "substeps taken"})
         for name, values in rows.notes.items():
-            taken = name in data or name in coords  # for example by an unknown
-            data[f"{NOTE}{name}" if taken else name] = ("time", values)
-        about = {
+            clash = name in data or name in coords  # for example by an unknown
+            data[f"{NOTE}{name}" if clash else name] = ("time", values)
+        attributes = {
             **self.attrs,
             "fields": " ".join(self.fields),
             "scalars": "\n".join(self.scalars),
             "state": " ".join(self.state),
         }
-        return xr.Dataset(data, coords, about)
+        return xr.Dataset(data, coords, attributes)
 
     def _of_sensors(self, rows: RecordArrays) -> dict[str, Any]:
         """Return the variables with the errors of assimilated and validation sensors."""
@@ -351,10 +351,10 @@ class Layout:
         """Return the positions of sensors, NaN for sensors that are not at one point."""
         if not any(name in self.places for name in names):
             return {}
-        nowhere = [np.nan] * len(self.coordinates)
-        at = np.array([self.places.get(name, nowhere) for name in names])
+        no_place = [np.nan] * len(self.coordinates)
+        positions = np.array([self.places.get(name, no_place) for name in names])
         unit = {"units": self.length_unit}
-        axes = zip(self.coordinates, at.T, strict=True)
+        axes = zip(self.coordinates, positions.T, strict=True)
         return {f"{dimension}_{axis}": (dimension, x, unit) for axis, x in axes}
 
     def _sensor_units(self, dimension: str, names: Sequence[str]) -> dict[str, Any]:
@@ -369,7 +369,7 @@ class Layout:
 
         `axes`, `cells`: names of the axes and kinds of cells of the mesh.
         """
-        places = {f"{of}{axis}" for axis in axes for of in ("", "sensor_", "validation_")}
+        places = {f"{prefix}{axis}" for axis in axes for prefix in ("", "sensor_", "validation_")}
         return {*OWN_NAMES, *places, *cells}
 
     def _snapshots(self, kept: Sequence[Snapshot]) -> dict[str, Any]:
@@ -382,12 +382,12 @@ class Layout:
             attrs |= {"comment": self.comments[name]} if name in self.comments else {}
             data[name] = (("snapshot", "vertex"), values, attrs)
         for name, (_, count) in kept[-1].told.items():
-            told = np.array([snapshot.told[name][0] for snapshot in kept])
-            about = {"long_name": "modes that the data determine", "of": count}
-            data[f"{name}_modes"] = ("snapshot", told, about)
-            left = np.array([snapshot.left_out.get(name, np.nan) for snapshot in kept])
-            about = {"long_name": "share of modes that the law leaves out in the variance of"}
-            data[f"{name}_left_out"] = ("snapshot", left, about)
+            determined = np.array([snapshot.told[name][0] for snapshot in kept])
+            attributes = {"long_name": "modes that the data determine", "of": count}
+            data[f"{name}_modes"] = ("snapshot", determined, attributes)
+            left_out = np.array([snapshot.left_out.get(name, np.nan) for snapshot in kept])
+            attributes = {"long_name": "share of modes that the law leaves out in the variance of"}
+            data[f"{name}_left_out"] = ("snapshot", left_out, attributes)
         last = kept[-1].correlation
         if last is not None and len(self.scalars) > 1:
             data["correlation"] = (("unknown", "other"), last.copy())
@@ -419,13 +419,13 @@ def refusal(name: str) -> str:
 
 def refused_readings(data: xr.Dataset) -> dict[str, Mask]:
     """Return sensor -> mask of samples whose reading the gate refused, if there are any."""
-    found = {}
+    masks = {}
     for name in map(str, data["sensor"].values) if "sensor" in data else ():
         note = refusal(name)
         key = f"{NOTE}{note}" if f"{NOTE}{note}" in data else note
         if key in data and data[key].dims == ("time",):
-            found[name] = np.asarray(data[key].values == 1.0)
-    return found
+            masks[name] = np.asarray(data[key].values == 1.0)
+    return masks
 
 
 def used_errors(data: xr.Dataset, variable: str, dimension: str) -> Array:
@@ -435,8 +435,8 @@ def used_errors(data: xr.Dataset, variable: str, dimension: str) -> Array:
     if not refused:
         return errors
     errors, names = errors.copy(), list(map(str, data[dimension].values))
-    for name, which in refused.items():
-        errors[which, names.index(name)] = math.nan
+    for name, mask in refused.items():
+        errors[mask, names.index(name)] = math.nan
     return errors
 
 
@@ -460,10 +460,10 @@ def name_clashes(
             for variable, use in _uses(name, kind, ends):
                 uses.setdefault(variable, []).append(use)
     return [
-        f"in tables and datasets of a run '{name}' would be {' and '.join(both)}: give the "
-        f"{'unknown' if any('unknown' in use for use in both) else 'component'} another name."
-        for name, both in uses.items()
-        if len(both) > 1
+        f"in tables and datasets of a run '{name}' would be {' and '.join(meanings)}: give the "
+        f"{'unknown' if any('unknown' in use for use in meanings) else 'component'} another name."
+        for name, meanings in uses.items()
+        if len(meanings) > 1
     ]
 
 

@@ -140,9 +140,9 @@ class Result(Shown):
 
     def _announce(self, estimate: Estimate) -> bool:
         """Count an estimate whose record is stored later; return whether to store its fields."""
-        keeps = self._keeps
+        with_fields = self._keeps
         self._follow(estimate)
-        return keeps
+        return with_fields
 
     @property
     def _keeps(self) -> bool:
@@ -224,9 +224,9 @@ class Result(Shown):
 
     def correlation(self) -> pd.DataFrame:
         """Return the correlation of the last scalar estimates; raises as `covariance`."""
-        found = self.covariance()
-        size = np.sqrt(np.diag(found))
-        return found.div(size, axis=0).div(size, axis=1)
+        covariance = self.covariance()
+        size = np.sqrt(np.diag(covariance))
+        return covariance.div(size, axis=0).div(size, axis=1)
 
     def sample(self, n: int, seed: int | np.random.Generator | None = None) -> xr.Dataset:
         """Return draws from the last estimate: numbers, unknown fields and the state.
@@ -385,7 +385,7 @@ class Result(Shown):
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes without the model, whose functions pickle may not support."""
         records, fields = self._finished()
-        own: dict[str, Any] = {
+        attributes: dict[str, Any] = {
             "records": records,
             "_last_fields": fields,
             "_complete": True,
@@ -393,8 +393,8 @@ class Result(Shown):
             "expected": None,
         }
         if self.readings is not None:
-            own["readings"] = partial(kept, self.readings())
-        return {k: v for k, v in vars(self).items() if k not in OF_MODEL} | own
+            attributes["readings"] = partial(kept, self.readings())
+        return {k: v for k, v in vars(self).items() if k not in OF_MODEL} | attributes
 
     def __getattr__(self, name: str) -> Any:
         # Python calls this only for missing names, such as those that `__getstate__` drops.

@@ -67,15 +67,15 @@ def sample_of(item: Any) -> Sample:
 
 def in_order(stream: Iterable[Any], who: str) -> Iterator[Sample]:
     """Iterate over samples with increasing times; `who` names the caller in messages."""
-    before = -math.inf
+    last_time = -math.inf
     for item in stream:
         sample = sample_of(item)
-        if not sample.t > before:
+        if not sample.t > last_time:
             raise SampleError(
                 f"{who}: the sample at t = {sample.t!r} is not later than the one before at "
-                f"t = {before!r}; sort the stream and drop repeated samples."
+                f"t = {last_time!r}; sort the stream and drop repeated samples."
             )
-        before = sample.t
+        last_time = sample.t
         yield sample
 
 
@@ -109,13 +109,13 @@ def noise_channel(name: str) -> str:
 
 def check_noise(name: str, value: Any) -> float:
     """Return the validated noise of a reading; NaN selects the noise of its sensor."""
-    found = number(value, noise_channel(name))
-    if found <= 0.0:
+    std = number(value, noise_channel(name))
+    if std <= 0.0:
         raise SampleError(
-            f"{noise_channel(name)}: got {found:g}; a standard deviation must be positive (NaN: "
+            f"{noise_channel(name)}: got {std:g}; a standard deviation must be positive (NaN: "
             "that of the sensor)."
         )
-    return found
+    return std
 
 
 def by_name(z: Any, names: Sequence[str]) -> dict[str, Any]:
@@ -125,13 +125,13 @@ def by_name(z: Any, names: Sequence[str]) -> dict[str, Any]:
     """
     if not isinstance(z, Mapping):
         z = dict(zip(names, np.atleast_1d(z).tolist(), strict=True))
-    found = {}
+    values = {}
     for name, value in z.items():
         if isinstance(value, tuple | list) and len(value) == 2:
-            found[name], found[noise_channel(name)] = value
+            values[name], values[noise_channel(name)] = value
         else:
-            found[name] = value
-    return found
+            values[name] = value
+    return values
 
 
 def _series(values: Any) -> Any:
@@ -165,10 +165,10 @@ def in_order_of(members: Sequence[str], values: Any, what: str) -> Any:
     values = _series(values)
     if isinstance(values, np.ndarray) or not (hasattr(values, "items") and hasattr(values, "keys")):
         return values
-    labels, each = list(values.keys()), list(values.items())
-    found = {str(label): value for label, value in each}
-    if len(found) == len(each) and found.keys() == set(members):
-        return [found[name] for name in members]
+    labels, items = list(values.keys()), list(values.items())
+    by_label = {str(label): value for label, value in items}
+    if len(by_label) == len(items) and by_label.keys() == set(members):
+        return [by_label[name] for name in members]
     if isinstance(values, Mapping) or labels != list(range(len(members))):
         raise SampleError(
             f"{what} has values for {labels}; expected one for each of the members {list(members)}."
@@ -180,10 +180,10 @@ def mapped(given: Any, what: str) -> Mapping[str, Any]:
     """Convert a mapping, a row or table of pandas, or None (empty) to a mapping from names."""
     if given is None:
         return {}
-    found = dict(given.items()) if is_frame(given) else labelled(given)
-    if not isinstance(found, Mapping):
+    mapping = dict(given.items()) if is_frame(given) else labelled(given)
+    if not isinstance(mapping, Mapping):
         raise SampleError(f"{what}: got {given!r:.80}; expected a mapping from names to values.")
-    return found
+    return mapping
 
 
 def number(value: Any, what: str) -> float:
@@ -195,12 +195,12 @@ def number(value: Any, what: str) -> float:
     if isinstance(value, str | bytes | bool):
         raise SampleError(f"{what}: got {value!r}; expected a number (NaN if it is missing).")
     try:
-        found = float(value)
+        result = float(value)
     except (TypeError, ValueError):
         raise SampleError(f"{what}: got {value!r}; expected a number (NaN if missing).") from None
-    if np.isinf(found):
-        raise SampleError(f"{what}: got {found}; send NaN for a missing sample, never infinity.")
-    return found
+    if np.isinf(result):
+        raise SampleError(f"{what}: got {result}; send NaN for a missing sample, never infinity.")
+    return result
 
 
 def numbers(values: Any, what: str) -> Array:
@@ -218,13 +218,13 @@ def numbers(values: Any, what: str) -> Array:
 
 def plan(name: str, values: Any, count: int) -> Array:
     """Return the values of an input at `count` times, shape (count,)."""
-    found = numbers(values, f"input '{name}'")
-    if found.shape not in ((), (count,)):
+    array = numbers(values, f"input '{name}'")
+    if array.shape not in ((), (count,)):
         raise SampleError(
-            f"input '{name}' has shape {found.shape}; needs one number, or {count}: one for each "
+            f"input '{name}' has shape {array.shape}; needs one number, or {count}: one for each "
             "time."
         )
-    return np.broadcast_to(found, (count,))
+    return np.broadcast_to(array, (count,))
 
 
 def _array(z: Any) -> Array:
@@ -251,8 +251,8 @@ def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
     The noise is None if no reading specifies its own.
     """
     # Most samples are valid arrays, which skip the slower checks below.
-    usual = type(z) is np.ndarray and z.dtype == float and z.shape == (observed.size,)
-    if usual and np.count_nonzero(np.isfinite(z)) == z.size:
+    plain_array = type(z) is np.ndarray and z.dtype == float and z.shape == (observed.size,)
+    if plain_array and np.count_nonzero(np.isfinite(z)) == z.size:
         return np.array(z), None
     if isinstance(z, np.ma.MaskedArray):
         z = numbers(z, "z")
@@ -274,8 +274,8 @@ def _values(array: Array, observed: Observed) -> Array:
             "each with its noise."
         )
     if np.isinf(array).any():
-        where = observed.names[int(np.flatnonzero(np.isinf(array))[0])]
-        raise SampleError(f"channel '{where}' is infinite; send NaN for a missing sample.")
+        sensor = observed.names[int(np.flatnonzero(np.isinf(array))[0])]
+        raise SampleError(f"channel '{sensor}' is infinite; send NaN for a missing sample.")
     return array.copy()
 
 
@@ -288,15 +288,15 @@ class Channels:
     validation: Observed | None  # sensors that are only scored
 
     def __post_init__(self) -> None:
-        both = [name for name in self.hidden if name in self.observed.names]
-        if both:
+        shared = [name for name in self.hidden if name in self.observed.names]
+        if shared:
             raise ConfigurationError(
-                f"channels {both} are both assimilated and for validation: rename the "
+                f"channels {shared} are both assimilated and for validation: rename the "
                 'sensors, as in Points({"T_30": 0.3}).'
             )
-        if taken := [name for name in self.inputs if name in self.noise]:
+        if used := [name for name in self.inputs if name in self.noise]:
             raise ConfigurationError(
-                f"channel '{taken[0]}' has the name of the noise of a reading: rename it."
+                f"channel '{used[0]}' has the name of the noise of a reading: rename it."
             )
 
     @cached_property
@@ -333,9 +333,9 @@ class Channels:
     def optional(self) -> frozenset[str]:
         """Inputs that may be missing: positions of moving sensors."""
         sensors = [item.observation for item in self.sensors]
-        needed = {name for item in sensors for name in set(item.inputs) - item.optional}
-        found = frozenset().union(*(item.optional for item in sensors))
-        return found - needed - set(self.forced)
+        required = {name for item in sensors for name in set(item.inputs) - item.optional}
+        optional = frozenset().union(*(item.optional for item in sensors))
+        return optional - required - set(self.forced)
 
     def parse(
         self, z: Readings, inputs: Mapping[str, float] | None
@@ -354,9 +354,9 @@ class Channels:
             measured, noise = readings(z, self.observed)
             validation, named = np.full(len(self.hidden), np.nan), {}
         if inputs:
-            given = self._named(inputs)
-            self._check_once(named, given)
-            named |= {n: v for n, v in given.items() if n not in named or not math.isnan(v)}
+            named_inputs = self._named(inputs)
+            self._check_once(named, named_inputs)
+            named |= {n: v for n, v in named_inputs.items() if n not in named or not math.isnan(v)}
         return measured, noise, validation, named
 
     def labelled(self, z: Any) -> Any:
@@ -409,8 +409,8 @@ class Channels:
                 continue
             if isinstance(value, tuple | list):
                 value, stds[name] = self._pair(name, value)
-            usual = type(value) is float and math.isfinite(value)
-            values[name] = value if usual else number(value, f"channel '{name}'")
+            finite = type(value) is float and math.isfinite(value)
+            values[name] = value if finite else number(value, f"channel '{name}'")
         noise = own_noise(_row(self.observed.names, stds)) if stds else None
         return _row(self.observed.names, values), noise, _row(self.hidden, values), values
 
@@ -444,10 +444,10 @@ class Channels:
             value = named.get(name, np.nan)
             if math.isnan(value) and name not in self.optional:
                 if name not in set(known):
-                    needed = [c for c in self.inputs if c not in self.optional]
+                    required = [c for c in self.inputs if c not in self.optional]
                     raise MissingInputError(
                         f"input '{name}' has no value in the first sample, nor before; start where "
-                        f"all of {needed} have one."
+                        f"all of {required} have one."
                     )
                 value = known[name]
                 held.append(name)
@@ -467,11 +467,11 @@ class Channels:
         last sample.
         """
         times, planned, last = list(times), [], known
-        given = mapped(inputs, "forecast: inputs")
-        plans = {name: plan(name, values, len(times)) for name, values in given.items()}
-        for k, when in enumerate(times):
+        stated = mapped(inputs, "forecast: inputs")
+        plans = {name: plan(name, values, len(times)) for name, values in stated.items()}
+        for k, time in enumerate(times):
             named = self._named({name: float(values[k]) for name, values in plans.items()})
-            if when == t:  # positions of moving sensors are known at the last sample
+            if time == t:  # positions of moving sensors are known at the last sample
                 named = {**last, **{name: v for name, v in named.items() if not np.isnan(v)}}
             last, _ = self.filled(named, last)
             planned.append(last)

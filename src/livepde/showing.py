@@ -54,22 +54,22 @@ def listed(names: Iterable[str]) -> str:
     >>> listed("ab"), listed("abcdefghij")
     ('a, b', 'a, b, c, d, e, f, g, h, ... (10)')
     """
-    every = list(names)
-    more = f", ... ({len(every)})" if len(every) > MOST else ""
-    return ", ".join(every[:MOST]) + more
+    names_list = list(names)
+    rest = f", ... ({len(names_list)})" if len(names_list) > MOST else ""
+    return ", ".join(names_list[:MOST]) + rest
 
 
 def options_of(value: Any) -> str:
     """Return a dataclass as text, with the options that differ from their defaults."""
-    said = []
+    texts = []
     for field in dataclasses.fields(value) if dataclasses.is_dataclass(value) else ():
-        usual = field.default
+        default = field.default
         if field.default_factory is not dataclasses.MISSING:
-            usual = field.default_factory()
-        given = getattr(value, field.name)
-        if field.init and repr(given) != repr(usual):
-            said.append(f"{field.name}={given!r}")
-    return f"{type(value).__name__}({', '.join(said)})"
+            default = field.default_factory()
+        value_of_field = getattr(value, field.name)
+        if field.init and repr(value_of_field) != repr(default):
+            texts.append(f"{field.name}={value_of_field!r}")
+    return f"{type(value).__name__}({', '.join(texts)})"
 
 
 def expression(function: Callable[..., Any]) -> str:
@@ -84,11 +84,11 @@ def expression(function: Callable[..., Any]) -> str:
         return name
     try:
         source = textwrap.dedent(inspect.getsource(function))
-        found = list(_returned(source, list(code.co_varnames[: code.co_argcount])))
+        expressions = list(_returned(source, list(code.co_varnames[: code.co_argcount])))
     except (OSError, SyntaxError, TypeError):
         return name
     # Functions with the same arguments in one statement cannot be distinguished.
-    return found[0] if len(found) == 1 and len(found[0]) <= LONG else name
+    return expressions[0] if len(expressions) == 1 and len(expressions[0]) <= LONG else name
 
 
 def _returned(source: str, arguments: list[str]) -> Iterator[str]:
@@ -96,13 +96,13 @@ def _returned(source: str, arguments: list[str]) -> Iterator[str]:
     for node in ast.walk(_parsed(source)):
         if not isinstance(node, ast.Lambda | ast.FunctionDef):
             continue
-        if [one.arg for one in node.args.args] != arguments:
+        if [argument.arg for argument in node.args.args] != arguments:
             continue
         if isinstance(node, ast.Lambda):
             yield ast.unparse(node.body)
         elif isinstance(node.body[-1], ast.Return) and node.body[-1].value is not None:
-            whole = len(node.body) - (ast.get_docstring(node) is not None) == 1
-            yield ast.unparse(node.body[-1].value) if whole else f"{node.name}(...)"
+            single = len(node.body) - (ast.get_docstring(node) is not None) == 1
+            yield ast.unparse(node.body[-1].value) if single else f"{node.name}(...)"
 
 
 def _parsed(source: str) -> ast.AST:

@@ -211,7 +211,7 @@ class HilbertSpace:
         chosen at random. For the other coefficients v_i G_ii, or v_i if G is not explicit, is
         interpolated harmonically on the graph of G: each value is the mean of its neighbours.
         """
-        return self._between(*self._solved)
+        return self._between(*self._sampled_variances)
 
     def beyond(self, modes: Array) -> Array:
         """Return the prior variance of each coefficient outside given modes, shape (n,).
@@ -220,62 +220,62 @@ class HilbertSpace:
         the modes is interpolated. Values at rounding level are set to zero. `modes`: G-orthonormal
         columns, (n, k).
         """
-        held = (modes**2).sum(axis=1)
+        variance_of_modes = (modes**2).sum(axis=1)
         if self.dim <= LARGE:
             # Differences at rounding level are set to zero, since a negative variance has no root.
-            left = self.variance - held
-            return np.where(left > ROUNDING * self.variance, left, 0.0)
-        solved, variance = self._solved
-        left = variance - held[solved]
+            remainder = self.variance - variance_of_modes
+            return np.where(remainder > ROUNDING * self.variance, remainder, 0.0)
+        sampled, variance = self._sampled_variances
+        remainder = variance - variance_of_modes[sampled]
         # Only the remainder is interpolated: the part of the modes is known at every coefficient.
         # The tolerance is larger than above because modes of large spaces are less accurate.
-        return self._between(solved, np.where(left > 10 * PRECISE * variance, left, 0.0))
+        return self._between(sampled, np.where(remainder > 10 * PRECISE * variance, remainder, 0.0))
 
     @cached_property
-    def _solved(self) -> tuple[IntArray, Array]:
+    def _sampled_variances(self) -> tuple[IntArray, Array]:
         """Sampled coefficients and their prior variances, computed by Riesz solves."""
         free = np.flatnonzero(self.free)
         if len(free) > LARGE:
             count = max(min(SOLVED, 2 * SOLVED * LARGE // len(free)), FEWEST_SOLVED)
-            solved = np.sort(np.random.default_rng(0).choice(free, count, replace=False))
+            sampled = np.sort(np.random.default_rng(0).choice(free, count, replace=False))
         else:
-            solved = free[np.unique(np.linspace(0, len(free) - 1, SOLVED).astype(int))]
-        variance = np.zeros(len(solved))
+            sampled = free[np.unique(np.linspace(0, len(free) - 1, SOLVED).astype(int))]
+        variance = np.zeros(len(sampled))
         # Unit vectors are solved in blocks, which bounds the memory of large spaces.
         block = max(1, min(BLOCK, ENTRIES // max(self.dim, 1)))
-        for start in range(0, len(solved), block):
-            at = solved[start : start + block]
-            unit = np.zeros((self.dim, len(at)))
-            unit[at, np.arange(len(at))] = 1.0
-            found = self.factor.solve(unit)[at, np.arange(len(at))]
-            variance[start : start + block] = found
-        return solved, variance
+        for start in range(0, len(sampled), block):
+            indices = sampled[start : start + block]
+            unit = np.zeros((self.dim, len(indices)))
+            unit[indices, np.arange(len(indices))] = 1.0
+            values = self.factor.solve(unit)[indices, np.arange(len(indices))]
+            variance[start : start + block] = values
+        return sampled, variance
 
-    def _between(self, solved: IntArray, values: Array) -> Array:
-        """Return values at all free coefficients by harmonic interpolation from `solved`."""
-        found = np.zeros(self.dim)
-        found[solved] = values
-        rest = np.setdiff1d(np.flatnonzero(self.free), solved)
-        if len(rest):
-            whole, links = self.augmented, self._links
+    def _between(self, sampled: IntArray, values: Array) -> Array:
+        """Return values at all free coefficients by harmonic interpolation from `sampled`."""
+        result = np.zeros(self.dim)
+        result[sampled] = values
+        others = np.setdiff1d(np.flatnonzero(self.free), sampled)
+        if len(others):
+            gram, links = self.augmented, self._links
             # The product v_i G_ii is dimensionless, so that neighbouring values and slopes can be
             # averaged.
-            scale = whole.diagonal() if whole.shape[0] == self.dim else np.ones(self.dim)
+            scale = gram.diagonal() if gram.shape[0] == self.dim else np.ones(self.dim)
             graph = sp.csr_array(sp.diags_array(links.sum(axis=1)) - links)
-            inner = sp.csr_array(graph[rest][:, rest])
+            inner = sp.csr_array(graph[others][:, others])
             pattern = Pattern.of(inner)
             factor = analyse(pattern, symmetric=True).factorise(_data(inner))
-            known = graph[rest][:, solved] @ (found * scale)[solved]
-            found[rest] = -factor.solve(known) / scale[rest]
-        return found
+            right_side = graph[others][:, sampled] @ (result * scale)[sampled]
+            result[others] = -factor.solve(right_side) / scale[others]
+        return result
 
     @property
     def _links(self) -> sp.csr_array:
         """Adjacency matrix of the coefficients coupled by G, directly or by auxiliary unknowns."""
-        whole = sp.csr_array(self.augmented)
-        ones = sp.csr_array((np.ones(whole.nnz), whole.indices, whole.indptr), whole.shape)
+        gram = sp.csr_array(self.augmented)
+        pattern = sp.csr_array((np.ones(gram.nnz), gram.indices, gram.indptr), gram.shape)
         n = self.dim
-        links = sp.csr_array(ones[:n, :n] + ones[:n, n:] @ ones[n:, :n])
+        links = sp.csr_array(pattern[:n, :n] + pattern[:n, n:] @ pattern[n:, :n])
         return sp.csr_array((np.ones(links.nnz), links.indices, links.indptr), links.shape)
 
     def spread(self, weights: Array, modes: Array) -> float:
@@ -294,8 +294,8 @@ class HilbertSpace:
         total = float((weights @ modes**2).sum())
         for sign in signs.T:
             probe = np.sqrt(weights) * self.free * sign
-            seen = modes.T @ probe
-            total += max(float(probe @ self.riesz(probe) - seen @ seen), 0.0) / PROBES
+            coordinates = modes.T @ probe
+            total += max(float(probe @ self.riesz(probe) - coordinates @ coordinates), 0.0) / PROBES
         return total
 
     def modes(self, count: int, mass: sp.csr_array) -> tuple[Array, Array]:
@@ -471,19 +471,19 @@ class BorderedSpace(HilbertSpace):
 
 def product(spaces: Sequence[HilbertSpace], name: str, fixed: IntArray) -> HilbertSpace:
     """Return the product space, with a given name and fixed coefficients."""
-    whole = sp.csr_array(sp.block_diag([s.augmented for s in spaces], format="csr"))
+    gram = sp.csr_array(sp.block_diag([s.augmented for s in spaces], format="csr"))
     sizes = [s.augmented.shape[0] for s in spaces]
     starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     leading = [np.arange(k, k + s.dim) for k, s in zip(starts, spaces, strict=True)]
-    rest = [
+    auxiliary = [
         np.arange(k + s.dim, k + size) for k, s, size in zip(starts, spaces, sizes, strict=True)
     ]
     dim = sum(s.dim for s in spaces)
-    if dim == whole.shape[0]:
-        return HilbertSpace(whole, name, fixed)
+    if dim == gram.shape[0]:
+        return HilbertSpace(gram, name, fixed)
     # A Schur complement needs the coefficients of all spaces first, auxiliary unknowns last.
-    order = np.concatenate([*leading, *rest])
-    return BorderedSpace(sp.csr_array(whole[order][:, order]), dim, name, fixed)
+    order = np.concatenate([*leading, *auxiliary])
+    return BorderedSpace(sp.csr_array(gram[order][:, order]), dim, name, fixed)
 
 
 @dataclass(frozen=True, eq=False)

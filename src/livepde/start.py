@@ -41,20 +41,20 @@ def time_option(name: str, value: Any) -> float:
 
 def check_kinds(validation: Any, scheme: Any) -> None:
     """Raise `ConfigurationError` if `validation` or `scheme` has a wrong type."""
-    for what, part, kind, expected in (
+    for option, value, kind, expected in (
         ("validation", validation, Observation, "an observation, such as Points"),
         ("scheme", scheme, Scheme, "a time scheme, such as Alexander2()"),
     ):
-        if part is not None and not isinstance(part, kind):
-            raise ConfigurationError(f"{what}: got {part!r:.80}; expected {expected}.")
+        if value is not None and not isinstance(value, kind):
+            raise ConfigurationError(f"{option}: got {value!r:.80}; expected {expected}.")
 
 
 def check_start(model: Model, t0: float, u0: Any, uncertain: Mapping[str, Any]) -> None:
     """Raise `ConfigurationError` for a non-finite t0, or a missing or repeated initial state."""
     if not np.isfinite(t0):
         raise ConfigurationError(f"t0 must be a finite number; got {t0}.")
-    for name, given in uncertain.items():
-        if given and u0 is None:
+    for name, stated in uncertain.items():
+        if stated and u0 is None:
             raise ConfigurationError(f"{name} describes u0: give u0, too.")
     if u0 is not None and model.form_initial is not None:
         raise ConfigurationError("the model has its own initial state (initial=): leave out u0.")
@@ -78,24 +78,24 @@ def with_sensors(
     model: Model, observation: Observation, validation: Observation | None = None
 ) -> Model:
     """Return the model with the unknowns of its sensors and the states of slow sensors."""
-    known = model.parameter_space.unknowns
-    own = {name: item for name, item in observation.unknowns.items() if name not in known}
-    model = model.with_unknowns(own) if own else model
-    states = {**_shown_states(validation), **observation.states}
-    new = {name: one for name, one in states.items() if name not in model.sensors}
-    return model.with_sensors(new) if new else model
+    unknowns = model.parameter_space.unknowns
+    added = {name: item for name, item in observation.unknowns.items() if name not in unknowns}
+    model = model.with_unknowns(added) if added else model
+    states = {**_states_of_validation(validation), **observation.states}
+    added_states = {name: state for name, state in states.items() if name not in model.sensors}
+    return model.with_sensors(added_states) if added_states else model
 
 
-def _shown_states(validation: Observation | None) -> Mapping[str, SensorState]:
+def _states_of_validation(validation: Observation | None) -> Mapping[str, SensorState]:
     """Return the states of slow validation sensors, whose time constants must be known."""
-    shown = {} if validation is None else validation.states
-    for name, state in shown.items():
+    states = {} if validation is None else validation.states
+    for name, state in states.items():
         if state.unknown:
             raise ConfigurationError(
                 f"validation: the time constant of '{name}' is an unknown, which only assimilated "
                 "sensors have: give a number."
             )
-    return shown
+    return states
 
 
 def stated_problem(
@@ -140,18 +140,18 @@ def initial_readings(
                 f"u0_from: '{name}' is neither an assimilated sensor nor a channel of the "
                 f"model; these are {sorted(known)}."
             )
-    found = {}
-    for name, given in u0_from.items():
-        weight, noise = given if isinstance(given, tuple) else (given, math.nan)
-        at = model.state_space.interpolate(weight)
-        found[name] = InitialReading(at, check_noise(name, noise))
-    return found
+    readings = {}
+    for name, stated in u0_from.items():
+        weight, noise = stated if isinstance(stated, tuple) else (stated, math.nan)
+        coefficients = model.state_space.interpolate(weight)
+        readings[name] = InitialReading(coefficients, check_noise(name, noise))
+    return readings
 
 
 def initial_errors(model: Model, u0_errors: Iterable[Any]) -> Array:
     """Return coefficients of the independent errors of u0, shape (errors, n)."""
-    found = np.array([model.state_space.interpolate(error) for error in u0_errors])
-    found = found.reshape(-1, model.X.dim)
-    if not np.isfinite(found).all():
+    coefficients = np.array([model.state_space.interpolate(error) for error in u0_errors])
+    coefficients = coefficients.reshape(-1, model.X.dim)
+    if not np.isfinite(coefficients).all():
         raise ConfigurationError("u0_errors: an error of u0 is not finite; give finite values.")
-    return found
+    return coefficients

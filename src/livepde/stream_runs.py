@@ -55,7 +55,7 @@ class StreamRuns(Shown):
         """Process one sample and return the estimate at its time."""
 
     @abstractmethod
-    def _taken(
+    def _process(
         self, t: Any, z: Readings, inputs: Mapping[str, float] | None
     ) -> tuple[Estimate, Interval]: ...
 
@@ -151,10 +151,10 @@ class StreamRuns(Shown):
         """
         options: dict[str, Any] = {"time": time, "time_unit": time_unit, "columns": columns}
         options |= {"units": units, "strict": strict}
-        given = {name: value for name, value in options.items() if value is not None}
-        stream, result = self._samples_of(stream, given), self._result(fields_every)
-        begun, taken = copy.copy(self), list[Sample]()  # shallow, since states are immutable
-        result.smoother = partial(begun.smoothed, taken, fields_every=fields_every)
+        stated = {name: value for name, value in options.items() if value is not None}
+        stream, result = self._samples_of(stream, stated), self._result(fields_every)
+        at_start, taken = copy.copy(self), list[Sample]()  # shallow, since states are immutable
+        result.smoother = partial(at_start.smoothed, taken, fields_every=fields_every)
         result.readings = partial(self._channels.readings, taken)
         if progress:
             from livepde.progress import watched
@@ -172,8 +172,8 @@ class StreamRuns(Shown):
         if result.last is not None:
             result._settle(self._settled(result.last))
             noise = self.law.reading_noise(self._work, self._state)
-            if noise is not None and not begun._so_far.samples and not self.model.latent.moves:
-                result.expected = partial(begun._expected, taken, noise)
+            if noise is not None and not at_start._so_far.samples and not self.model.latent.moves:
+                result.expected = partial(at_start._expected, taken, noise)
         return result
 
     def _samples_of(self, data: Any, reading: Mapping[str, Any]) -> Iterable[Any]:
@@ -188,18 +188,18 @@ class StreamRuns(Shown):
         from livepde.streams.given import Reading
 
         optional = [name for name in self._channels.inputs if name in self._channels.optional]
-        needed = [name for name in self._channels.names if name not in optional]
+        required = [name for name in self._channels.names if name not in optional]
         units = self.model.channel_units
         for sensors in self._channels.sensors:
             units |= dict(zip(sensors.names, sensors.units, strict=True))
-        how = Reading(
-            channels=needed,
+        reader = Reading(
+            channels=required,
             optional=[*optional, *self._channels.noise],
             unit=self.model.time_unit,
             channel_units=units,
             **reading,
         )
-        table = how.table(data)
+        table = reader.table(data)
         if table.origin is None:
             return table
         stamp = since_1970(table.origin)
@@ -251,21 +251,21 @@ class StreamRuns(Shown):
                 "smoothed takes a run from its first sample on: call it of an identifier that has "
                 "taken none."
             )
-        if why := self._unsmoothed:
-            raise LawError(f"smoothed: {why}; use SensitivityLaw.")
+        if reason := self._unsmoothed:
+            raise LawError(f"smoothed: {reason}; use SensitivityLaw.")
         stream = self._samples_of(stream, {})
-        who, run, before = copy.copy(self), Hindsight(self._q0), self._state
+        copied, hindsight, initial = copy.copy(self), Hindsight(self._q0), self._state
         for item in stream:
             sample = sample_of(item)
-            estimate, interval = who._taken(sample.t, sample.z, sample.inputs)
-            if before is None:  # the initial state depends on inputs of the first sample
-                before = self._start(Inputs(interval.inputs0))
-            run.add(estimate, interval, who._latent_belief().q)
+            estimate, interval = copied._process(sample.t, sample.z, sample.inputs)
+            if initial is None:  # the initial state depends on inputs of the first sample
+                initial = self._start(Inputs(interval.inputs0))
+            hindsight.add(estimate, interval, copied._latent_belief().q)
         result = self._result(fields_every)
-        result.layout = who._dated(result.layout)
-        data = run.fixed_interval(fields_every)
-        beliefs = data and self.law.smoothed(self._work, before, who._state, data)
-        return run.dataset(result, self.problem, beliefs or ())
+        result.layout = copied._dated(result.layout)
+        data = hindsight.fixed_interval(fields_every)
+        beliefs = data and self.law.smoothed(self._work, initial, copied._state, data)
+        return hindsight.dataset(result, self.problem, beliefs or ())
 
     def _expected(
         self, samples: Iterable[Sample], noise: Array, q: Array, draws: Array
@@ -278,21 +278,21 @@ class StreamRuns(Shown):
         """
         latent = self.model.latent
         centre = latent.inverse(q)
-        found = LinearReadings(np.array([latent.inverse(draw) for draw in draws]) - centre)
-        who = self._started(centre, self._u0, self.problem, self._work, assumed=False)
-        who._forget()
-        nothing = np.full(self.observed.size, np.nan)
+        linear = LinearReadings(np.array([latent.inverse(draw) for draw in draws]) - centre)
+        identifier = self._started(centre, self._u0, self.problem, self._work, assumed=False)
+        identifier._forget()
+        missing = np.full(self.observed.size, np.nan)
         for sample in samples:
-            _, own, _, named = self._channels.parse(sample.z, sample.inputs)
+            _, own_noise, _, named = self._channels.parse(sample.z, sample.inputs)
             inputs = {name: named[name] for name in self._channels.inputs if name in named}
-            estimate, interval = who._taken(sample.t, nothing, inputs)
-            std = noise if own is None else np.where(np.isnan(own), noise, own)
+            estimate, interval = identifier._process(sample.t, missing, inputs)
+            std = noise if own_noise is None else np.where(np.isnan(own_noise), noise, own_noise)
             used = estimate.status.ok and estimate.t >= self.assimilate_from
-            latent_factor = who._latent_belief().q_factor
-            belief = who._belief()
+            latent_factor = identifier._latent_belief().q_factor
+            belief = identifier._belief()
             predicted = self.observed.predict(belief.u, belief.q, interval.end)
             rows = seen_rows(self.observed, belief, interval.end)
             if latent_factor is None or rows is None:
                 raise LawError(f"{type(self.law).__name__} has no covariance: use SensitivityLaw.")
-            found.add(predicted, rows, latent_factor, std if used else nothing)
-        return found.readings, found.std
+            linear.add(predicted, rows, latent_factor, std if used else missing)
+        return linear.readings, linear.std

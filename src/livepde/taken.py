@@ -42,12 +42,12 @@ class TakenSamples:
     @classmethod
     def start(cls, t0: float, sensors: int, validation: int, inputs: int) -> TakenSamples:
         """Return the value before the first sample."""
-        nothing = Inputs({})
+        missing = Inputs({})
         return cls(
             t=float(t0),
             z=np.full(sensors, np.nan),
-            inputs=nothing,
-            known=nothing,
+            inputs=missing,
+            known=missing,
             samples=0,
             origin=math.nan,
             validation=ValidationLedger.start(validation),
@@ -128,12 +128,12 @@ class TakenSamples:
         """Return the value after a step; `missing`: 1 for each input that holds its last value."""
         length = end.t - self.t
         steps = self.steps.add(status.code, length, control.stretches(length))
-        now = changed(self, samples=self.samples + 1, origin=origin, steps=steps)
+        counted = changed(self, samples=self.samples + 1, origin=origin, steps=steps)
         if not status.taken:  # an input with "hold" may have no further reading
-            last = {name: end.inputs[name] for name in control.held.last}
-            return changed(now, known=Inputs({**self.known, **last}))
+            held = {name: end.inputs[name] for name in control.held.last}
+            return changed(counted, known=Inputs({**self.known, **held}))
         gaps = self.gaps.add(length, missing) if len(missing) else self.gaps
-        return changed(now, t=end.t, z=end.z, inputs=end.inputs, known=end.inputs, gaps=gaps)
+        return changed(counted, t=end.t, z=end.z, inputs=end.inputs, known=end.inputs, gaps=gaps)
 
     @property
     def leaves(self) -> dict[str, Any]:

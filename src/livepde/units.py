@@ -138,8 +138,8 @@ def conversion(given: str, unit: str, where: str) -> Affine:
         given = SCALES.get(given, given)
     if given == unit:
         return Affine()
-    if (usual := USUAL.get((with_powers(given), unit))) is not None:
-        return Affine(*usual)
+    if (known := USUAL.get((with_powers(given), unit))) is not None:
+        return Affine(*known)
     check_unit(given, where)
     zero, one, two = _converted(given, unit, where)
     # In logarithmic units such as decibels, three equidistant values do not lie on a line.
@@ -208,9 +208,9 @@ def has_states(unit: str) -> bool:
 
 def unit_in(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
     """Return the unit in the name of a column, if it can be converted to `unit`; else empty."""
-    for given in filter(None, (pattern.search(name) for pattern in patterns)):
-        powers = with_powers(given[1])
-        for text in (powers, given[1], powers.replace("_", "/")):  # L_s is L/s
+    for match in filter(None, (pattern.search(name) for pattern in patterns)):
+        powers = with_powers(match[1])
+        for text in (powers, match[1], powers.replace("_", "/")):  # L_s is L/s
             with suppress(CaseError):
                 conversion(text, unit, name)
                 return SCALES.get(text, text) if unit in TEMPERATURES else text
@@ -223,8 +223,8 @@ def counted_since(name: str) -> str:
     >>> counted_since("time [hours since 2023-06-01 00:00:00]"), counted_since("s since start")
     ('hours since 2023-06-01 00:00:00', '')
     """
-    found = SINCE.search(name)
-    return found[1].strip() if found else ""
+    match = SINCE.search(name)
+    return match[1].strip() if match else ""
 
 
 def other_time_unit(name: str, unit: str) -> str:
@@ -235,8 +235,8 @@ def other_time_unit(name: str, unit: str) -> str:
     """
     if unit and (counted := counted_since(name)):
         return counted
-    stated = (pattern.search(name) for pattern in OF_TIMES)
-    if not (unit and any(found and OF_TIME.fullmatch(found[1]) for found in stated)):
+    matches = (pattern.search(name) for pattern in OF_TIMES)
+    if not (unit and any(match and OF_TIME.fullmatch(match[1]) for match in matches)):
         return ""  # without loading pint
     return other_unit(name, unit, *OF_TIMES)
 
@@ -274,40 +274,40 @@ def in_si(unit: str) -> SI | None:
     exponents = {BASE[name]: power for name, power in one.dimensionality.items() if name in BASE}
     if len(exponents) < len(one.dimensionality) or any(p != int(p) for p in exponents.values()):
         return None
-    whole = {name: int(power) for name, power in exponents.items()}
+    powers = {name: int(power) for name, power in exponents.items()}
     offset = float(zero.magnitude)
-    return SI(float(one.magnitude) - offset, offset, whole)
+    return SI(float(one.magnitude) - offset, offset, powers)
 
 
 def check_unit(unit: str, where: str) -> None:
     """Raise `CaseError` for a unit that is too long, or has large or nested powers."""
     if len(unit) > UNIT:
         raise CaseError(f"{where}: a unit has at most {UNIT} characters; got {len(unit)}.")
-    flat = re.sub(rf"\s*({POWER}|[()])\s*", r"\1", with_powers(unit))
-    if re.search(rf"{POWER}[-+(]*[0-9]{{3,}}", flat) or _towers(flat):
+    compact = re.sub(rf"\s*({POWER}|[()])\s*", r"\1", with_powers(unit))
+    if re.search(rf"{POWER}[-+(]*[0-9]{{3,}}", compact) or _nested_powers(compact):
         raise CaseError(
             f"{where}: '{unit}' is not a unit: powers are numbers below 100, and none is raised to "
             "another."
         )
-    if re.search(r"[0-9]{10}", flat):
+    if re.search(r"[0-9]{10}", compact):
         raise CaseError(f"{where}: '{unit}' is not a unit: its numbers have less than 10 digits.")
 
 
-def _towers(unit: str) -> bool:
+def _nested_powers(unit: str) -> bool:
     """Return whether a power, or a group that contains a power, is raised to a power."""
     if re.search(rf"{POWER}[-+(]*[0-9.]*\)*{POWER}", unit):
         return True
-    powers, marks = 0, []
+    count, starts = 0, []
     for match in re.finditer(rf"\(|\)|{POWER}", unit):
         sign = match[0]
         if sign == "(":
-            marks.append(powers)
+            starts.append(count)
         elif sign == ")":
-            inside = powers > (marks.pop() if marks else powers)
+            inside = count > (starts.pop() if starts else count)
             if inside and re.match(POWER, unit[match.end() :]):
                 return True
         else:
-            powers += 1
+            count += 1
     return False
 
 
