@@ -45,12 +45,12 @@ def assessed(
         return Verdict.of((), (FORGOTTEN,), judged=False)
     work = law.prepare(problem)
     one.law, one._work = law, work
-    again = one._start(Inputs(dict(zip(channels, rows.inputs[0].tolist(), strict=True))))
+    replayed = one._start(Inputs(dict(zip(channels, rows.inputs[0].tolist(), strict=True))))
     if np.isfinite(rows.readings[0]).any():
-        again, _ = stepped(law, work, problem, again, first_interval(state.log, channels))
+        replayed, _ = stepped(law, work, problem, replayed, first_interval(state.log, channels))
     for interval in intervals_since(state.log, channels):
-        again, _ = stepped(law, work, problem, again, interval)
+        replayed, _ = stepped(law, work, problem, replayed, interval)
     # The log lacks readings of excluded sensors: the memory of the gate comes from the last state.
-    now = changed(again.now, screened=state.now.screened)
-    found = one._placed(changed(again, now=now), ends, samples)
-    return found._settled(found.estimate()).verdict
+    now = changed(replayed.now, screened=state.now.screened)
+    placed = one._placed(changed(replayed, now=now), ends, samples)
+    return placed._settled(placed.estimate()).verdict

@@ -57,15 +57,15 @@ def beginnings(
     if not isinstance(work, SensitivityWork):
         return [work] * len(initial)
     made: dict[int, SensitivityWork] = {}  # shared by members with one u0, since it caches matrices
-    found = []
-    for one, off, u0 in zip(readings, errors, initial, strict=True):
-        own = bool(one) or bool(len(off))
-        begin = made.get(id(u0)) if not own else None
+    prepared = []
+    for initial_readings, own_errors, u0 in zip(readings, errors, initial, strict=True):
+        separate = bool(initial_readings) or bool(len(own_errors))
+        begin = made.get(id(u0)) if not separate else None
         if begin is None:
-            begin = work.made_of(one, off, u0)
-            made |= {} if own else {id(u0): begin}
-        found.append(begin)
-    return found
+            begin = work.made_of(initial_readings, own_errors, u0)
+            made |= {} if separate else {id(u0): begin}
+        prepared.append(begin)
+    return prepared
 
 
 class FleetEngine(ABC):
@@ -81,9 +81,9 @@ class FleetEngine(ABC):
 
     def subset(self, which: IntArray) -> Self:
         """Return an engine for the members with these numbers."""
-        other = copy.copy(self)
-        other._begins = [self._begins[k] for k in which]
-        return other
+        engine = copy.copy(self)
+        engine._begins = [self._begins[k] for k in which]
+        return engine
 
     def begun(self, k: int) -> Any:
         """Return the prepared data of the law for the start of a member."""
@@ -137,29 +137,29 @@ class SeparateEngine(FleetEngine):
     def start(
         self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]
     ) -> tuple[Any, ...]:
-        each = zip(self._begins, q0, u0, moments, strict=True)
-        return tuple(self.law.start(*one) for one in each)
+        arguments = zip(self._begins, q0, u0, moments, strict=True)
+        return tuple(self.law.start(*values) for values in arguments)
 
     def begin(self, state: tuple[Any, ...], span: Span) -> tuple[Any, ...]:
-        each = zip(self._begins, state, strict=True)
+        members = zip(self._begins, state, strict=True)
         return tuple(
-            laws.stepped(self.law, work, self.problem, one, span.member(k))[0]
-            for k, (work, one) in enumerate(each)
+            laws.stepped(self.law, work, self.problem, previous, span.member(k))[0]
+            for k, (work, previous) in enumerate(members)
         )
 
     def step(
         self, state: tuple[Any, ...], span: Span
     ) -> tuple[tuple[Any, ...], laws.MemberReports]:
-        parts = self.law, self.work, self.problem
-        taken = [laws.stepped(*parts, one, span.member(k)) for k, one in enumerate(state)]
-        members, sensors = len(taken), len(taken[0][1].predicted)
-        blank = np.zeros((members, sensors)), np.zeros(members, dtype=int)
-        reports = laws.MemberReports((laws.Status(),) * members, *blank)
-        each = {k: report for k, (_, report) in enumerate(taken)}
-        return tuple(new for new, _ in taken), reports.with_members(each)
+        context = self.law, self.work, self.problem
+        results = [laws.stepped(*context, one, span.member(k)) for k, one in enumerate(state)]
+        members, sensors = len(results), len(results[0][1].predicted)
+        zeros = np.zeros((members, sensors)), np.zeros(members, dtype=int)
+        reports = laws.MemberReports((laws.Status(),) * members, *zeros)
+        by_member = {k: report for k, (_, report) in enumerate(results)}
+        return tuple(new for new, _ in results), reports.with_members(by_member)
 
     def settled(self, state: tuple[Any, ...]) -> tuple[Any, ...]:
-        return tuple(self.law.settled(self.work, one) for one in state)
+        return tuple(self.law.settled(self.work, member) for member in state)
 
     def believed(self, state: tuple[Any, ...], k: int) -> laws.Belief:
         belief: laws.Belief = self.law.belief(self.work, state[k])
@@ -168,9 +168,9 @@ class SeparateEngine(FleetEngine):
     def beliefs(self, state: tuple[Any, ...]) -> Beliefs:
         beliefs = [self.problem.physical(self.believed(state, k)) for k in range(len(state))]
         stds = [belief.q_std for belief in beliefs]
-        known = [std for std in stds if std is not None]
+        given_stds = [std for std in stds if std is not None]
         q, u = (np.array([getattr(belief, name) for belief in beliefs]) for name in ("q", "u"))
-        return Beliefs(q, u, np.array(known) if known else None)
+        return Beliefs(q, u, np.array(given_stds) if given_stds else None)
 
     def member(self, state: tuple[Any, ...], k: int) -> Any:
         return state[k]
@@ -186,15 +186,15 @@ class BlockEngine(FleetEngine):
         self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]
     ) -> SensitivityState:
         starts = zip(self._begins, q0, u0, moments, strict=True)
-        first: SensitivityState = join(*(self.law.start(*start) for start in starts))
-        return first
+        joined: SensitivityState = join(*(self.law.start(*start) for start in starts))
+        return joined
 
     def begin(self, state: SensitivityState, span: Span) -> SensitivityState:
-        each = enumerate(self._begins)
-        begun: SensitivityState = join(
-            *(self.law.begin(work, take(state, k), span.member(k)) for k, work in each)
+        members = enumerate(self._begins)
+        joined: SensitivityState = join(
+            *(self.law.begin(work, take(state, k), span.member(k)) for k, work in members)
         )
-        return begun
+        return joined
 
     def step(
         self, state: SensitivityState, span: Span

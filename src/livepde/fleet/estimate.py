@@ -85,15 +85,15 @@ class FleetEstimate:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes for pickle and copies, with values instead of functions."""
-        each = tuple(map(self.belief, range(len(self.members))))
-        own = {
+        beliefs = tuple(map(self.belief, range(len(self.members))))
+        values = {
             "read": partial(kept, self.beliefs),
             "diagnose": partial(kept, self.diagnostics),
-            "belief": each.__getitem__,
+            "belief": beliefs.__getitem__,
             "space": self.space.described,
             "state_space": None,
         }
-        return vars(self) | own
+        return vars(self) | values
 
     @cached_property
     def beliefs(self) -> Beliefs:
@@ -211,7 +211,7 @@ class FleetResult:
         """
         import xarray as xr
 
-        rows, layout, both = self._rows, self.layout, (MEMBER, "time")
+        rows, layout, axes = self._rows, self.layout, (MEMBER, "time")
         times = np.array([row.t for row in rows])
         data = xr.Dataset(
             coords={
@@ -224,27 +224,27 @@ class FleetResult:
         for label in layout.scalars:
             pairs = self._table([np.transpose(row.parameters[label]) for row in rows], 2)
             for k, name in enumerate((label, f"{label}_std")):
-                data[name] = (both, pairs[..., k], dict(layout.numbers[name]))
+                data[name] = (axes, pairs[..., k], dict(layout.numbers[name]))
         unit = {"units": layout.sensor_unit}
         innovations = self._series("innovation", len(layout.sensors))
-        data["innovation"] = ((*both, "sensor"), innovations, unit)
+        data["innovation"] = ((*axes, "sensor"), innovations, unit)
         if layout.validation is not None:
             errors = self._series("validation_error", len(layout.validation))
-            data["validation_error"] = ((*both, "validation"), errors, unit)
-        data["status"] = (both, self._series("status"), dict(STATUS_FLAGS))
+            data["validation_error"] = ((*axes, "validation"), errors, unit)
+        data["status"] = (axes, self._series("status"), dict(STATUS_FLAGS))
         steps = self._series("steps")
-        data["steps"] = (both, steps.astype(np.int32), {"long_name": "substeps taken"})
+        data["steps"] = (axes, steps.astype(np.int32), {"long_name": "substeps taken"})
         for name, values in self._diagnostics():
             # A diagnostic with the name of an unknown gets a prefix.
-            data[f"{NOTE}{name}" if name in data else name] = (both, values)
+            data[f"{NOTE}{name}" if name in data else name] = (axes, values)
         data.attrs["scalars"] = "\n".join(layout.scalars)
         return data
 
     def _diagnostics(self) -> Iterator[tuple[str, Array]]:
         """Iterate over the diagnostics of the law by name, NaN where a sample has no value."""
-        nothing = np.full(len(self.members), np.nan)
+        missing = np.full(len(self.members), np.nan)
         for name in dict.fromkeys(chain.from_iterable(row.diagnostics for row in self._rows)):
-            yield name, self._table([row.diagnostics.get(name, nothing) for row in self._rows])
+            yield name, self._table([row.diagnostics.get(name, missing) for row in self._rows])
 
     def _series(self, name: str, *more: int) -> Array:
         return self._table([getattr(row, name) for row in self._rows], *more)
@@ -328,9 +328,9 @@ class FleetRecords:
     def _numbers(self, beliefs: Beliefs, factors: Factors) -> Array:
         """Return `Record.numbers` of all members, shape (members, numbers)."""
         space, columns = self.model.parameter_space, []
-        after, before = (np.linalg.norm(factor, axis=2) for factor in (factors.q, factors.prior))
+        after, prior = (np.linalg.norm(factor, axis=2) for factor in (factors.q, factors.prior))
         # Remaining share of the prior standard deviation; NaN where the prior has none.
-        shares = after / np.where(before > 0.0, before, np.nan)
+        shares = after / np.where(prior > 0.0, prior, np.nan)
         for label, k in space.labels.items():
             value, std = beliefs.q[:, k], after[:, k]
             ends = interval_ends(label, space.unknown_of(label), value, std)
@@ -339,16 +339,16 @@ class FleetRecords:
 
     def _profiles(self, u: Array, factors: Factors) -> dict[str, Array]:
         """Return values and standard deviations of the state, (members, vertices) each."""
-        found: dict[str, Array] = {}
+        profiles: dict[str, Array] = {}
         members, _, r = factors.u.shape
         order = vertex_order(self.model)
         for name, block in self.model.state_space.fields.items():
-            part, names = self.model.state_space.part(name), block.variables(name)
-            columns = factors.u[:, part].transpose(1, 0, 2).reshape(-1, members * r)
+            index, names = self.model.state_space.part(name), block.variables(name)
+            columns = factors.u[:, index].transpose(1, 0, 2).reshape(-1, members * r)
             # Variances at the vertices are sums of squares of rows of the factor.
             squares = ((block.at_vertices @ columns) ** 2).reshape(-1, members, r).sum(axis=2)
             deviations = np.sqrt(squares)
-            for end, values in {"": block.at_vertices @ u[:, part].T, "_std": deviations}.items():
+            for end, values in {"": block.at_vertices @ u[:, index].T, "_std": deviations}.items():
                 rows = values.T.reshape(members, len(names), -1)[:, :, order]
-                found |= {f"{key}{end}": rows[:, c] for c, key in enumerate(names)}
-        return found
+                profiles |= {f"{key}{end}": rows[:, c] for c, key in enumerate(names)}
+        return profiles

@@ -111,15 +111,15 @@ class Fleet:
         u0_from: Mapping[str, Any] | list[Mapping[str, Any]] | None = None,
         u0_errors: tuple[Any, ...] | list[tuple[Any, ...]] = (),
     ) -> None:
-        self.members = _named(members)
+        self.members = _member_names(members)
         self._judging = law
         if isinstance(law, SensitivityLaw):  # statistics of a verdict cost more than the step
             law = replace(law, verdict=False)
         q0s, u0s = self._each("q0", q0), self._each("u0", u0)
-        made_of = [one or {} for one in self._each("u0_from", u0_from)]
-        off = [tuple(one) for one in self._each("u0_errors", u0_errors)]
-        most: tuple[Any, ...] = max(off, key=len)
-        self._one = Identifier(
+        sources = [item or {} for item in self._each("u0_from", u0_from)]
+        error_lists = [tuple(item) for item in self._each("u0_errors", u0_errors)]
+        largest_errors: tuple[Any, ...] = max(error_lists, key=len)
+        self._member = Identifier(
             model,
             observation,
             law,
@@ -133,12 +133,12 @@ class Fleet:
             assimilate_from=assimilate_from,
             between=between,
             input_noise=input_noise,
-            u0_from=max(made_of, key=len),
-            u0_errors=most,
+            u0_from=max(sources, key=len),
+            u0_errors=largest_errors,
         )
-        self.model = model = self._one.model
+        self.model = model = self._member.model
         self.law = law
-        self.problem = self._one.problem
+        self.problem = self._member.problem
         # Laws evaluate `initial` on other meshes, which is only possible if members share it.
         if len({*map(id, u0s)}) > 1:
             self.problem = replace(self.problem, initial=None)
@@ -148,8 +148,8 @@ class Fleet:
         self._stated = self._stated_at_start(u0s)
         self._assumed = [assumes_zero(model, u) for u in u0s]
         self.note = law.stepped_alone(self._work)
-        self._errors = [initial_errors(model, one) for one in off]
-        self._engine = self._stepper(made_of, u0s)
+        self._errors = [initial_errors(model, item) for item in error_lists]
+        self._engine = self._stepper(sources, u0s)
         sizes = self.observed.size, len(self.inputs), len(self)
         self._state: Any = None
         self._so_far = TakenByMembers.start(t0, *sizes)
@@ -159,29 +159,29 @@ class Fleet:
 
     def _stated_at_start(self, u0s: Sequence[Any]) -> Array:
         """Return the inputs at t0 that u0 implies, shape (members, channels); NaN: none."""
-        found = np.full((len(self.members), len(self.inputs)), np.nan)
+        values = np.full((len(self.members), len(self.inputs)), np.nan)
         for k, u in enumerate(u0s):
             if k == 0 or u is not u0s[k - 1]:
                 stated = self.model.boundary_readings(u)
-            found[k] = [stated.get(name, np.nan) for name in self.inputs]
-        return found
+            values[k] = [stated.get(name, np.nan) for name in self.inputs]
+        return values
 
-    def _stepper(self, made_of: list[Mapping[str, Any]], u0s: list[Any]) -> FleetEngine:
+    def _stepper(self, sources: list[Mapping[str, Any]], u0s: list[Any]) -> FleetEngine:
         """Return an engine that steps members as blocks if the law supports it, else one by one."""
-        readings = [initial_readings(self.model, self.observed, one) for one in made_of]
+        readings = [initial_readings(self.model, self.observed, item) for item in sources]
         begins = beginnings(self._work, readings, self._errors, u0s)
         if not self.note:
             return BlockEngine(self.law, self._work, begins)
-        unlike = {
+        differences = {
             "u0_errors differ": any(
-                not np.array_equal(one, self._errors[0]) for one in self._errors
+                not np.array_equal(item, self._errors[0]) for item in self._errors
             ),
-            "u0_from differs": any(one.keys() != made_of[0].keys() for one in made_of),
+            "u0_from differs": any(item.keys() != sources[0].keys() for item in sources),
         }
-        for what, differ in unlike.items():
-            if differ:
+        for option, differs in differences.items():
+            if differs:
                 raise errors.ConfigurationError(
-                    f"{what} between members, which are stepped separately, as {self.note}: give "
+                    f"{option} between members, which are stepped separately, as {self.note}: give "
                     "all the same."
                 )
         return SeparateEngine(self.law, self._work, begins, self.problem)
@@ -203,17 +203,17 @@ class Fleet:
     @property
     def observed(self) -> Observed:
         """Observation operator of the assimilated sensors."""
-        return self._one.observed
+        return self._member.observed
 
     @property
     def validation(self) -> Observed | None:
         """Observation operator of the validation sensors, or None."""
-        return self._one.validation
+        return self._member.validation
 
     @property
     def inputs(self) -> tuple[str, ...]:
         """Names of the input channels of the model and the sensors."""
-        return self._one.inputs
+        return self._member.inputs
 
     @property
     def together(self) -> bool:
@@ -234,18 +234,18 @@ class Fleet:
     def _begin_without_inputs(self) -> None:
         """Initialise the state immediately if it does not depend on inputs."""
         if self._state is None and not self.inputs:
-            none = np.zeros((len(self), 0))
-            self._begin(none, none > 0.0)
+            empty = np.zeros((len(self), 0))
+            self._begin(empty, empty > 0.0)
 
-    def _begun_by(self, values: Array, missing: Mask, *, later: bool) -> dict[str, Mask]:
+    def _initialise(self, values: Array, missing: Mask, *, later: bool) -> dict[str, Mask]:
         """Initialise the state by the inputs of a first sample; `later`: it is after t0.
 
         Return channel -> mask of members without a known value at t0, or in this sample.
         """
         unstated = self._unstated & later
         self._begin(self._opening(values) if later else values, unstated)
-        some = np.flatnonzero(unstated.any(axis=0)).tolist()
-        return {self.inputs[k]: unstated[:, k] | missing[:, k] for k in some}
+        channels = np.flatnonzero(unstated.any(axis=0)).tolist()
+        return {self.inputs[k]: unstated[:, k] | missing[:, k] for k in channels}
 
     def _begin(self, inputs: Array, unstated: Mask) -> None:
         moments, u0 = self._moments(self._so_far.t, inputs), self._u0
@@ -299,34 +299,34 @@ class Fleet:
         if not np.isfinite(t):
             raise errors.SampleError(f"time t is {t}; give the time of the sample.")
         measured, noise, validation, named = self._parsed(z, inputs)
-        self._one._check_weighs(noise)
+        self._member._check_weighs(noise)
         # Times of members differ after a failed step: a sample must be later than all of them.
         last = float(self._so_far.t.max())
         self._refuse_earlier(t, last)
         values, held = self._filled(named)
-        none = np.zeros(len(self))
-        missing = np.array([held.get(name, none) for name in self.inputs], dtype=float)
+        no_member = np.zeros(len(self))
+        missing = np.array([held.get(name, no_member) for name in self.inputs], dtype=float)
         missing = missing.reshape(len(self.inputs), len(self)).T
         if self._state is None:
-            held |= self._begun_by(values, missing > 0.0, later=t > last)
-        used = measured if t >= self._one.assimilate_from else np.full_like(measured, np.nan)
-        before = self._so_far
-        ending = partial(
-            Span, t0=before.t, t1=t, channels=self.inputs, inputs1=values, z1=used, noise=noise
+            held |= self._initialise(values, missing > 0.0, later=t > last)
+        used = measured if t >= self._member.assimilate_from else np.full_like(measured, np.nan)
+        earlier = self._so_far
+        span_to = partial(
+            Span, t0=earlier.t, t1=t, channels=self.inputs, inputs1=values, z1=used, noise=noise
         )
         if t == last:
-            span = ending(inputs0=values, z0=used)
+            span = span_to(inputs0=values, z0=used)
             report = self._expected(span)
             self._state = self._engine.begin(self._state, span)
         else:
-            gaps = np.stack([before.held, missing], axis=1)
-            span = ending(inputs0=before.inputs, z0=before.z, gaps=gaps if gaps.any() else None)
+            gaps = np.stack([earlier.held, missing], axis=1)
+            span = span_to(inputs0=earlier.inputs, z0=earlier.z, gaps=gaps if gaps.any() else None)
             span = span.driven(self.problem.control.held)
             self._state, report = self._engine.step(self._state, span)
         control = self.problem.control
         holding = np.array([name in control.held.last for name in self.inputs], dtype=bool)
-        parts = t, used, values, missing, report.statuses, control, holding
-        self._so_far, self._samples = before.after(*parts), self._samples + 1
+        arguments = t, used, values, missing, report.statuses, control, holding
+        self._so_far, self._samples = earlier.after(*arguments), self._samples + 1
         return self._estimate(span, measured, validation, report, held)
 
     def _refuse_earlier(self, t: float, last: float) -> None:
@@ -346,13 +346,13 @@ class Fleet:
     def _unstated(self) -> Mask:
         """Mask of channels of the model without a value at t0, shape (members, channels)."""
         # A "next" input requires no initial value: its first reading is the mean since t0.
-        read = {*self.model.channels} - {*self.problem.control.held.next}
-        asked: Mask = np.array([name in read for name in self.inputs], dtype=bool)
-        return np.isnan(self._stated) & asked
+        required = {*self.model.channels} - {*self.problem.control.held.next}
+        mask: Mask = np.array([name in required for name in self.inputs], dtype=bool)
+        return np.isnan(self._stated) & mask
 
     def _expected(self, span: Span) -> MemberReports:
         beliefs, count = self._engine.beliefs(self._state), len(self)
-        predicted = self._shown(self.observed, beliefs, span)
+        predicted = self._predicted(self.observed, beliefs, span)
         return MemberReports((Status(),) * count, predicted, np.zeros(count, dtype=int))
 
     def _believed(self, state: Any, k: int) -> Belief:
@@ -366,16 +366,16 @@ class Fleet:
         report: MemberReports,
         held: dict[str, Mask],
     ) -> FleetEstimate:
-        state, engine, error = self._state, self._engine, validation
-        read = cache(lambda: engine.beliefs(state))
+        state, engine, errors_of_validation = self._state, self._engine, validation
+        beliefs = cache(lambda: engine.beliefs(state))
         if self.validation is not None:
-            error = validation - self._shown(self.validation, read(), span)
+            errors_of_validation = validation - self._predicted(self.validation, beliefs(), span)
         return FleetEstimate(
             t=span.t1,
             members=self.members,
-            read=read,
+            read=beliefs,
             innovation=measured - report.predicted,
-            validation_error=error,
+            validation_error=errors_of_validation,
             statuses=report.statuses,
             steps=report.steps,
             diagnose=lambda: report.diagnostics,
@@ -386,12 +386,12 @@ class Fleet:
         )
 
     @staticmethod
-    def _shown(observed: Observed, beliefs: Beliefs, span: Span) -> Array:
+    def _predicted(observed: Observed, beliefs: Beliefs, span: Span) -> Array:
         """Return the predicted readings of all members, shape (members, sensors)."""
         u, q = beliefs.u, beliefs.q
         if type(observed) is Observed and observed.linear:
-            shown: Array = (observed.G @ u.T).T
-            return shown
+            readings: Array = (observed.G @ u.T).T
+            return readings
         rows = [observed.predict(u[k], q[k], span.end.member(k)) for k in range(len(span))]
         return np.array(rows)
 
@@ -410,15 +410,15 @@ class Fleet:
         state = None if self._state is None else self._engine.member(self._state, k)
         ends = {name: values[k].copy() for name, values in self.ends.items()}
         # Cached, since its fingerprint is computed once for all checkpoints of this member.
-        start = self._starts[k] = self._starts.get(k) or self._begun(k)
-        return start._placed(state, ends, self._samples)
+        initial = self._starts[k] = self._starts.get(k) or self._initial_member(k)
+        return initial._placed(state, ends, self._samples)
 
-    def _begun(self, k: int) -> Identifier:
+    def _initial_member(self, k: int) -> Identifier:
         """Return the identifier of a member before its first sample."""
-        begun = self._engine.begun(k)
-        problem = begun.filter.problem if isinstance(begun, SensitivityWork) else self.problem
-        parts = self._q0[k], self._u0[k], problem, begun
-        return self._one._started(*parts, assumed=self._assumed[k])
+        prepared = self._engine.begun(k)
+        problem = prepared.filter.problem if isinstance(prepared, SensitivityWork) else self.problem
+        start = self._q0[k], self._u0[k], problem, prepared
+        return self._member._started(*start, assumed=self._assumed[k])
 
     def verdict(self, member: str | int) -> Verdict:
         """Return the verdict that a separate run of a member would have, by name or number.
@@ -427,12 +427,12 @@ class Fleet:
         member again, which takes as long as a separate run.
         """
         k = number_of(self.members, member)
-        law, begun = self._judging, self._engine.begun(k)
+        law, prepared = self._judging, self._engine.begun(k)
         if self._state is None or not isinstance(law, SensitivityLaw) or not law.verdict:
             return Verdict.unjudged()
         ends = {name: values[k].copy() for name, values in self.ends.items()}
-        one, state = self._begun(k), self._engine.member(self._state, k)
-        return assessed(one, law, begun, state, ends, self._samples)
+        identifier, state = self._initial_member(k), self._engine.member(self._state, k)
+        return assessed(identifier, law, prepared, state, ends, self._samples)
 
     def template(self) -> Any:
         """Return a state of the first member with zero inputs, as a template of the structure."""
@@ -447,20 +447,20 @@ class Fleet:
         `state`: state of their engine; None before the first sample.
         `samples`: number of their samples so far.
         """
-        other = copy.copy(self)
-        other._starts = {}
+        fleet = copy.copy(self)
+        fleet._starts = {}
         for name in ("header", "fingerprint"):
-            vars(other).pop(name, None)
-        other.members = tuple(self.members[k] for k in which)
-        other._engine = self._engine.subset(which)
+            vars(fleet).pop(name, None)
+        fleet.members = tuple(self.members[k] for k in which)
+        fleet._engine = self._engine.subset(which)
         starts = self._q0, self._u0, self._errors
-        other._q0, other._u0, other._errors = ([each[k] for k in which] for each in starts)
-        other._assumed = [self._assumed[k] for k in which]
-        other._stated = self._stated[which]
-        other._so_far = take(self._so_far, which)
-        other._state, other._samples = state, samples
-        other._begin_without_inputs()
-        return other
+        fleet._q0, fleet._u0, fleet._errors = ([values[k] for k in which] for values in starts)
+        fleet._assumed = [self._assumed[k] for k in which]
+        fleet._stated = self._stated[which]
+        fleet._so_far = take(self._so_far, which)
+        fleet._state, fleet._samples = state, samples
+        fleet._begin_without_inputs()
+        return fleet
 
     def adopt(self, which: IntArray, part: Fleet) -> Any:
         """Copy times and values from a subset, and return its state; for `Shard`."""
@@ -488,7 +488,7 @@ class Fleet:
 
     def labelled(self, z: Any) -> Any:
         """Convert labelled readings of a member to a mapping from channels; see `Channels`."""
-        return self._one._channels.labelled(z)
+        return self._member._channels.labelled(z)
 
     def _parsed(
         self, z: Values, inputs: Mapping[str, ArrayLike] | None
@@ -505,17 +505,17 @@ class Fleet:
                 raise errors.SampleError(
                     f"unknown input '{name}'; model and sensors have {list(self.inputs)}."
                 )
-            named[name] = self._given_once(name, named.get(name), self._column(name, values))
+            named[name] = self._input_of(name, named.get(name), self._column(name, values))
         return measured, None if noise is None else own_noise(noise), validation, named
 
-    def _given_once(self, name: str, before: Array | None, column: Array) -> Array:
+    def _input_of(self, name: str, before: Array | None, column: Array) -> Array:
         """Return the values of an input; `before`: its values among the readings, or None."""
         if before is None:
             return column
-        twice = (before != column) & ~np.isnan(before) & ~np.isnan(column)
+        conflicts = (before != column) & ~np.isnan(before) & ~np.isnan(column)
         sensors = {*self.observed.names, *(self.validation.names if self.validation else ())}
-        if twice.any() and name not in sensors:  # a sensor may have the name of an input
-            k = int(np.argmax(twice))
+        if conflicts.any() and name not in sensors:  # a sensor may have the name of an input
+            k = int(np.argmax(conflicts))
             raise errors.SampleError(
                 f"input '{name}' of member '{self.members[k]}' is {before[k]:g} among the readings "
                 f"and {column[k]:g} among the inputs; give one of them."
@@ -524,22 +524,22 @@ class Fleet:
 
     def _by_name(self, z: Any) -> tuple[Array, Array | None, Array, dict[str, Array]]:
         hidden = self.validation.names if self.validation else ()
-        channels, sensors = self._one.channels, (*self.observed.names, *hidden)
-        noisy = dict(zip(map(noise_channel, sensors), sensors, strict=True))
+        channels, sensors = self._member.channels, (*self.observed.names, *hidden)
+        noise_of = dict(zip(map(noise_channel, sensors), sensors, strict=True))
         for name in z:
-            if name not in channels and name not in noisy:
+            if name not in channels and name not in noise_of:
                 raise errors.SampleError(
                     f"unknown channel '{name}'; this fleet has {list(channels)}."
                 )
         columns = {name: self._column(name, values) for name, values in z.items()}
-        nothing = np.full(len(self), np.nan)
+        missing = np.full(len(self), np.nan)
 
         def table(names: Sequence[str]) -> Array:
-            rows = [columns.get(name, nothing) for name in names]
+            rows = [columns.get(name, missing) for name in names]
             return np.reshape(rows, (len(names), len(self))).T
 
-        for name in noisy.keys() & columns.keys():
-            _check_positive(noisy[name], columns[name])
+        for name in noise_of.keys() & columns.keys():
+            _check_positive(noise_of[name], columns[name])
         noise = table([noise_channel(name) for name in self.observed.names])
         named = {name: columns[name] for name in self.inputs if name in columns}
         return table(self.observed.names), noise, table(hidden), named
@@ -588,7 +588,7 @@ class Fleet:
         for k, name in enumerate(self.inputs):
             column = named.get(name, values[:, k])
             missing = np.isnan(column)
-            if name not in self._one._channels.optional and missing.any():
+            if name not in self._member._channels.optional and missing.any():
                 column = np.where(missing, self._so_far.known[:, k], column)
                 if np.isnan(column).any():
                     member = self.members[int(np.argmax(np.isnan(column)))]
@@ -604,7 +604,7 @@ class Fleet:
     @cached_property
     def fingerprint(self) -> Fingerprint:
         """Fingerprint of the problem, stored in checkpoints; computed on first access."""
-        return self._one.fingerprint.of_members(self._q0, self._u0, self._errors)
+        return self._member.fingerprint.of_members(self._q0, self._u0, self._errors)
 
     @cached_property
     def header(self) -> dict[str, Any]:
@@ -622,10 +622,10 @@ class Fleet:
 
     def check(self, header: Mapping[str, Any], leaves: Mapping[str, Array], where: str) -> None:
         """Raise `RunError` if a checkpoint is of another fleet; `where` names it in messages."""
-        other = [key for key, value in self.header.items() if header.get(key) != value]
-        if differs := other[0] if other else self.fingerprint.differing(leaves):
+        different = [key for key, value in self.header.items() if header.get(key) != value]
+        if difference := different[0] if different else self.fingerprint.differing(leaves):
             raise errors.RunError(
-                f"{where} was saved with another {differs}; build the fleet as it was then."
+                f"{where} was saved with another {difference}; build the fleet as it was then."
             )
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -657,8 +657,8 @@ class Fleet:
             if header["begun"]:
                 moments = self._moments(self._so_far.t, np.zeros((len(self), len(self.inputs))))
                 template = self._engine.start(self._q0, self._u0, moments)
-                inner = {path.removeprefix("state/"): leaf for path, leaf in leaves.items()}
-                state = self._engine.restored(template, inner)
+                stored = {path.removeprefix("state/"): leaf for path, leaf in leaves.items()}
+                state = self._engine.restored(template, stored)
             so_far, samples = self._so_far.restored(leaves), int(leaves["samples"])
         except (KeyError, ValueError) as error:
             raise errors.RunError(
@@ -669,7 +669,7 @@ class Fleet:
         self._begin_without_inputs()
 
 
-def _named(members: int | Sequence[str]) -> tuple[str, ...]:
+def _member_names(members: int | Sequence[str]) -> tuple[str, ...]:
     """Return the names of the members; the default names are numbers from 0."""
     if isinstance(members, str) or not isinstance(members, int | Iterable):
         raise errors.ConfigurationError(
@@ -685,8 +685,8 @@ def _named(members: int | Sequence[str]) -> tuple[str, ...]:
 
 def _check_positive(name: str, noise: Array) -> None:
     """Raise `SampleError` for a standard deviation that is neither positive nor NaN."""
-    good = np.isnan(noise) | (noise > 0.0) & np.isfinite(noise)
-    for value in noise[~good].tolist():
+    valid = np.isnan(noise) | (noise > 0.0) & np.isfinite(noise)
+    for value in noise[~valid].tolist():
         check_noise(name, value)
 
 

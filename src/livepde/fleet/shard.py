@@ -202,7 +202,7 @@ class Shard:
         store = JoinedStates if self._fleet.together else OwnStates
         self._states: JoinedStates | OwnStates = store(self._fleet.template(), len(self))
         self._taken: IntArray = np.zeros(len(self._fleet), dtype=np.int64)  # samples of each member
-        self._torn = False
+        self._interrupted = False
 
     def __len__(self) -> int:
         return len(self._fleet)
@@ -239,27 +239,27 @@ class Shard:
         RunError
             An exception interrupted an earlier step, so that the batch is partly processed.
         """
-        self._refuse_torn()
+        self._refuse_interrupted()
         items: list[Item] = [item if isinstance(item, tuple | list) else () for item in batch]
-        self._refuse_elsewhere(offset, len(items))
+        self._check_offset(offset, len(items))
         space, sensors = self._fleet.model.parameter_space, self._fleet.observed.names
         estimates = ShardEstimates.blank(offset, items, space, sensors)
-        self._torn = True
+        self._interrupted = True
         for wave in self._waves(items, estimates):
             for rows in self._blocks(items, wave):
                 self._take(items, rows, estimates)
-        self._torn = False
+        self._interrupted = False
         self.offset += len(items)
         return estimates
 
-    def _refuse_torn(self) -> None:
-        if self._torn:
+    def _refuse_interrupted(self) -> None:
+        if self._interrupted:
             raise RunError(
                 f"the step at offset {self.offset} was broken off by an exception, and some "
                 "members have taken their samples: load the last dump."
             )
 
-    def _refuse_elsewhere(self, offset: int, count: int) -> None:
+    def _check_offset(self, offset: int, count: int) -> None:
         """Raise `OffsetError` unless the batch continues at the offset of the shard."""
         last, here = offset + count - 1, self.offset
         if offset == here:
@@ -309,14 +309,14 @@ class Shard:
 
     def _blocks(self, items: Sequence[Item], wave: Sequence[int]) -> Iterator[list[int]]:
         """Yield blocks of rows whose members have the same last two sample times."""
-        alike: dict[tuple[Any, ...], list[int]] = {}
+        groups: dict[tuple[Any, ...], list[int]] = {}
         for row in wave:
             name, t, z, *_ = items[row]
             k = self._places[name]
             ends = float(self._fleet.ends["t"][k]), float(t), self._taken[k] > 0
-            key = *ends, self._states.rows(k), isinstance(z, Mapping)
-            alike.setdefault(key, []).append(row)
-        for rows in alike.values():
+            group = *ends, self._states.rows(k), isinstance(z, Mapping)
+            groups.setdefault(group, []).append(row)
+        for rows in groups.values():
             for first in range(0, len(rows), BLOCK):
                 yield rows[first : first + BLOCK]
 
@@ -357,7 +357,7 @@ class Shard:
 
         Raises `RunError`: an exception interrupted a step.
         """
-        self._refuse_torn()
+        self._refuse_interrupted()
         header = {**self._fleet.header, "shard": FORMAT}
         leaves = {"offset": self.offset, "taken": self._taken, **self._fleet.ends}
         leaves |= self._fleet.fingerprint.leaves
@@ -378,15 +378,15 @@ class Shard:
         try:
             offset, taken = int(leaves["offset"]), leaves["taken"].astype(np.int64)
             so_far = self._fleet._so_far.restored(leaves)
-            inner = {path.removeprefix("state/"): leaf for path, leaf in leaves.items()}
-            states = self._states.restored(inner)
+            stored = {path.removeprefix("state/"): leaf for path, leaf in leaves.items()}
+            states = self._states.restored(stored)
         except (KeyError, ValueError) as error:
             raise RunError(
                 f"the dump does not fit this shard ({error}): build it with the law's options as "
                 "they were."
             ) from error
         self._fleet._so_far = so_far
-        self.offset, self._taken, self._states, self._torn = offset, taken, states, False
+        self.offset, self._taken, self._states, self._interrupted = offset, taken, states, False
 
 
 def _joined(items: Sequence[Item], observed: Observed) -> tuple[float, Any, dict[str, Any]]:
@@ -399,9 +399,9 @@ def _joined(items: Sequence[Item], observed: Observed) -> tuple[float, Any, dict
 
 def _rows(rows: Sequence[Any], observed: Observed) -> Array:
     """Return measurements and their noise (NaN: default), shape (members, sensors, 2)."""
-    nothing = np.full(observed.size, np.nan)
+    default = np.full(observed.size, np.nan)
     pairs = (readings(row, observed) for row in rows)
-    return np.stack([(z, nothing if noise is None else noise) for z, noise in pairs]).swapaxes(1, 2)
+    return np.stack([(z, default if noise is None else noise) for z, noise in pairs]).swapaxes(1, 2)
 
 
 class OwnStates:
@@ -421,8 +421,8 @@ class OwnStates:
 
     def put(self, which: IntArray, state: State) -> None:
         """Store the states of members after a step."""
-        for k, one in zip(which.tolist(), state, strict=True):
-            self._states[k] = one
+        for k, member_state in zip(which.tolist(), state, strict=True):
+            self._states[k] = member_state
 
     def leaves(self) -> dict[str, Any]:
         """Return all states as arrays by name."""
@@ -430,10 +430,10 @@ class OwnStates:
 
     def restored(self, leaves: Mapping[str, Array]) -> OwnStates:
         """Return the states from `leaves`; raise KeyError or ValueError if they do not fit."""
-        other = OwnStates((self._template,), 0)
-        each = range(len(self._states))
-        other._states = [checkpoint.rebuild(self._template, leaves, f"state.{k}") for k in each]
-        return other
+        states = OwnStates((self._template,), 0)
+        indices = range(len(self._states))
+        states._states = [checkpoint.rebuild(self._template, leaves, f"state.{k}") for k in indices]
+        return states
 
 
 class JoinedStates:
@@ -449,7 +449,7 @@ class JoinedStates:
         self._rows: IntArray = np.zeros(count, dtype=np.int64)
         self._leaves: dict[str, Array] = checkpoint.flatten(template)
         self._log = np.zeros((count, 0, self._leaves.pop(LOG).shape[2]))
-        self._once = set(self._leaves)
+        self._shared = set(self._leaves)
         self._taken: dict[str, Array] = {}
 
     def rows(self, k: int) -> int:
@@ -462,17 +462,17 @@ class JoinedStates:
         index: Any = which
         if np.array_equal(which, np.arange(first, first + length)):
             index = slice(first, first + length)  # no copy
-        found = {}
+        selected = {}
         for path, leaf in self._leaves.items():
-            if path not in self._once:
-                found[path] = leaf[index]
+            if path not in self._shared:
+                selected[path] = leaf[index]
             else:  # a leaf of length 0 keeps that length
-                found[path] = (
+                selected[path] = (
                     np.broadcast_to(leaf, (length, *leaf.shape[1:])) if len(leaf) else leaf
                 )
-        self._taken = found
+        self._taken = selected
         log = self._log[which][:, : self._rows[first]]
-        return checkpoint.rebuild(self._template, {**found, LOG: log})
+        return checkpoint.rebuild(self._template, {**selected, LOG: log})
 
     def put(self, which: IntArray, state: State) -> None:
         """Store the states of members after a start, or a step from the states of `take`."""
@@ -483,29 +483,29 @@ class JoinedStates:
             self._log = _widened(self._log, rows + ROOM, np.inf)
         self._log[which, :rows], self._log[which, rows:] = log, np.inf
         self._rows[which] = rows
-        changed = {path: new for path, new in leaves.items() if new is not self._taken.get(path)}
+        updates = {path: new for path, new in leaves.items() if new is not self._taken.get(path)}
         # An array may be a view of an array that is overwritten below, for example if the filter
         # becomes the older filter. Views are copied first.
-        changed = {path: new if new.base is None else new.copy() for path, new in changed.items()}
-        for path, new in changed.items():
-            self._put_leaf(which, path, new)
+        updates = {path: new if new.base is None else new.copy() for path, new in updates.items()}
+        for path, new in updates.items():
+            self._store_leaf(which, path, new)
         self._taken = {}
 
-    def _put_leaf(self, which: IntArray, path: str, new: Array) -> None:
+    def _store_leaf(self, which: IntArray, path: str, new: Array) -> None:
         leaf = self._leaves[path]
         if not len(new):  # a leaf without values of members
             self._leaves[path] = new
             return
-        if path in self._once:  # stored once as long as no member differs
+        if path in self._shared:  # stored once as long as no member differs
             if leaf.shape[1:] == new.shape[1:] and np.array_equal(
                 np.broadcast_to(leaf, new.shape), new, equal_nan=leaf.dtype.kind == "f"
             ):
                 return
-            self._once.remove(path)
+            self._shared.remove(path)
             leaf = np.repeat(leaf, self._count, axis=0)
         if leaf.ndim > 2:  # square roots of covariances, whose number of rows may increase
-            room = max(leaf.shape[1], new.shape[1])
-            leaf, new = (_widened(array, room, 0.0) for array in (leaf, new))
+            rows = max(leaf.shape[1], new.shape[1])
+            leaf, new = (_widened(array, rows, 0.0) for array in (leaf, new))
         leaf[which] = new
         self._leaves[path] = leaf
 
@@ -515,22 +515,22 @@ class JoinedStates:
 
     def restored(self, leaves: Mapping[str, Array]) -> JoinedStates:
         """Return the states from `leaves`; raise KeyError or ValueError if they do not fit."""
-        other = JoinedStates(self._template, self._count)
-        other._rows, other._log = leaves["rows"].astype(np.int64), leaves[LOG]
-        other._leaves = {path: leaves[path] for path in self._leaves}
-        lengths = {path: len(leaf) for path, leaf in other._leaves.items()}
-        other._once = {path for path, length in lengths.items() if length < self._count}
-        if {len(other._rows), len(other._log), *lengths.values()} - {0, 1, self._count}:
+        states = JoinedStates(self._template, self._count)
+        states._rows, states._log = leaves["rows"].astype(np.int64), leaves[LOG]
+        states._leaves = {path: leaves[path] for path in self._leaves}
+        lengths = {path: len(leaf) for path, leaf in states._leaves.items()}
+        states._shared = {path for path, length in lengths.items() if length < self._count}
+        if {len(states._rows), len(states._log), *lengths.values()} - {0, 1, self._count}:
             raise ValueError(f"states of other than {self._count} members")
         if self._count == 1:
-            other._once = set()
-        other.take(np.array([0]))  # raises an error if the structure differs from the template
-        return other
+            states._shared = set()
+        states.take(np.array([0]))  # raises an error if the structure differs from the template
+        return states
 
 
 def _widened(array: Array, room: int, value: float) -> Array:
     """Return an array padded with `value` to at least `room` entries on its second axis."""
-    more = room - array.shape[1]
-    if more <= 0:
+    padding = room - array.shape[1]
+    if padding <= 0:
         return array
-    return np.pad(array, ((0, 0), (0, more), (0, 0)), constant_values=value)
+    return np.pad(array, ((0, 0), (0, padding), (0, 0)), constant_values=value)

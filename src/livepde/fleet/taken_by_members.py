@@ -32,15 +32,15 @@ class TakenByMembers:
     @classmethod
     def start(cls, t0: float, sensors: int, channels: int, members: int) -> TakenByMembers:
         """Return the value before the first sample."""
-        unknown, none = np.full((members, channels), np.nan), np.zeros((members, channels))
+        unknown, zeros = np.full((members, channels), np.nan), np.zeros((members, channels))
         return cls(
             t=np.full(members, float(t0)),
             z=np.full((members, sensors), np.nan),
             inputs=unknown,
             known=unknown,
-            held=none,
+            held=zeros,
             held_counts=np.zeros((members, 1 + channels), dtype=np.int64),
-            unstated=none,
+            unstated=zeros,
             steps=np.zeros((members, COUNTS), dtype=np.int64),
         )
 
@@ -68,15 +68,15 @@ class TakenByMembers:
         codes = [STATUS_CODES.index(status.code) for status in statuses]
         steps = self.steps + np.eye(COUNTS, dtype=np.int64)[codes]
         steps[:, -1] += [*map(control.stretches, (t - self.t).tolist())]
-        good = np.array([status.taken for status in statuses])
-        rows = good[:, None]
+        accepted = np.array([status.taken for status in statuses])
+        rows = accepted[:, None]
         counts = self.held_counts
         if missing.shape[1]:
-            more = np.column_stack([np.ones(len(good)), missing > 0.0]).astype(np.int64)
-            counts = counts + more * rows
+            added = np.column_stack([np.ones(len(accepted)), missing > 0.0]).astype(np.int64)
+            counts = counts + added * rows
         return changed(
             self,
-            t=np.where(good, t, self.t),
+            t=np.where(accepted, t, self.t),
             z=np.where(rows, z, self.z),
             inputs=np.where(rows, inputs, self.inputs),
             known=np.where(rows | holding, inputs, self.known),
@@ -87,7 +87,7 @@ class TakenByMembers:
 
     def restored(self, leaves: Mapping[str, Array]) -> TakenByMembers:
         """Return the value stored in leaves of a checkpoint; raise `KeyError` or `ValueError`."""
-        for name, own in vars(self).items():
-            if leaves[name].shape != own.shape:
-                raise ValueError(f"{name} has shape {leaves[name].shape}, needs {own.shape}")
+        for name, value in vars(self).items():
+            if leaves[name].shape != value.shape:
+                raise ValueError(f"{name} has shape {leaves[name].shape}, needs {value.shape}")
         return changed(self, **{name: leaves[name] for name in vars(self)})
