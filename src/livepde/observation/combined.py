@@ -52,7 +52,7 @@ class Combined(Observation):
     listed = ("parts", "observation")
 
     def __post_init__(self) -> None:
-        self._sees_all("give of= to the observations it is made of.")
+        self._refuse_component("give of= to the observations it is made of.")
         super().__post_init__()
         if self.noise is not None and any(part.noise is not None for part in self.parts):
             raise ObservationError("Combined: give noise= to it or to its parts, not to both.")
@@ -65,19 +65,19 @@ class Combined(Observation):
 
     @property
     def unknowns(self) -> Mapping[str, Unknown]:
-        found: dict[str, Unknown] = {}
+        unknowns: dict[str, Unknown] = {}
         for part in self.parts:
-            if both := found.keys() & part.unknowns.keys():
+            if shared := unknowns.keys() & part.unknowns.keys():
                 raise ObservationError(
-                    f"Combined: two parts have the unknown '{min(both)}'; put their sensors "
+                    f"Combined: two parts have the unknown '{min(shared)}'; put their sensors "
                     "together."
                 )
-            found |= part.unknowns
-        return found
+            unknowns |= part.unknowns
+        return unknowns
 
     @property
     def states(self) -> Mapping[str, SensorState]:
-        return {name: one for part in self.parts for name, one in part.states.items()}
+        return {name: item for part in self.parts for name, item in part.states.items()}
 
     @property
     def nodal(self) -> bool:
@@ -85,8 +85,8 @@ class Combined(Observation):
 
     def region(self, state: FunctionSpace) -> Mask | None:
         parts = [part.region(state) for part in self.parts]
-        known = [part for part in parts if part is not None]
-        return np.logical_or.reduce(known) if len(known) == len(parts) else None
+        regions = [part for part in parts if part is not None]
+        return np.logical_or.reduce(regions) if len(regions) == len(parts) else None
 
     @property
     def portable(self) -> bool:
@@ -122,12 +122,12 @@ class CombinedObserved(Observed):
 
     @cached_property
     def noise(self) -> Array | None:
-        own = super().noise
-        if own is not None:
-            return own
+        stated = super().noise
+        if stated is not None:
+            return stated
         levels = [part.noise for part in self.parts]
-        known = [level for level in levels if level is not None]
-        return np.concatenate(known) if len(known) == len(levels) else None
+        given = [level for level in levels if level is not None]
+        return np.concatenate(given) if len(given) == len(levels) else None
 
     @cached_property
     def G(self) -> sp.csr_array:
@@ -197,8 +197,8 @@ class Calibrated(Observation):
     adds: bool = False
 
     def __post_init__(self) -> None:
-        self._sees_all("give of= to the observations it is made of.")
-        self._shows(self.base)
+        self._refuse_component("give of= to the observations it is made of.")
+        self._add_base_channels(self.base)
 
     @property
     def unknowns(self) -> Mapping[str, Unknown]:
@@ -259,26 +259,26 @@ class CalibratedObserved(Observed):
     def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
         # H_u = (dz/dy) (dy/du) and H_q = dz/dq + (dz/dy) (dy/dq), column by column.
         y = self.base.predict(u, q, moment)
-        seen = self.available(moment)
+        available = self.available(moment)
         inner_u, inner_q = self.base.jacobian(u, q, moment)
         if (derivatives := self.observation.derivatives) is not None:
-            known = numbers(self.parameter, q)
-            slopes, columns = derivatives(y, known, Place(np.zeros((0,)), None, moment))
-            slopes = np.where(seen, slopes, 0.0)
+            named = numbers(self.parameter, q)
+            slopes, columns = derivatives(y, named, Place(np.zeros((0,)), None, moment))
+            slopes = np.where(available, slopes, 0.0)
             H_q = np.zeros((self.size, self.parameter.dim))
             for label, column in columns.items():
-                H_q[seen, self.parameter.labels[label]] = column[seen]
+                H_q[available, self.parameter.labels[label]] = column[available]
             if inner_q is not None:
                 H_q += slopes[:, None] * inner_q
             scaled = copy(inner_u)  # SciPy's constructor would dominate the cost
             scaled.data = inner_u.data * np.repeat(slopes, np.diff(inner_u.indptr))
             return scaled, H_q
         slope = np.zeros((self.size, self.size))
-        for k in np.flatnonzero(seen):
-            slope[seen, k] = self._slope(_nudged(y, int(k)), q, moment)[seen]
+        for k in np.flatnonzero(available):
+            slope[available, k] = self._slope(_nudged(y, int(k)), q, moment)[available]
         H_q = np.zeros((self.size, self.parameter.dim))
         for j in self.parameter.labels.values():
-            H_q[seen, j] = self._slope(y, _nudged(q, j), moment)[seen]
+            H_q[available, j] = self._slope(y, _nudged(q, j), moment)[available]
         if inner_q is not None:
             H_q += slope @ inner_q
         return sp.csr_array(sp.csr_array(slope) @ inner_u), H_q
@@ -289,15 +289,15 @@ class CalibratedObserved(Observed):
 
     def steady_direct(self, moment: Moment) -> Array | None:
         base = self.base.observation
-        fixed = type(self.base) is Observed and not (base.directs or base.inputs)
-        if not (self.observation.adds and fixed):
+        plain = type(self.base) is Observed and not (base.directs or base.inputs)
+        if not (self.observation.adds and plain):
             return None
         if self._steady_direct is None:
             zero, q = np.zeros(self.state.dim), self.parameter.prior
             direct = self.jacobian(zero, q, moment)[1]
-            y, more = np.arange(1.0, 1.0 + self.size), np.linspace(0.5, 1.5, len(q))
-            shift = 0.0 if direct is None else direct @ (q + more)
-            if not np.allclose(self._read(y, q + more, moment), y + shift):
+            y, increment = np.arange(1.0, 1.0 + self.size), np.linspace(0.5, 1.5, len(q))
+            shift = 0.0 if direct is None else direct @ (q + increment)
+            if not np.allclose(self._read(y, q + increment, moment), y + shift):
                 raise ObservationError(
                     "Calibrated: adds=True, but function does more than to add unknowns to the "
                     "readings. Leave out adds."
@@ -309,12 +309,12 @@ class CalibratedObserved(Observed):
         return np.asarray(np.imag(self._read(y, q, moment)) / STEP)
 
     def available(self, moment: Moment) -> Array:
-        seen = self.base.available(moment)
-        if seen.all():
-            return seen
+        available = self.base.available(moment)
+        if available.all():
+            return available
         # A reading that depends on a missing base reading is also missing.
-        z = self._read(np.where(seen, 1.0, np.nan), self.parameter.prior, moment)
-        return np.asarray(np.logical_and(seen, np.logical_not(np.isnan(z))))
+        z = self._read(np.where(available, 1.0, np.nan), self.parameter.prior, moment)
+        return np.asarray(np.logical_and(available, np.logical_not(np.isnan(z))))
 
 
 def _nudged(values: Array, k: int) -> Any:
@@ -366,8 +366,8 @@ class Transformed(Observation):
     reach: float = np.inf
 
     def __post_init__(self) -> None:
-        self._sees_all("give of= to the observations it is made of.")
-        self._shows(self.base)
+        self._refuse_component("give of= to the observations it is made of.")
+        self._add_base_channels(self.base)
         if self.base.unknowns:
             raise ObservationError(
                 "Transformed: its base has uncertain positions; write the function into "

@@ -52,7 +52,7 @@ class Functionals(Observation):
     listed = ("integrands", "integrand")
 
     def __post_init__(self) -> None:
-        self._sees_all("an integrand names its component, as u.c.")
+        self._refuse_component("an integrand names its component, as u.c.")
         super().__post_init__()
 
     def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
@@ -78,13 +78,13 @@ class FunctionalsObserved(Observed):
 
     def _form(self, name: str, spaces: Mapping[str, FunctionSpace]) -> Form:
         inputs = self.observation.inputs
-        g, where = placed(self.observation.integrands[name])
+        g, region = placed(self.observation.integrands[name])
 
         def integrand(w: Any, uq: Any, x: Any) -> Any:
             q = _jets(uq, PARAMETER, self.parameter)
             return g(q, _jets(uq, STATE, self.state), x) * w
 
-        form = integrand if where is None else On(where, integrand)
+        form = integrand if region is None else On(region, integrand)
         try:
             return Form(name, form, spaces, self.state.mesh, self._order, "uq", inputs=inputs)
         except ModelError as error:
@@ -103,14 +103,14 @@ class FunctionalsObserved(Observed):
         return np.array([form.vector("w", moment, uq=uq)[0] for form in self.forms])
 
     def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
-        seen = self.state.seen
-        uq = np.concatenate([u[:seen], q])
+        size = self.state.seen
+        uq = np.concatenate([u[:size], q])
         rows = sp.csr_array(
             sp.vstack([form.matrix("w", "uq", moment, uq=uq) for form in self.forms])
         )
-        more = sp.csr_array((rows.shape[0], len(u) - seen))
-        H = sp.csr_array(sp.hstack([rows[:, :seen], more], format="csr"))
-        return H, rows[:, seen:].toarray()
+        zeros = sp.csr_array((rows.shape[0], len(u) - size))
+        H = sp.csr_array(sp.hstack([rows[:, :size], zeros], format="csr"))
+        return H, rows[:, size:].toarray()
 
 
 def _jets(uq: Any, prefix: str, space: FunctionSpace) -> Any:
@@ -133,12 +133,12 @@ def in_cells(parameter: FunctionSpace, mesh: Any, name: str) -> sp.csr_array:
     rows = np.repeat(np.arange(cells), count)
     means = sp.csr_array((shares.ravel(), (rows, np.arange(cells * count))))
     size, start = cells * count, 0
-    found = sp.csr_array((cells, parameter.dim))
+    matrix = sp.csr_array((cells, parameter.dim))
     for key, part in zip(parameter.blocks, local.locals, strict=True):
         if base_name(key) == name:
-            found = found + means @ local.evaluation[start * size : (start + 1) * size]
+            matrix = matrix + means @ local.evaluation[start * size : (start + 1) * size]
         start += part.components
-    return sp.csr_array(found)
+    return sp.csr_array(matrix)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,9 +220,9 @@ class FluxPlatesObserved(Observed):
         if isinstance(at, str):
             facets = (mesh.boundaries or {}).get(at)
             if facets is None:
-                known = sorted(mesh.boundaries or {})
+                names = sorted(mesh.boundaries or {})
                 raise ObservationError(
-                    f"FluxPlates: '{name}' is at '{at}'; the mesh names {known}."
+                    f"FluxPlates: '{name}' is at '{at}'; the mesh names {names}."
                 )
             place = float(mesh.p[0][mesh.facets[0][np.asarray(facets)]].mean())
             if place not in (low, high):

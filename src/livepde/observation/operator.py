@@ -76,8 +76,8 @@ class Split:
     @cached_property
     def _diagonal(self) -> Array | None:
         """Diagonal of R if R is diagonal, else None."""
-        alone = bool(np.array_equal(self.R.indices, np.flatnonzero(np.diff(self.R.indptr))))
-        return self.R.diagonal() if alone else None
+        diagonal = bool(np.array_equal(self.R.indices, np.flatnonzero(np.diff(self.R.indptr))))
+        return self.R.diagonal() if diagonal else None
 
     @cached_property
     def _selected(self) -> IntArray | None:
@@ -95,20 +95,20 @@ class Split:
         Missing measurements (NaN) are ignored. `boundary` is a coefficient vector with Dirichlet
         values, and zero elsewhere; None for zero.
         """
-        known: Array = z[self.present]
+        data: Array = z[self.present]
         if boundary is not None and boundary.any():
-            known = known - self.G @ boundary
+            data = data - self.G @ boundary
         if self._selected is None:
-            return self.inverse @ known
-        part = np.zeros(self.R.shape[0])
-        part[self._selected] = known
-        return part
+            return self.inverse @ data
+        observed = np.zeros(self.R.shape[0])
+        observed[self._selected] = data
+        return observed
 
 
 def is_selection(G: sp.csr_array) -> bool:
     """Return whether every row selects a single coefficient, different for all rows."""
-    one_each = bool(np.all(np.diff(G.indptr) == 1) and np.all(G.data == 1.0))
-    return one_each and len(np.unique(G.indices)) == len(G.indices)
+    single = bool(np.all(np.diff(G.indptr) == 1) and np.all(G.data == 1.0))
+    return single and len(np.unique(G.indices)) == len(G.indices)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,8 +175,8 @@ class _Inverse(Reconstructor):
 
     def __call__(self, z: Array, boundary: Array, delta: float | None = None) -> Reconstructed:
         u = self.split.reconstruct(z, boundary)
-        rest = self.split.G @ (u + boundary) - z[self.split.present]
-        return Reconstructed(u, 0.0, data_norm(rest, self.weights), delta)
+        residual = self.split.G @ (u + boundary) - z[self.split.present]
+        return Reconstructed(u, 0.0, data_norm(residual, self.weights), delta)
 
 
 def weights(observed: Observed, present: Array) -> sp.csr_array:
@@ -227,9 +227,9 @@ class Observation:
     listed: ClassVar[tuple[str, str]] = ("", "")
 
     def __post_init__(self) -> None:
-        sensors, one = self.listed
+        sensors, singular = self.listed
         if sensors and not len(getattr(self, sensors)):
-            raise ObservationError(f"{type(self).__name__}: give at least one {one}.")
+            raise ObservationError(f"{type(self).__name__}: give at least one {singular}.")
 
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
         """Return G on the coefficients of the state, shape (sensors, n)."""
@@ -238,7 +238,7 @@ class Observation:
             "projections R and P: use SensitivityLaw."
         )
 
-    def _sees_all(self, remedy: str) -> None:
+    def _refuse_component(self, remedy: str) -> None:
         """Raise an error if `of` is given, for observations on which it has no effect."""
         if self.of:
             raise ObservationError(f"{type(self).__name__}: of='{self.of}' has no effect; {remedy}")
@@ -257,7 +257,7 @@ class Observation:
         """Prepend channels to `inputs`, without duplicates."""
         object.__setattr__(self, "inputs", tuple(dict.fromkeys([*channels, *self.inputs])))
 
-    def _shows(self, base: Observation) -> None:
+    def _add_base_channels(self, base: Observation) -> None:
         """Add the channels of a base observation; raise an error if the base has noise."""
         if base.noise is not None:
             raise ObservationError(
@@ -354,8 +354,8 @@ class Observed:
     @property
     def places(self) -> Mapping[str, Array]:
         """Sensor name -> coordinates, for sensors at a single point."""
-        at = self.observation.places
-        return {} if at is None else dict(zip(self.names, at, strict=True))
+        coordinates = self.observation.places
+        return {} if coordinates is None else dict(zip(self.names, coordinates, strict=True))
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -371,14 +371,14 @@ class Observed:
     @cached_property
     def noise(self) -> Array | None:
         """Noise standard deviation of each sensor, shape (sensors,); None if unknown."""
-        given = self.observation.noise
-        if given is None:
+        stated = self.observation.noise
+        if stated is None:
             return None
         try:
-            noise = np.asarray(given, dtype=float)
+            noise = np.asarray(stated, dtype=float)
         except (TypeError, ValueError):
             raise ObservationError(
-                f"noise: got {given!r}; expected one number, or one for each of {self.names}."
+                f"noise: got {stated!r}; expected one number, or one for each of {self.names}."
             ) from None
         if noise.ndim > 1 or (noise.ndim == 1 and noise.shape != (self.size,)):
             raise ObservationError(
@@ -484,8 +484,8 @@ class Observed:
 
         Sensors may be redundant: the Moore-Penrose inverse averages them.
         """
-        asked = np.ones(self.size, dtype=bool) if present is None else present
-        return self._splits.get(asked.tobytes(), lambda: self._split(asked))
+        used = np.ones(self.size, dtype=bool) if present is None else present
+        return self._splits.get(used.tobytes(), lambda: self._split(used))
 
     def reconstruct(
         self,
@@ -520,11 +520,11 @@ class Observed:
             )
         if delta is not None:
             require_positive("reconstruct: delta", delta, ObservationError)
-        asked = np.isfinite(z) if present is None else present
+        used = np.isfinite(z) if present is None else present
         if boundary is None:
             boundary = np.zeros(self.X.dim)
         rule = self.observation.reconstruction
-        prepared = self._reconstructors.get(asked.tobytes(), lambda: rule.prepare(self, asked))
+        prepared = self._reconstructors.get(used.tobytes(), lambda: rule.prepare(self, used))
         return prepared(z, boundary, delta)
 
     def _split(self, present: Array) -> Split:
@@ -550,8 +550,8 @@ class Observed:
             representers = rows.T if self.observation.nodal else self.X.riesz(rows.T)
             values, vectors = np.linalg.eigh(rows @ representers)
             # Redundant sensors cause zero eigenvalues of G G*, which the pseudoinverse omits.
-            kept = values > DEPENDENT * max(values.max(initial=0.0), 1e-300)
-            C = vectors[:, kept] / np.sqrt(values[kept])
+            independent = values > DEPENDENT * max(values.max(initial=0.0), 1e-300)
+            C = vectors[:, independent] / np.sqrt(values[independent])
             # V W is idempotent up to rounding only if W V = I up to rounding, which C does not
             # ensure for nearly redundant sensors. With a sparse W, R has the support of G.
             V = representers @ C
@@ -572,14 +572,14 @@ class Observed:
         """
         known = self.X.free == 0.0
         known[observed] = True
-        inside = np.ones(0, dtype=bool)
+        determined = np.ones(0, dtype=bool)
         for name, block in self.state.fields.items():
             start = self.state.part(name).start
-            own = (observed >= start) & (observed < start + block.size)
-            if own.any():
+            in_component = (observed >= start) & (observed < start + block.size)
+            if in_component.any():
                 complete = known[start + block.element_dofs].all(axis=0)
-                inside = inside & complete if len(inside) else complete
-        asked = self.observation.region(self.state)
-        if asked is not None and len(inside):
-            inside = inside & asked
-        return None if inside.all() and len(inside) else np.flatnonzero(inside)
+                determined = determined & complete if len(determined) else complete
+        region = self.observation.region(self.state)
+        if region is not None and len(determined):
+            determined = determined & region
+        return None if determined.all() and len(determined) else np.flatnonzero(determined)

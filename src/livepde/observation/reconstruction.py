@@ -209,8 +209,8 @@ class Spectral(Reconstructor):
         if self.size == 0:
             return
         self.root = np.linalg.cholesky(self.weights.toarray()).T
-        seen = self.root @ (self.G @ basis)
-        fit = seen.T @ seen
+        images = self.root @ (self.G @ basis)
+        fit = images.T @ images
         cost = basis.T @ (penalty @ basis)
         cost = (cost + cost.T) / 2
         # Scale of alpha: for alpha = rho, fit and penalty have the same trace.
@@ -220,32 +220,30 @@ class Spectral(Reconstructor):
         self.s = np.clip(s, np.finfo(float).tiny, 1.0)
         # In the null space of |.|, k must be exactly zero: for large alpha, alpha k would amplify
         # rounding errors.
-        rest = 1.0 - s
-        self.k = np.where(rest > 10 * len(s) * np.finfo(float).eps, rest, 0.0) / self.rho
+        remainder = 1.0 - s
+        self.k = np.where(remainder > 10 * len(s) * np.finfo(float).eps, remainder, 0.0) / self.rho
         self.phi = basis @ phi
         self.fitted = (self.G @ self.phi).T @ self.weights
         self.pulled = sp.csr_array(penalty.T) @ self.phi
-        self.image = np.linalg.qr(seen)[0]
+        self.image = np.linalg.qr(images)[0]
 
     def __call__(self, z: Array, boundary: Array, delta: float | None = None) -> Reconstructed:
-        known = z[self.present] - self.G @ boundary
+        data = z[self.present] - self.G @ boundary
         if self.size == 0:
-            return Reconstructed(
-                np.zeros(len(boundary)), 0.0, data_norm(known, self.weights), delta
-            )
-        beta = self.fitted @ known
+            return Reconstructed(np.zeros(len(boundary)), 0.0, data_norm(data, self.weights), delta)
+        beta = self.fitted @ data
         shift = boundary @ self.pulled
-        scaled = self.root @ known
+        in_noise = self.root @ data
         # No alpha fits the part of the data outside the range of G, where redundant sensors
         # disagree.
-        outside = scaled - self.image @ (self.image.T @ scaled)
-        rest = float(outside @ outside)
+        outside = in_noise - self.image @ (self.image.T @ in_noise)
+        unfitted = float(outside @ outside)
 
         def misfit(alpha: float) -> float:
-            part = alpha * (self.k * beta + shift * self.s) / (self.s + alpha * self.k)
-            return float(np.sqrt(rest + part @ (part / self.s)))
+            residual = alpha * (self.k * beta + shift * self.s) / (self.s + alpha * self.k)
+            return float(np.sqrt(unfitted + residual @ (residual / self.s)))
 
-        delta, alpha = self._alpha(misfit, delta, known)
+        delta, alpha = self._alpha(misfit, delta, data)
         # v = boundary + sum c phi: each c minimises s c^2 - 2 beta c + alpha (k c^2 + 2 shift c).
         u = self.phi @ ((beta - alpha * shift) / (self.s + alpha * self.k))
         return Reconstructed(u, alpha, misfit(alpha), delta)
@@ -279,7 +277,7 @@ def penalty_matrix(norm: str | Integrand, observed: Observed, basis: Array) -> s
             "Tikhonov: norm 'V' and forms know states of one component; take norm='X'."
         )
     block, _ = space.component()
-    inside = _inside(block, basis) if observed.observation.nodal else None
+    inside = _determined_elements(block, basis) if observed.observation.nodal else None
 
     def matrix(integrand: Any) -> sp.csr_array:
         pair = {"u": space, "v": space}
@@ -289,13 +287,13 @@ def penalty_matrix(norm: str | Integrand, observed: Observed, basis: Array) -> s
         return (form if inside is None else form.on(np.flatnonzero(inside))).matrix("v", "u")
 
     if callable(norm):
-        found = matrix(norm)
-        if abs(found - found.T).max() > 1e-10 * abs(found).max():
+        penalty = matrix(norm)
+        if abs(penalty - penalty.T).max() > 1e-10 * abs(penalty).max():
             raise ObservationError(
                 "Tikhonov: the form of the norm is not symmetric; write one that does not change "
                 "when its two functions are exchanged."
             )
-        return found
+        return penalty
     if block.bends:
         return matrix(lambda u, v, x: ddot(hess(u), hess(v)))
     try:
@@ -316,8 +314,8 @@ def penalty_matrix(norm: str | Integrand, observed: Observed, basis: Array) -> s
     return sp.csr_array(stiff.T @ sp.diags_array(scale) @ stiff)
 
 
-def _inside(block: FieldBlock, basis: Array) -> Mask:
+def _determined_elements(block: FieldBlock, basis: Array) -> Mask:
     """Return the mask of elements whose coefficients are all observed or known."""
-    known = np.asarray(np.abs(basis).any(axis=1))
-    known[block.fixed] = True
-    return np.asarray(known[block.element_dofs].all(axis=0))
+    determined = np.asarray(np.abs(basis).any(axis=1))
+    determined[block.fixed] = True
+    return np.asarray(determined[block.element_dofs].all(axis=0))

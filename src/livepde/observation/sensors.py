@@ -62,8 +62,8 @@ class Moving(Observation):
     @property
     def channels(self) -> list[tuple[str, ...]]:
         """Channels of the coordinates of each sensor."""
-        given = self.positions.values()
-        return [(names,) if isinstance(names, str) else tuple(names) for names in given]
+        positions = self.positions.values()
+        return [(names,) if isinstance(names, str) else tuple(names) for names in positions]
 
     @property
     def optional(self) -> frozenset[str]:
@@ -96,9 +96,9 @@ class MovingObserved(Observed):
         return self.observation.names(len(self.observation.positions))
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
-        G, seen = self._at(moment)
+        G, inside = self._at(moment)
         z: Array = G @ u
-        z[np.logical_not(seen)] = np.nan
+        z[np.logical_not(inside)] = np.nan
         return z
 
     def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
@@ -109,25 +109,25 @@ class MovingObserved(Observed):
 
     def _at(self, moment: Moment) -> tuple[sp.csr_array, Array]:
         """Return G at a moment, and the mask of sensors inside the mesh."""
-        given = dict(moment.inputs)
+        inputs = dict(moment.inputs)
         points = np.array(
-            [[given.get(name, np.nan) for name in names] for names in self.observation.channels]
+            [[inputs.get(name, np.nan) for name in names] for names in self.observation.channels]
         )
         key = points.tobytes()
         last = self._last
         if last is None or last[0] != key:
-            seen = np.array([self.block.contains(point) for point in points])
-            rows = np.flatnonzero(seen)
+            inside = np.array([self.block.contains(point) for point in points])
+            rows = np.flatnonzero(inside)
             G = sp.csr_array((len(points), self.state.dim))
             if len(rows):
                 values = self.state.widen(self.block.probe(points[rows].T), self.observation.of)
-                place = sp.csr_array(
+                selection = sp.csr_array(
                     (np.ones(len(rows)), (rows, np.arange(len(rows)))), (len(points), len(rows))
                 )
-                G = sp.csr_array(place @ values)
+                G = sp.csr_array(selection @ values)
             # Callers share the cached mask, so it must not be changed in place.
-            seen.setflags(write=False)
-            self._last = last = (key, G, seen)
+            inside.setflags(write=False)
+            self._last = last = (key, G, inside)
         return last[1], last[2]
 
 
@@ -181,8 +181,8 @@ class Points(Observation):
         for name in self.uncertain:
             if name not in self.names(len(self.points)):
                 raise ObservationError(f"Points: position_std: no sensor is called '{name}'.")
-        levels = set(given.values()) if isinstance(given, Mapping) else {given}
-        if len(levels) != 1 or not all(np.isfinite(std) and std > 0.0 for std in levels):
+        values = set(given.values()) if isinstance(given, Mapping) else {given}
+        if len(values) != 1 or not all(np.isfinite(std) and std > 0.0 for std in values):
             raise ObservationError(
                 "Points: position_std must be one positive number, which all sensors named have in "
                 f"common; got {given!r}."
@@ -193,8 +193,8 @@ class Points(Observation):
         if self.component is None:
             return
         numbers = np.asarray(self.component)
-        fits = numbers.shape in ((), (len(self.points),)) and numbers.dtype.kind in "iu"
-        if not (fits and (numbers >= 0).all()):
+        valid = numbers.shape in ((), (len(self.points),)) and numbers.dtype.kind in "iu"
+        if not (valid and (numbers >= 0).all()):
             raise ObservationError(
                 "Points: component must be the number of a component, from 0, or one for each of "
                 f"{len(self.points)} sensors; got {self.component!r}."
@@ -217,8 +217,8 @@ class Points(Observation):
     @property
     def positions(self) -> Array:
         """Coordinates of the sensors, shape (sensors, d)."""
-        given = self.points.values() if isinstance(self.points, Mapping) else self.points
-        return np.array([np.atleast_1d(p) for p in given], dtype=float)
+        points = self.points.values() if isinstance(self.points, Mapping) else self.points
+        return np.array([np.atleast_1d(p) for p in points], dtype=float)
 
     @property
     def unknowns(self) -> Mapping[str, Unknown]:
@@ -308,8 +308,8 @@ class _Shift:
         """Return the interpolation weights of all differences at a shift d."""
         if len(self.places) < 2:
             return np.zeros(len(self.places))
-        within = min(max(d, self.places[0]), self.places[-1])
-        return np.asarray(self._spline(within) + (d - within) * self._spline(within, 1))
+        clipped = min(max(d, self.places[0]), self.places[-1])
+        return np.asarray(self._spline(clipped) + (d - clipped) * self._spline(clipped, 1))
 
     def slopes(self, d: float) -> Array:
         """Return the derivatives of `weights`."""
@@ -330,10 +330,10 @@ class PlacedObserved(Observed):
         names, labels = points.names(len(at)), self.parameter.labels
 
         def differences(sensor: int, axis: int, shifts: Array) -> sp.csr_array:
-            there = np.repeat(at[[sensor]], len(shifts), axis=0)
-            there[:, axis] += shifts
-            every = np.concatenate([at[[sensor]], there])
-            values = points.rows(self.state, every, [sensor] * len(every))
+            shifted = np.repeat(at[[sensor]], len(shifts), axis=0)
+            shifted[:, axis] += shifts
+            points_tested = np.concatenate([at[[sensor]], shifted])
+            values = points.rows(self.state, points_tested, [sensor] * len(points_tested))
             return sp.csr_array(values[1:] - values[np.zeros(len(shifts), dtype=int)])
 
         self.shifts = []
@@ -348,7 +348,7 @@ class PlacedObserved(Observed):
                         "model.with_unknowns(observation.unknowns)."
                     )
                 start, reach = at[sensor], REACH * std
-                low, high = (_reached(block, start, axis, step) for step in (-reach, reach))
+                low, high = (_last_inside(block, start, axis, step) for step in (-reach, reach))
                 # Between nodes of linear elements, u has no curvature to resolve.
                 step = min(std, max(float(block.widths(start)[axis]), std / PER_STD))
                 places = _spaced(low[axis] - start[axis], high[axis] - start[axis], step)
@@ -400,8 +400,8 @@ class PlacedObserved(Observed):
         row = np.repeat(np.arange(self.size), np.diff(pattern.indptr))
         values = [np.asarray(self.G[row, pattern.indices])]
         for k, sensor in enumerate(rows):
-            own = np.asarray(self._differences[np.full_like(row, k), pattern.indices])
-            values.append(np.where(row == sensor, own, 0.0))
+            difference = np.asarray(self._differences[np.full_like(row, k), pattern.indices])
+            values.append(np.where(row == sensor, difference, 0.0))
         return pattern, np.array(values)
 
 
@@ -411,21 +411,21 @@ def _spaced(low: float, high: float, step: float) -> Array:
     return np.unique(np.concatenate([*ends, [0.0]]))
 
 
-def _reached(block: FieldBlock, start: Array, axis: int, step: float) -> Array:
+def _last_inside(block: FieldBlock, start: Array, axis: int, step: float) -> Array:
     """Return start + step along an axis, or the last point before it inside the mesh."""
-    least, most = 0.0, 1.0  # if the share is below `NEAR`, the start is at the end of the mesh
+    inside, outside = 0.0, 1.0  # if the share is below `NEAR`, the start is at the end of the mesh
 
     def at(share: float) -> Array:
         point: Array = start.copy()
         point[axis] += share * step
         return point
 
-    if block.contains(at(most)):
-        return at(most)
-    while most - least > NEAR:
-        middle = 0.5 * (least + most)
-        least, most = (middle, most) if block.contains(at(middle)) else (least, middle)
-    return at(least) if least > 0.0 else start
+    if block.contains(at(outside)):
+        return at(outside)
+    while outside - inside > NEAR:
+        centre = 0.5 * (inside + outside)
+        inside, outside = (centre, outside) if block.contains(at(centre)) else (inside, centre)
+    return at(inside) if inside > 0.0 else start
 
 
 @dataclass(frozen=True, eq=False)
@@ -450,14 +450,14 @@ class Averages(Observation):
     listed = ("regions", "region")
 
     def __post_init__(self) -> None:
-        given: Any = self.regions
-        if not isinstance(given, Mapping):
+        regions: Any = self.regions
+        if not isinstance(regions, Mapping):
             raise ObservationError(
                 "Averages: expected a mapping, sensor name -> predicate on x or name of a boundary "
-                f"or subdomain, as in Averages({{'core': lambda x: x[0] < 0.1}}); got {given!r}."
+                f"or subdomain, as in Averages({{'core': lambda x: x[0] < 0.1}}); got {regions!r}."
             )
         super().__post_init__()
-        for name, region in given.items():
+        for name, region in regions.items():
             if not (isinstance(name, str) and (isinstance(region, str) or callable(region))):
                 raise ObservationError(
                     f"Averages: {name!r}: {region!r} is not a region; expected the name of a "
@@ -472,18 +472,18 @@ class Averages(Observation):
     @staticmethod
     def _row(block: FieldBlock, name: str, region: Predicate | str) -> Array:
         mesh, weight = block.field.mesh, block.field.weight
-        where = region if isinstance(region, str) else None
-        known = [*(mesh.boundaries or {}), *(mesh.subdomains or {})]
-        if where is not None and where not in known:
+        boundary = region if isinstance(region, str) else None
+        names = [*(mesh.boundaries or {}), *(mesh.subdomains or {})]
+        if boundary is not None and boundary not in names:
             raise ObservationError(
-                f"Averages: region '{name}' is '{where}'; the mesh names {known or 'nothing'}."
+                f"Averages: region '{name}' is '{boundary}'; the mesh names {names or 'nothing'}."
             )
         order = max(2 * int(block.field.element.maxdeg), block.field.order)
-        measure = Measure(mesh, order, where, weight=weight)
+        measure = Measure(mesh, order, boundary, weight=weight)
         if isinstance(region, str):
             size, row = _integral(block, measure, lambda x, _: 1.0)
             if size == 0.0:  # a boundary on the axis
-                size, row = _integral(block, Measure(mesh, order, where), lambda x, _: 1.0)
+                size, row = _integral(block, Measure(mesh, order, boundary), lambda x, _: 1.0)
         else:
             size, row = _integral_inside(block, measure, region)
         if size <= 0:
@@ -496,11 +496,11 @@ def _integral_inside(block: FieldBlock, measure: Measure, region: Predicate) -> 
     mesh, cut = block.field.mesh, crossed(measure, region)
     size, row = _integral(block, measure, lambda x, cells: region(x) * ~np.isin(cells, cut))
     # Without quadrature points in the region and crossed cells, search finer parts of all cells.
-    members = cut if size > 0 or len(cut) else np.arange(mesh.nelements)
-    if len(members):
-        fine = FineMeasure(mesh, measure.order, members=members, weight=measure.weight)
-        more, added = _integral(block, fine, lambda x, _: region(x))
-        size, row = size + more, row + added
+    divided = cut if size > 0 or len(cut) else np.arange(mesh.nelements)
+    if len(divided):
+        fine = FineMeasure(mesh, measure.order, members=divided, weight=measure.weight)
+        size_inside, row_inside = _integral(block, fine, lambda x, _: region(x))
+        size, row = size + size_inside, row + row_inside
     return size, row
 
 
@@ -512,8 +512,8 @@ def _integral(
     The density is a function of points and of the indices of their cells, shape (cells, 1).
     """
     size, row = 0.0, np.zeros(block.size)
-    for at, piece in measure.pieces():
-        cells = np.arange(at.start, at.stop) if piece.cells is None else piece.cells
+    for part, piece in measure.pieces():
+        cells = np.arange(part.start, part.stop) if piece.cells is None else piece.cells
         weights = density(piece.points, cells[:, None]) * piece.weights
         size += float(weights.sum())
         local = block.local(piece)
@@ -587,16 +587,16 @@ def _cuts(mesh: Any, a: Array, b: Array) -> Array:
     else:
         first = corners[:, :, 1] - corners[:, :, 0]
         normals = np.cross(first, corners[:, :, 2] - corners[:, :, 0])
-    across = normals @ (b - a)
+    slope = normals @ (b - a)
     with np.errstate(divide="ignore", invalid="ignore"):
-        s = np.einsum("fd,fd->f", normals, corners[:, :, 0] - a) / across
+        s = np.einsum("fd,fd->f", normals, corners[:, :, 0] - a) / slope
     s, corners = s[np.isfinite(s)], corners[np.isfinite(s)]
     points = a + s[:, None] * (b - a)
     # Rounding must not remove the cut of a line along a facet or through a vertex.
-    slack = 1e-9 * (mesh.p.max() - mesh.p.min())
-    low, high = corners.min(axis=2) - slack, corners.max(axis=2) + slack
-    hit = s[np.all((points >= low) & (points <= high), axis=1) & (s > 0) & (s < 1)]
-    return np.unique(np.concatenate([[0.0], hit, [1.0]]))
+    tolerance = 1e-9 * (mesh.p.max() - mesh.p.min())
+    low, high = corners.min(axis=2) - tolerance, corners.max(axis=2) + tolerance
+    cuts = s[np.all((points >= low) & (points <= high), axis=1) & (s > 0) & (s < 1)]
+    return np.unique(np.concatenate([[0.0], cuts, [1.0]]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -607,7 +607,7 @@ class Matrix(Observation):
     labels: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
-        self._sees_all("G uses all components.")
+        self._refuse_component("G uses all components.")
 
     def names(self, count: int) -> tuple[str, ...]:
         if self.labels is None:
@@ -617,8 +617,8 @@ class Matrix(Observation):
         return tuple(self.labels)
 
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
-        given: Any = self.G if sp.issparse(self.G) else np.atleast_2d(self.G)
-        matrix = sp.csr_array(given)
+        stored: Any = self.G if sp.issparse(self.G) else np.atleast_2d(self.G)
+        matrix = sp.csr_array(stored)
         if matrix.shape[1] != state.seen:
             raise ObservationError(
                 f"Matrix: G has {matrix.shape[1]} columns; the state has {state.seen} coefficients."

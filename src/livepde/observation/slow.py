@@ -54,7 +54,7 @@ class Slow(Observation):
     portable = True
 
     def __post_init__(self) -> None:
-        self._sees_all("give of= to the observation that it is made of.")
+        self._refuse_component("give of= to the observation that it is made of.")
         if not isinstance(self.base, Points | Averages | LineIntegrals):
             kind = type(self.base).__name__
             raise ObservationError(
@@ -66,12 +66,12 @@ class Slow(Observation):
                 "Slow: the base has uncertain positions, or reads unknowns directly. Leave out "
                 "position_std and direct."
             )
-        self._shows(self.base)
-        given = self.time_constant
-        low = given.bounds[0] if isinstance(given, Prior) else given
-        if not (low >= 0.0 and (isinstance(given, Prior) or 0.0 < given < math.inf)):
+        self._add_base_channels(self.base)
+        constant = self.time_constant
+        low = constant.bounds[0] if isinstance(constant, Prior) else constant
+        if not (low >= 0.0 and (isinstance(constant, Prior) or 0.0 < constant < math.inf)):
             raise ObservationError(
-                f"Slow: time_constant must be positive; got {given!r}. As a prior use LogNormal."
+                f"Slow: time_constant must be positive; got {constant!r}. As a prior use LogNormal."
             )
 
     @property
@@ -93,8 +93,8 @@ class Slow(Observation):
     @property
     def states(self) -> Mapping[str, SensorState]:
         constant = None if isinstance(self.time_constant, Prior) else float(self.time_constant)
-        each = enumerate(self._sensors)
-        return {name: SensorState(partial(_row, self.base, k), constant) for k, name in each}
+        sensors = enumerate(self._sensors)
+        return {name: SensorState(partial(_row, self.base, k), constant) for k, name in sensors}
 
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
         if missing := [name for name in self._sensors if name not in state.sensors]:

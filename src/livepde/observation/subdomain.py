@@ -57,10 +57,10 @@ class Subdomain(Observation):
     def elements(self, state: FieldBlock) -> IntArray:
         """Return the indices of the elements in omega."""
         inside = np.zeros(state.field.mesh.nelements, dtype=bool)
-        for at, piece in Measure(state.field.mesh, INTERIOR).pieces():
+        for cells, piece in Measure(state.field.mesh, INTERIOR).pieces():
             x = piece.points
-            found = np.broadcast_to(self.omega(x.reshape(len(x), -1)), x[0].size)
-            inside[at] = found.reshape(x.shape[1:]).all(axis=1)
+            in_omega = np.broadcast_to(self.omega(x.reshape(len(x), -1)), x[0].size)
+            inside[cells] = in_omega.reshape(x.shape[1:]).all(axis=1)
         return np.flatnonzero(inside)
 
     def region(self, state: FunctionSpace) -> Mask:
@@ -74,13 +74,13 @@ class Subdomain(Observation):
         inside = np.zeros(state.size, dtype=bool)
         inside[state.element_dofs[:, self.elements(state)]] = True
         inside[state.fixed] = False
-        found: IntArray = np.flatnonzero(inside)
-        if not len(found):
+        free: IntArray = np.flatnonzero(inside)
+        if not len(free):
             raise ObservationError(
                 "Subdomain: no element of the mesh with a free coefficient lies in omega; check "
                 "the predicate and the unit of its coordinates, or refine the mesh."
             )
-        return found
+        return free
 
     def sample(self, given: Callable[[Array], Any] | xr.DataArray, state: FunctionSpace) -> Array:
         """Return the data z of one or several samples from values in space.
@@ -113,14 +113,14 @@ class Subdomain(Observation):
         array([0. , 2.5, 5. ])
         """
         block, _ = state.component(self.of)
-        found = self.selected(block)
+        selected = self.selected(block)
         points, fit = block.fitted(self.elements(block))
         what = f"{type(self).__name__}.sample"
         values: Any
         if callable(given):
-            values, several = np.asarray(given(points), dtype=float)[None], False
+            values, many = np.asarray(given(points), dtype=float)[None], False
         else:
-            values, several = _interpolated(given, points, what)
+            values, many = _interpolated(given, points, what)
         shape = len(block.variables("u")), points.shape[1]
         if shape[0] > 1 and values.shape[1:] != shape:
             raise ObservationError(
@@ -140,14 +140,14 @@ class Subdomain(Observation):
                 f"{what}: a value is not finite. A missing value may be NaN for elements of first "
                 "order only."
             )
-        z = np.array([fit(one)[found] for one in values])
-        return z if several else z[0]
+        z = np.array([fit(sample_values)[selected] for sample_values in values])
+        return z if many else z[0]
 
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
         block, _ = state.component(self.of)
-        found = self.selected(block)
-        entries = (np.ones(len(found)), (np.arange(len(found)), found))
-        return state.widen(sp.csr_array(entries, shape=(len(found), block.size)), self.of)
+        selected = self.selected(block)
+        entries = (np.ones(len(selected)), (np.arange(len(selected)), selected))
+        return state.widen(sp.csr_array(entries, shape=(len(selected), block.size)), self.of)
 
 
 def _interpolated(given: Any, points: Array, what: str) -> tuple[Array, bool]:
@@ -159,25 +159,25 @@ def _interpolated(given: Any, points: Array, what: str) -> tuple[Array, bool]:
         raise ObservationError(
             f"{what}: got {type(given).__name__}; expected a function of x or a DataArray."
         )
-    more = [dimension for dimension in given.dims if dimension not in axes]
-    if len(more) > 1 or not all(axis in given.indexes for axis in axes):
+    other_axes = [dimension for dimension in given.dims if dimension not in axes]
+    if len(other_axes) > 1 or not all(axis in given.indexes for axis in axes):
         raise ObservationError(
             f"{what}: the DataArray has the dimensions {list(map(str, given.dims))}; expected the "
             f"coordinates {axes}, and at most one dimension more."
         )
-    at = {}
+    coordinates = {}
     for axis, x in zip(axes, points, strict=True):
-        known = given[axis].values
-        low, high = float(known.min()), float(known.max())
-        slack = 1e-9 * (high - low)
-        if x.min() < low - slack or x.max() > high + slack:
+        grid = given[axis].values
+        low, high = float(grid.min()), float(grid.max())
+        tolerance = 1e-9 * (high - low)
+        if x.min() < low - tolerance or x.max() > high + tolerance:
             raise ObservationError(
                 f"{what}: the DataArray has values for {axis} from {low:g} to {high:g}; they are "
                 f"needed from {x.min():g} to {x.max():g}."
             )
-        at[axis] = xr.DataArray(np.clip(x, low, high), dims="at the points")
-    found = given.interp(at).transpose(*more, "at the points")
-    return np.atleast_2d(np.asarray(found.values, dtype=float)), bool(more)
+        coordinates[axis] = xr.DataArray(np.clip(x, low, high), dims="at the points")
+    result = given.interp(coordinates).transpose(*other_axes, "at the points")
+    return np.atleast_2d(np.asarray(result.values, dtype=float)), bool(other_axes)
 
 
 def _everywhere(x: object) -> bool:
