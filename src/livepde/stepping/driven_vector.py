@@ -49,9 +49,9 @@ class DrivenVector:
             a, b = scale * rng.standard_normal((2, len(self.channels)))
             with np.errstate(all="ignore"):
                 parts = [self._at(0.3, x) for x in (a, b, a + b, 0.0 * a)]
-            change = parts[0] + parts[1] - parts[2] - parts[3]
+            defect = parts[0] + parts[1] - parts[2] - parts[3]
             size = max(np.abs(part).max(initial=0.0) for part in parts)
-            if not np.abs(change).max(initial=0.0) <= ROUNDING * size:
+            if not np.abs(defect).max(initial=0.0) <= ROUNDING * size:
                 return False
         return True
 

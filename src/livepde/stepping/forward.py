@@ -56,8 +56,8 @@ class ForwardStage:
         self.model = model
         self.newton = newton or Newton()
         self.form = model.physical_A
-        self._made: tuple[At, Factor] | None = None
-        self._last: tuple[At, _System] | None = None
+        self._cached_factor: tuple[At, Factor] | None = None
+        self._cached_system: tuple[At, _System] | None = None
         self._rate: tuple[float, Array] | None = None
         # q, the load without inputs, and its derivative by each input.
         self._driving: tuple[Array, Array, Array] | None = None
@@ -65,29 +65,29 @@ class ForwardStage:
     def twin(self) -> ForwardStage:
         """Return a stage with the same symbolic analysis and separate factors."""
         _ = self._dual_weights, self.engine  # computed before the copy, to be shared
-        other = copy.copy(self)
-        other._made = other._last = other._rate = other._driving = None
-        return other
+        stage = copy.copy(self)
+        stage._cached_factor = stage._cached_system = stage._rate = stage._driving = None
+        return stage
 
     @cached_property
     def _rows(self) -> tuple[Pattern, dict[str, sp.csr_array]]:
         """Pattern of M/h + B' + d(A q)/du on the free rows, and the maps of its parts."""
         model = self.model
         free = sp.diags_array(model.X.free)
-        whole = Assembler(model.X.dim)
-        whole.add("M", model.form_M.pattern("v", "u"), free)
-        whole.add("B", model.form_B.pattern("v", "u"), free)
-        whole.add("A", self.form.pattern("v", "u"), free)
-        return whole.build()
+        assembler = Assembler(model.X.dim)
+        assembler.add("M", model.form_M.pattern("v", "u"), free)
+        assembler.add("B", model.form_B.pattern("v", "u"), free)
+        assembler.add("A", self.form.pattern("v", "u"), free)
+        return assembler.build()
 
     @cached_property
     def _free(self) -> tuple[Pattern, sp.csr_array, Array]:
         """Pattern and map from row data to the free block, with ones on fixed diagonals."""
         model = self.model
-        whole = Assembler(model.X.dim)
-        whole.add("rows", self._rows[0], right=sp.diags_array(model.X.free))
-        whole.add("fixed", Pattern.of(sp.eye_array(model.X.dim)))
-        pattern, maps = whole.build()
+        assembler = Assembler(model.X.dim)
+        assembler.add("rows", self._rows[0], right=sp.diags_array(model.X.free))
+        assembler.add("fixed", Pattern.of(sp.eye_array(model.X.dim)))
+        pattern, maps = assembler.build()
         return pattern, maps["rows"], maps["fixed"] @ (1.0 - model.X.free)
 
     @cached_property
@@ -98,12 +98,12 @@ class ForwardStage:
         # If the matrix is linear in q, a test with one random q is correct with probability one.
         # `_factorise` tests every matrix again.
         model, rows = self.model, self._free[1]
-        some = np.random.default_rng(0).standard_normal(model.Q.dim) * model.latent.deviations
+        amplitudes = np.random.default_rng(0).standard_normal(model.Q.dim) * model.latent.deviations
         inputs = Inputs(dict.fromkeys(model.channels, 1.0))
         with np.errstate(all="ignore"):
-            q = model.latent.value(model.latent.prior + some)
-            rest = self._data_at(q, math.inf, Moment(0.0, inputs))
-        parts = (self._rows[1]["M"] @ model.mass.data, rest)
+            q = model.latent.value(model.latent.prior + amplitudes)
+            without_mass = self._data_at(q, math.inf, Moment(0.0, inputs))
+        parts = (self._rows[1]["M"] @ model.mass.data, without_mass)
         return all(self._mirrored(rows @ part) for part in parts)
 
     @cached_property
@@ -175,9 +175,9 @@ class ForwardStage:
     @cached_property
     def _dual_weights(self) -> Array:
         diagonal = np.abs(self.model.mass.diagonal())
-        least = diagonal.max(initial=0.0) or 1.0
+        largest = diagonal.max(initial=0.0) or 1.0
         # Algebraic components have no mass and use the largest diagonal entry instead.
-        return self.model.X.free / np.where(diagonal > 0.0, diagonal, least)
+        return self.model.X.free / np.where(diagonal > 0.0, diagonal, largest)
 
     @cached_property
     def _mass(self) -> sp.csr_array | Array:
@@ -189,16 +189,16 @@ class ForwardStage:
 
     def _factorise(self, data: Array) -> Factor:
         _, rows, fixed = self._free
-        complete = rows @ data + fixed if len(self.model.X.fixed) else data
+        free_data = rows @ data + fixed if len(self.model.X.fixed) else data
         # A Cholesky solver reads only one triangle, so a nonsymmetric matrix would go unnoticed.
-        if not self.solver.definite or self._mirrored(complete):
+        if not self.solver.definite or self._mirrored(free_data):
             try:
-                return self.solver.factorise(complete)
+                return self.solver.factorise(free_data)
             except LinearAlgebraError as error:
                 if not self.symmetric:
                     raise StepFailed("singular", str(error)) from error
         try:  # the matrix is not positive definite for extreme q, but the step may still succeed
-            return self._general.factorise(complete)
+            return self._general.factorise(free_data)
         except LinearAlgebraError as error:
             raise StepFailed("singular", str(error)) from error
 
@@ -228,41 +228,41 @@ class ForwardStage:
 
     def _system(self, q: Array, h: float, moment: Moment) -> _System:
         """Return matrix and constant offset B(0) + A(0) q, cached for the last (q, h)."""
-        last = self._last
-        if last is None or not last[0].same(q, h):
+        cached = self._cached_system
+        if cached is None or not cached[0].same(q, h):
             physical = self.model.latent.value(q)
             data = self._data_at(physical, h, moment)
             offset = self._at_zero(physical, moment) if self.model.constant else None
-            last = (At(q, h), _System(data, self._rows[0].compact(data), offset))
-            self._last = last
-        return last[1]
+            cached = (At(q, h), _System(data, self._rows[0].compact(data), offset))
+            self._cached_system = cached
+        return cached[1]
 
     def factor(self, q: Array, h: float, moment: Moment) -> Factor:
         """Return the factor of an affine model for (q, h), cached for the last pair."""
-        made, last = self._made, self._last
-        if made is None or not made[0].same(q, h):
-            self._made = made = None  # memory may not suffice for two factors
-            if last is not None and last[0].same(q, h):
-                data = last[1].data
+        cached, system = self._cached_factor, self._cached_system
+        if cached is None or not cached[0].same(q, h):
+            self._cached_factor = cached = None  # memory may not suffice for two factors
+            if system is not None and system[0].same(q, h):
+                data = system[1].data
             else:
                 data = self._data_at(self.model.latent.value(q), h, moment)
-            self._made = made = (At(q, h), self._factorise(data))
-        return made[1]
+            self._cached_factor = cached = (At(q, h), self._factorise(data))
+        return cached[1]
 
-    def _known(self, c: Array, system: _System, q: Array, h: float, moment: Moment) -> Array:
+    def _right_side(self, c: Array, system: _System, q: Array, h: float, moment: Moment) -> Array:
         """Return the right-hand side of a stage of an affine model."""
-        known: Array = self._mass @ (c / h)
+        right_side: Array = self._mass @ (c / h)
         if system.offset is not None:
-            return known - system.offset + self.model.F(moment)
+            return right_side - system.offset + self.model.F(moment)
         if not self._driven_affinely:
             physical = self.model.latent.value(q)
-            return known - self._at_zero(physical, moment) + self.model.F(moment)
+            return right_side - self._at_zero(physical, moment) + self.model.F(moment)
         driving = self._driving  # read only once: copies of an identifier may step in other threads
         if driving is None or not np.array_equal(driving[0], q):
             self._driving = driving = (q, *self._load(self.model.latent.value(q)).assembled())
         _, base, changes = driving
         inputs = np.array([moment.inputs[name] for name in self.model.channels])
-        return known + base + inputs @ changes
+        return right_side + base + inputs @ changes
 
     def _load(self, q: Array) -> DrivenVector:
         """Return F - B(0) - A(0) q of an affine model, as a function of time and inputs."""
@@ -280,16 +280,16 @@ class ForwardStage:
         Tested at a random q: at the prior mean, a product of an unknown and an input may vanish.
         """
         latent = self.model.latent
-        some = np.random.default_rng(0).standard_normal(latent.dim) * latent.deviations
+        amplitudes = np.random.default_rng(0).standard_normal(latent.dim) * latent.deviations
         with np.errstate(all="ignore"):
-            return self._load(latent.value(latent.prior + some)).responses is not None
+            return self._load(latent.value(latent.prior + amplitudes)).responses is not None
 
     def solve(self, c: Array, q: Array, h: float, moment: Moment) -> Array:
         """Return the state at the end of a stage; raise `StepFailed` without a solution."""
         u = self.model.impose(c, moment)
         if self.keeps:
             system = self._system(q, h, moment)
-            residual = system.matrix @ u - self._known(c, system, q, h, moment)
+            residual = system.matrix @ u - self._right_side(c, system, q, h, moment)
             return u - solved(self.factor(q, h, moment), residual * self.model.X.free)
         equation = _StageEquation(self, c, self.model.latent.value(q), h, moment)
         return self.newton.solve(equation, u).at.y
@@ -366,20 +366,20 @@ class ForwardStage:
         # Predict the state by linear extrapolation in time: a better predictor saves corrections.
         guess = begin + h * kept.trend if len(kept.q) else begin
         system = self._system(q, h, moment)
-        known = self._known(begin, system, q, h, moment)
-        corrected = self._corrections(system, At(q, h), moment, kept)
-        new[:, 0] = u = corrected.solve(begin, model.impose(guess, moment), known, STATE, PASSES)
-        exact = At(q, h).same(*corrected.factor_at)
+        known = self._right_side(begin, system, q, h, moment)
+        corrections = self._corrections(system, At(q, h), moment, kept)
+        new[:, 0] = u = corrections.solve(begin, model.impose(guess, moment), known, STATE, PASSES)
+        current = At(q, h).same(*corrections.factor_at)
         for part in groups:
             start, known = c[:, part], driven(u, part)
-            if exact:  # a direct solve requires no initial guess
+            if current:  # a direct solve requires no initial guess
                 known *= free
                 new[:, part] = solved(self.factor(q, h, moment), known)
             elif part.start == end:
-                new[:, part] = corrected.once(start, known)
+                new[:, part] = corrections.correct(start, known)
             else:
-                new[:, part] = corrected.solve(start, start, known, tolerance, PASSES - 1)
-        return new, Kept(*corrected.factor_at, corrected.spent, (u - begin) / h)
+                new[:, part] = corrections.solve(start, start, known, tolerance, PASSES - 1)
+        return new, Kept(*corrections.factor_at, corrections.spent, (u - begin) / h)
 
     def _corrections(self, system: _System, at: At, moment: Moment, kept: Kept) -> Corrections:
         """Return the refinement for a stage that starts with the factor of an earlier stage."""
@@ -397,11 +397,11 @@ class ForwardStage:
         self, u: Array, c: Array, q: Array, directions: Array, h: float, moment: Moment
     ) -> Array:
         """Return the right-hand sides of tangents, shape (n, r)."""
-        at = {} if self.form.linear_in_parameter else {"q": self.model.latent.value(q)}
+        arguments = {} if self.form.linear_in_parameter else {"q": self.model.latent.value(q)}
         if self.form.fixed_by_numbers:
-            forcing = self.form.about(at["q"]).product(directions, u)
+            forcing = self.form.about(arguments["q"]).product(directions, u)
         else:
-            forcing = self.form.product("v", "q", directions, moment, u=u, **at)
+            forcing = self.form.product("v", "q", directions, moment, u=u, **arguments)
         driven: Array = self._mass @ c
         driven /= h
         driven -= forcing
@@ -447,10 +447,10 @@ class _StageEquation:
         driven = self.stage.form.vector("v", self.moment, q=self.q, u=y)
         flux = model.B(y, self.moment)
         residual = (rate + flux + driven - self.source) * model.X.free
-        own, *sizes = (
+        error, *sizes = (
             self.stage.dual(term) for term in (residual, rate, flux, driven, self.source)
         )
-        return _StateEvaluation(y, residual, own / max(*sizes, TINY))
+        return _StateEvaluation(y, residual, error / max(*sizes, TINY))
 
     def factor(self, at: _StateEvaluation) -> Factor:
         return self.stage._factorise(self.stage._data(at.y, self.q, self.h, self.moment))
@@ -460,9 +460,9 @@ class _StageEquation:
         data = np.abs(stage._data(at.y, self.q, self.h, moment))
         # The rounding error is proportional to |S| |u|, the sum of the sizes of terms in each row.
         sizes = stage._rows[0].matrix(data) @ np.maximum(np.abs(at.y), np.abs(self.c))
-        own = stage.dual(at.residual)
+        error = stage.dual(at.residual)
         rounding = ROUNDING * max(stage.dual(sizes), stage.dual(self.source))
-        return own <= max(allowed * own / max(at.size, TINY), rounding)
+        return error <= max(allowed * error / max(at.size, TINY), rounding)
 
 
 def simulate(

@@ -40,18 +40,18 @@ class Held:
                 f"between: got {between!r}; expected a mapping from input channel to behaviour, "
                 'such as {"heater": "hold"}.'
             )
-        for name, given in between.items():
+        for name, behaviour in between.items():
             if name not in inputs:
                 raise ConfigurationError(
                     f"between: '{name}' is not an input of this model; the inputs are "
                     f"{list(inputs)}."
                 )
-            if given not in get_args(Between):
+            if behaviour not in get_args(Between):
                 raise ConfigurationError(
-                    f"between of '{name}': got {given!r}; expected 'line', 'hold' or 'next'."
+                    f"between of '{name}': got {behaviour!r}; expected 'line', 'hold' or 'next'."
                 )
         kinds = {
-            kind: [n for n, one in between.items() if one == kind] for kind in ("hold", "next")
+            kind: [n for n, item in between.items() if item == kind] for kind in ("hold", "next")
         }
         return cls(tuple(sorted(kinds["hold"])), tuple(sorted(kinds["next"])))
 
@@ -162,10 +162,10 @@ class Interval:
         if self.inputs0 is self.inputs1:
             return Moment(t, self._last.inputs)
         s = self._weight(t)
-        mixed = {k: (1 - s) * self.inputs0[k] + s * v for k, v in self.inputs1.items()}
+        inputs = {k: (1 - s) * self.inputs0[k] + s * v for k, v in self.inputs1.items()}
         if self.row is not None:  # avoid rounding errors in the values of held channels
-            mixed |= {k: v for k, v in self.inputs1.items() if v == self.inputs0[k]}
-        return Moment(t, Inputs(mixed))
+            inputs |= {k: v for k, v in self.inputs1.items() if v == self.inputs0[k]}
+        return Moment(t, Inputs(inputs))
 
     @cached_property
     def _last(self) -> Moment:
@@ -201,16 +201,16 @@ def _values(inputs: Mapping[str, float], channels: tuple[str, ...]) -> Array:
 
 def own_noise(noise: ArrayLike) -> Array | None:
     """Return noise standard deviations of readings; None if all are sensor defaults (NaN)."""
-    found: Array = np.asarray(noise, dtype=float)
-    return None if np.isnan(found).all() else found
+    stds: Array = np.asarray(noise, dtype=float)
+    return None if np.isnan(stds).all() else stds
 
 
 def gaps_of(
     channels: Sequence[str], before: Iterable[float], again: Iterable[float]
 ) -> dict[str, tuple[float, bool]]:
     """Return the attribute `gaps` of an interval from durations before it and flags at its end."""
-    each = zip(channels, before, again, strict=True)
-    return {name: (past, now > 0.0) for name, past, now in each if past or now}
+    gaps = zip(channels, before, again, strict=True)
+    return {name: (past, continues > 0.0) for name, past, continues in gaps if past or continues}
 
 
 class Moments(NamedTuple):
@@ -324,21 +324,21 @@ class Span:
     @property
     def present(self) -> Mask:
         """Mask of members with a measurement at the end, shape (members,) or (1,)."""
-        given = np.isfinite(self.z1)
-        if np.count_nonzero(given) == given.size:
-            return np.ones(len(given), dtype=bool)
-        return np.asarray(given.any(axis=1))
+        finite = np.isfinite(self.z1)
+        if np.count_nonzero(finite) == finite.size:
+            return np.ones(len(finite), dtype=bool)
+        return np.asarray(finite.any(axis=1))
 
     def at(self, t: float) -> Moments:
         """Return time and inputs at t for members with a common start; at t1, before a switch."""
-        mixed = last = self.inputs1
+        inputs = last = self.inputs1
         # If both ends are the same object, all inputs are constant.
         if t != self.t1 and self.inputs0 is not last:
             s = (t - self.start) / (self.t1 - self.start)
-            mixed = (1 - s) * self.inputs0 + s * last
+            inputs = (1 - s) * self.inputs0 + s * last
             if self.row is not None:  # avoid rounding errors in the values of held channels
-                mixed = np.where(self.inputs0 == last, last, mixed)
-        return Moments(t=t, channels=self.channels, inputs=mixed, interval=self.interval)
+                inputs = np.where(self.inputs0 == last, last, inputs)
+        return Moments(t=t, channels=self.channels, inputs=inputs, interval=self.interval)
 
     @property
     def end(self) -> Moments:
@@ -348,8 +348,8 @@ class Span:
         return Moments(t=self.t1, channels=self.channels, inputs=self.stated, interval=interval)
 
     def part(self, group: IntArray) -> Span:
-        def some(values: Array) -> Array:
-            return values[group] if len(values) > 1 else values
+        def some(array: Array) -> Array:
+            return array[group] if len(array) > 1 else array
 
         parts = {item.name: getattr(self, item.name) for item in fields(self)}
         arrays = {name: some(part) for name, part in parts.items() if isinstance(part, np.ndarray)}

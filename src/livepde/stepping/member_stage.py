@@ -128,9 +128,9 @@ class SeparateStages(MemberStage):
         return self._stages[k]
 
     def twin(self) -> SeparateStages:
-        other = SeparateStages(self.model)
-        other._stages = [self._stage(0).twin()]
-        return other
+        stages = SeparateStages(self.model)
+        stages._stages = [self._stage(0).twin()]
+        return stages
 
     def kept(self, members: int) -> KeptFactors:
         stage = self._stage(0)
@@ -141,7 +141,7 @@ class SeparateStages(MemberStage):
     def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
         new, left, kept = np.empty_like(columns), [], stage.kept
         for k, member in enumerate(stage.members.tolist()):
-            y, after = self._stage(member).advance(
+            y, warm_start = self._stage(member).advance(
                 columns[:, k].T,
                 stage.q[k],
                 stage.directions[k].T,
@@ -152,10 +152,10 @@ class SeparateStages(MemberStage):
                 stage.apart,
             )
             new[:, k] = y.T
-            left.append(after)
+            left.append(warm_start)
         if not kept.q.shape[1]:
             return new, kept
-        rows = (np.array([getattr(one, name) for one in left]) for name in vars(left[0]))
+        rows = (np.array([getattr(item, name) for item in left]) for name in vars(left[0]))
         return new, KeptFactors(*rows)
 
 
@@ -217,10 +217,10 @@ class BandedStage(MemberStage):
         ones = np.where(rows == cols, 1.0 - free[rows], 0.0)
         parts = [term.data * inner for term in terms]
         parts[unknowns] = parts[unknowns] + ones
-        every = np.array([*parts, mass * inner])
-        self._blocks = BandedBlocks.of(BandedSolver(self.pattern), *every)
+        entries = np.array([*parts, mass * inner])
+        self._blocks = BandedBlocks.of(BandedSolver(self.pattern), *entries)
         # The matrix of a stage is their sum with weights h q, h, both times inputs, and 1.
-        self._bands = self._blocks.band(every)
+        self._bands = self._blocks.band(entries)
         # Couplings of free coefficients to Dirichlet values are moved to the right-hand side. They
         # are sparse matrices with few entries.
         self._drive(
@@ -244,28 +244,28 @@ class BandedStage(MemberStage):
             return model.impose(zero, moment)
 
         def load(moment: Moment) -> Array:
-            known = model.form_F.vector("v", moment) - model.B(zero, moment)
+            total = model.form_F.vector("v", moment) - model.B(zero, moment)
             if not form.linear_in_parameter:
-                known = known - form.vector("v", moment, q=0.0 * units[0], u=zero)
-            return np.asarray(known * free - rest_edge @ boundary(moment))
+                total = total - form.vector("v", moment, q=0.0 * units[0], u=zero)
+            return np.asarray(total * free - rest_edge @ boundary(moment))
 
         def offset(moment: Moment) -> Array:
             def at_zero(q: Array) -> Array:
                 return form.vector("v", moment, q=q, u=zero)
 
-            each = [_along(form, q, at_zero) * free for q in units]
-            return np.asarray(np.concatenate(each) + slope_edge @ boundary(moment))
+            derivatives = [_along(form, q, at_zero) * free for q in units]
+            return np.asarray(np.concatenate(derivatives) + slope_edge @ boundary(moment))
 
         def driven(vector: Callable[[Moment], Array], *forms: Form) -> DrivenVector:
             def timed() -> bool:
-                return not fixed_in_time or any("t" in each.uses for each in forms)
+                return not fixed_in_time or any("t" in form_read.uses for form_read in forms)
 
             return DrivenVector(vector, model.channels, timed)
 
         self._boundary = driven(boundary)
         self._mass_boundary = driven(lambda moment: mass_edge @ boundary(moment))
-        known = () if form.linear_in_parameter else (form,)
-        self._load = driven(load, model.form_F, model.form_B, *known)
+        affine_forms = () if form.linear_in_parameter else (form,)
+        self._load = driven(load, model.form_F, model.form_B, *affine_forms)
         self._offset = driven(offset, form)
 
     @staticmethod
@@ -276,7 +276,7 @@ class BandedStage(MemberStage):
         if model.linear_A.spaces["q"].dim > MOST_UNKNOWNS:
             return f"there are more than {MOST_UNKNOWNS} unknown coefficients"
         pattern, maps = _analysed(model)
-        if not (model.steady or all(each.responses for each in _matrices(model, maps))):
+        if not (model.steady or all(matrix.responses for matrix in _matrices(model, maps))):
             return "the matrices of the model depend on time, or on inputs other than linearly"
         if not isinstance(analyse(pattern), BandedSolver):
             return "the matrices of the model are not banded: the mesh has more than one dimension"
@@ -293,14 +293,14 @@ class BandedStage(MemberStage):
     def repeats(self) -> bool:
         """Whether stages with the same length and unknowns differ only in their inputs."""
         vectors = self._boundary, self._mass_boundary, self._load, self._offset
-        return not self._terms and all(one.responses is not None for one in vectors)
+        return not self._terms and all(vector.responses is not None for vector in vectors)
 
     def _stacked(self, *parts: Array) -> sp.csr_array:
         """Return vertically stacked matrices of the pattern."""
         blocks = [self.pattern.matrix(part) for part in parts]
-        whole = sp.csr_array(sp.vstack(blocks, format="csr"))
-        whole.eliminate_zeros()  # an unknown of one layer has entries only there
-        return whole
+        stacked = sp.csr_array(sp.vstack(blocks, format="csr"))
+        stacked.eliminate_zeros()  # an unknown of one layer has entries only there
+        return stacked
 
     def twin(self) -> BandedStage:
         return self  # no factor is cached
@@ -339,12 +339,12 @@ class BandedStage(MemberStage):
         # Rounding in BLAS may depend on the shape, so separate columns must not share a product
         # with the others. The solution of a column does not depend on other columns.
         new, n = np.empty(columns.shape), columns.shape[2]
-        rows, known = columns.reshape(-1, n), new.reshape(-1, n)
+        rows, products = columns.reshape(-1, n), new.reshape(-1, n)
         if self._mass.separate or together == len(rows):
-            self._mass(rows, known)
+            self._mass(rows, products)
         else:
-            self._mass(rows[:together], known[:together])
-            self._mass(rows[together:], known[together:])
+            self._mass(rows[:together], products[:together])
+            self._mass(rows[together:], products[together:])
         return new
 
     def _add_load(self, u: Array, step: BandedStep, stage: StageOfMembers) -> None:
@@ -363,13 +363,13 @@ class BandedStage(MemberStage):
     ) -> None:
         """Subtract the forcing from the right-hand sides of tangents, (columns * members, n)."""
         size = len(stage.q)
-        along, chosen = stage.h * stage.directions, together // size - 1
+        scaled, joint = stage.h * stage.directions, together // size - 1
         if step.slopes is not None:
-            along = along @ step.slopes.transpose(0, 2, 1)
-        if chosen:
-            known[size:together] -= _sums_along(along[:, :chosen], driven)
+            scaled = scaled @ step.slopes.transpose(0, 2, 1)
+        if joint:
+            known[size:together] -= _sums_along(scaled[:, :joint], driven)
         if stage.apart:
-            known[together:] -= _sums_along(along[:, chosen:], driven)
+            known[together:] -= _sums_along(scaled[:, joint:], driven)
 
     def _begin(self, stage: StageOfMembers) -> BandedStep:
         """Return the common data of stages of a length, and cache them if they are reusable."""
@@ -383,9 +383,9 @@ class BandedStage(MemberStage):
         weights = np.empty((len(unknowns), count + len(self._terms) + 2))
         amounts = np.multiply(unknowns, h, out=weights[:, :count])
         weights[:, count], weights[:, -1] = h, 1.0
-        for place, term in enumerate(self._terms, count + 1):
-            weights[:, place] = weights[:, term.unknown if term.unknown >= 0 else count]
-            weights[:, place] *= stage.at.inputs[:, term.channel]
+        for column, term in enumerate(self._terms, count + 1):
+            weights[:, column] = weights[:, term.unknown if term.unknown >= 0 else count]
+            weights[:, column] *= stage.at.inputs[:, term.channel]
         factor = self._blocks.factorise(weights.dot(self._bands))
         step = BandedStep(factor, h, amounts, slopes, self._forced(h))
         if not self._terms:  # otherwise the factor depends on the inputs of this stage
@@ -400,25 +400,25 @@ class BandedStage(MemberStage):
         members, unknowns = step.amounts.shape
         offset = None if offset is None else offset.repeat(members // len(offset), axis=0)
         for term, edge in self._edges:
-            drawn = at.inputs[:, term.channel, None] * (edge @ boundary.T).T
+            coupling = at.inputs[:, term.channel, None] * (edge @ boundary.T).T
             if term.unknown < 0:
-                u -= h * drawn
+                u -= h * coupling
                 continue
             if offset is None:
                 offset = np.zeros((members, unknowns, u.shape[1]))
-            offset[:, term.unknown] += drawn
+            offset[:, term.unknown] += coupling
         return offset
 
     def _driven(self, u: Array, offset: Array | None, step: BandedStep, inputs: Array) -> Array:
         """Return the forcing A(u) e_j = A_j u + offset_j of tangents, (members, unknowns, n)."""
         parts, count = self._slopes(u).reshape(len(u), -1, u.shape[1]), step.amounts.shape[1]
-        found = parts
+        forcing = parts
         if self._terms:
-            found, more = parts[:, :count].copy(), iter(range(count, parts.shape[1]))
+            forcing, more = parts[:, :count].copy(), iter(range(count, parts.shape[1]))
             for term in self._terms:
                 if term.unknown >= 0:
-                    found[:, term.unknown] += inputs[:, term.channel, None] * parts[:, next(more)]
-        return found if offset is None else found + offset
+                    forcing[:, term.unknown] += inputs[:, term.channel, None] * parts[:, next(more)]
+        return forcing if offset is None else forcing + offset
 
     def _forced(self, h: float) -> tuple[Array, Array] | None:
         """Return the right-hand side of the state, (1, n), and its derivative by the inputs.
@@ -437,8 +437,8 @@ def _sums_along(directions: Array, driven: Array) -> Array:
     """Return the forcing of the tangents along their directions, (r * members, n)."""
     if len(driven) == 1:  # faster than a product of stacks
         return np.asarray(directions[0].dot(driven[0]))
-    found: Array = (directions @ driven).transpose(1, 0, 2)
-    return found.reshape(-1, driven.shape[2])
+    sums: Array = (directions @ driven).transpose(1, 0, 2)
+    return sums.reshape(-1, driven.shape[2])
 
 
 def _along(form: Form, unit: Array, of: Callable[[Array], Array]) -> Array:
@@ -462,10 +462,10 @@ def _matrices(model: Model, maps: Mapping[str, sp.csr_array]) -> Iterator[Driven
         return np.asarray(maps["A"] @ data)
 
     def rest(moment: Moment) -> Array:
-        found = maps["B"] @ B.data("v", "u", moment, u=zero)
+        data = maps["B"] @ B.data("v", "u", moment, u=zero)
         if not A.linear_in_parameter:
-            found = found + maps["A"] @ A.data("v", "u", moment, u=zero, q=0.0 * units[0])
-        return np.asarray(found)
+            data = data + maps["A"] @ A.data("v", "u", moment, u=zero, q=0.0 * units[0])
+        return np.asarray(data)
 
     for unit in units:
         yield DrivenVector(partial(slope, unit=unit), model.channels, lambda: "t" in A.uses)
@@ -475,26 +475,26 @@ def _matrices(model: Model, maps: Mapping[str, sp.csr_array]) -> Iterator[Driven
 
 def _matrix_terms(model: Model, maps: Mapping[str, sp.csr_array]) -> list[MatrixTerm]:
     """Return the terms of A_j and B: all terms without inputs, then nonzero terms of inputs."""
-    bases, more = list[MatrixTerm](), list[MatrixTerm]()
-    every = list(_matrices(model, maps))
-    for unknown, entries in zip((*range(len(every) - 1), -1), every, strict=True):
+    bases, of_inputs = list[MatrixTerm](), list[MatrixTerm]()
+    matrices = list(_matrices(model, maps))
+    for unknown, entries in zip((*range(len(matrices) - 1), -1), matrices, strict=True):
         if model.steady:
             bases.append(MatrixTerm(unknown, -1, entries.without_inputs()))
             continue
         base, changes = entries.assembled()
         bases.append(MatrixTerm(unknown, -1, base))
-        each = (MatrixTerm(unknown, c, change) for c, change in enumerate(changes))
-        more += [term for term in each if term.data.any()]
-    return bases + more
+        terms = (MatrixTerm(unknown, c, change) for c, change in enumerate(changes))
+        of_inputs += [term for term in terms if term.data.any()]
+    return bases + of_inputs
 
 
 def _analysed(model: Model) -> tuple[Pattern, dict[str, sp.csr_array]]:
     """Return the sparsity pattern of the stage matrix, and the maps of its parts."""
-    whole = Assembler(model.X.dim)
-    whole.add("M", model.form_M.pattern("v", "u"))
-    whole.add("B", model.form_B.pattern("v", "u"))
-    whole.add("A", model.linear_A.pattern("v", "u"))
-    return whole.build()
+    assembler = Assembler(model.X.dim)
+    assembler.add("M", model.form_M.pattern("v", "u"))
+    assembler.add("B", model.form_B.pattern("v", "u"))
+    assembler.add("A", model.linear_A.pattern("v", "u"))
+    return assembler.build()
 
 
 def member_stage(model: Model) -> MemberStage:

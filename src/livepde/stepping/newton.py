@@ -168,23 +168,23 @@ class _Iteration(Generic[Point]):
         """
         newton, factor = self.newton, near.factor
         while not self._solved(at, allowed):
-            fresh = factor is None
-            self._check_budget(at, spent=fresh and factors == 0)
+            factorises = factor is None
+            self._check_budget(at, spent=factorises and factors == 0)
             if factor is None:
                 factor, factors = self._factor(at), factors - 1
-            new, update = self._updated(at, factor)
-            if fresh and not new.size < at.size:
-                limited = self._limited(at, new, allowed)
+            candidate, update = self._updated(at, factor)
+            if factorises and not candidate.size < at.size:
+                limited = self._limited(at, candidate, allowed)
                 if limited is not None:
                     at = limited
                     break
-                new = self._damped(at, update)
+                candidate = self._damped(at, update)
             # The factor of the prediction has a separate limit.
             refresh = near.refresh if factor is near.factor else newton.refresh
-            slow = not new.size <= refresh * at.size
+            slow = not candidate.size <= refresh * at.size
             # If an update with an old factor fails, the better iterate is kept and its Jacobian
             # factorised.
-            at = new if new.size < at.size else at
+            at = candidate if candidate.size < at.size else at
             factor = None if slow else factor
         return Solution(at, self.updates, self.made)
 
@@ -196,8 +196,8 @@ class _Iteration(Generic[Point]):
 
     def _limited(self, at: Point, new: Point, allowed: float) -> Point | None:
         """Return the first iterate whose residual is limited by rounding, or None."""
-        both = (one for one in (at, new) if self.equation.limited(one, allowed))
-        return next(both, None)
+        candidates = (iterate for iterate in (at, new) if self.equation.limited(iterate, allowed))
+        return next(candidates, None)
 
     def _solved(self, at: Point, allowed: float) -> bool:
         if not math.isfinite(at.size):
@@ -294,7 +294,7 @@ class Corrections:
     factor_at: At
     spent: float
 
-    def once(self, start: Array, b: Array) -> Array:
+    def correct(self, start: Array, b: Array) -> Array:
         """Return the solution of matrix x = b after a single correction.
 
         The remaining error is at most `SLOW` times the initial error; otherwise the factor would
@@ -314,15 +314,15 @@ class Corrections:
         free = self.free.reshape(-1, *[1] * (b.ndim - 1))
         width = b[0].size
         exact = self.at.same(*self.factor_at)
-        first = (b - self.matrix @ start) * free
-        x, r, count = start, first, 0
+        residual = (b - self.matrix @ start) * free
+        x, r, count = start, residual, 0
         while True:
             update = solved(self.factor(*self.factor_at), r)
             x, count = x + update, count + 1
             if exact:  # the factor is that of the stage's matrix, so no iteration is needed
                 return x
-            moved, size = float(np.linalg.norm(update)), float(np.linalg.norm(x))
-            if moved <= ROUNDING * size:  # further corrections are rounding errors
+            correction, size = float(np.linalg.norm(update)), float(np.linalg.norm(x))
+            if correction <= ROUNDING * size:  # further corrections are rounding errors
                 return x
             last, r = float(np.linalg.norm(r)), (b - self.matrix @ x) * free
             # The contraction rate is estimated from residuals instead of updates, since the next
@@ -330,20 +330,20 @@ class Corrections:
             rate = float(np.linalg.norm(r)) / last if last else math.inf  # squares may underflow
             if rate <= SLOW:
                 # The remaining error is the geometric series of further corrections.
-                left = moved * rate / (1.0 - rate)
+                remaining = correction * rate / (1.0 - rate)
                 change = float(np.linalg.norm(x - before))
                 allowed = max(min(tolerance * size, SHARE * change), ROUNDING * size)
-                done = left <= allowed
-                more = 0.0 if done else math.log(allowed / left) / math.log(rate)
-                spent = self.spent + width * max(count + more - passes, 0)
-                if done:
+                converged = remaining <= allowed
+                passes_left = 0.0 if converged else math.log(allowed / remaining) / math.log(rate)
+                spent = self.spent + width * max(count + passes_left - passes, 0)
+                if converged:
                     self.spent = spent
                     return x
                 if spent <= self.price:
                     continue
             # The refinement with the old factor costs more than a factorisation.
             self.factor_at, self.spent, exact = self.at, 0.0, True
-            x, r = start, first
+            x, r = start, residual
 
 
 def solved(factor: Factor, b: Array) -> Array:

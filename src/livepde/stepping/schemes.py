@@ -164,11 +164,11 @@ class Advance:
     start: float = math.nan
 
     def __post_init__(self) -> None:
-        given: Any = self.halvings
-        whole = isinstance(given, int | np.integer) and not isinstance(given, bool)
-        if not (whole and 0 <= given <= MOST_HALVINGS):
+        halvings: Any = self.halvings
+        integer = isinstance(halvings, int | np.integer) and not isinstance(halvings, bool)
+        if not (integer and 0 <= halvings <= MOST_HALVINGS):
             raise ConfigurationError(
-                f"halvings must be a whole number from 0 to {MOST_HALVINGS}; got {given!r}."
+                f"halvings must be a whole number from 0 to {MOST_HALVINGS}; got {halvings!r}."
             )
 
     def divided(self, parts: int) -> Advance:
@@ -190,10 +190,10 @@ class Advance:
 
     def grade(self, t: float, h: float) -> int:
         """Return the number of halvings of a substep h at t due to grading near the start."""
-        since = t - self.start
-        # The factor keeps rounding of the times from halving a step that is half of `since`.
-        longest = 0.5 * since * (1 + ROUNDING)
-        if not self.halvings or longest >= h or not since >= 0.0:
+        elapsed = t - self.start
+        # The factor keeps rounding of the times from halving a step that is half of `elapsed`.
+        longest = 0.5 * elapsed * (1 + ROUNDING)
+        if not self.halvings or longest >= h or not elapsed >= 0.0:
             return 0
         return sum(longest < h / 2**k for k in range(MOST_GRADES))
 
@@ -218,13 +218,13 @@ def advance(
     h = control.parts * (t1 - t0) / count
     grades = control.grade(t0, h)
     # A substep has 2^k ticks, where k is the maximum number of halvings.
-    whole = 1 << (control.halvings + grades)
-    finest = count * whole
+    ticks = 1 << (control.halvings + grades)
+    finest = count * ticks
     width = (t1 - t0) / finest
     # Time is counted in ticks of the finest halving, so that all times are integer multiples of
     # `width`.
     tick, steps = 0, 0
-    stride = longest = whole >> grades
+    stride = longest = ticks >> grades
     while tick < finest:
         t = t0 + tick * width
         stop = t1 if tick + stride == finest else t0 + (tick + stride) * width
@@ -245,7 +245,7 @@ def advance(
         steps += 1
         tick += stride
         # Longest substep that may start here; it is shorter near the initial time.
-        longest = whole >> control.grade(t0 + tick * width, h) if grades else whole
+        longest = ticks >> control.grade(t0 + tick * width, h) if grades else ticks
         # A stride is doubled only at a multiple of its double, so that substeps remain on the grid
         # of halvings.
         if 2 * stride <= longest and tick % (2 * stride) == 0:

@@ -55,18 +55,18 @@ class Steps:
 
         `parts`: number of parts of each substep, (spans,). `inputs0`, `inputs1`: from the samples.
         """
-        begun, counts = list[tuple[float, float]](), list[int]()
+        substeps, counts = list[tuple[float, float]](), list[int]()
 
         def begin(t: float, h: float) -> None:
-            begun.append((t, h))
+            substeps.append((t, h))
 
         for (start, stop), division in zip(ends.tolist(), parts.tolist(), strict=True):
-            before = len(begun)
+            count = len(substeps)
             if stop > start:
-                own = control.divided(max(division, 1))
-                advance(own, lambda y, t, h: y, NOTHING, start, stop, begin)
-            counts.append(len(begun) - before)
-        starts, lengths = np.reshape(begun, (-1, 2)).T
+                divided = control.divided(max(division, 1))
+                advance(divided, lambda y, t, h: y, NOTHING, start, stop, begin)
+            counts.append(len(substeps) - count)
+        starts, lengths = np.reshape(substeps, (-1, 2)).T
         inputs0, inputs1 = control.held.acting(channels, inputs0, inputs1, inputs1)
         return cls(
             starts=starts,
@@ -90,8 +90,8 @@ class Steps:
         begin, end = self.ends[of].T
         share = ((self.starts[some] + t - begin) / (end - begin))[:, None]
         first, last = self.inputs0[of], self.inputs1[of]
-        mixed = np.where(first == last, last, (1.0 - share) * first + share * last)
-        return Moments(t, self.channels, mixed.repeat(members, axis=0))
+        inputs = np.where(first == last, last, (1.0 - share) * first + share * last)
+        return Moments(t, self.channels, inputs.repeat(members, axis=0))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -121,18 +121,18 @@ class Sweep:
         lengths = np.unique(steps.lengths).tolist()
         if n > WIDEST or len(lengths) * members * n * n > MOST_ENTRIES:
             return None
-        still, matrices = np.zeros((members, n, m)), dict[float, Array]()
-        bare = cls(
-            stage=stage, scheme=scheme, steps=steps, q=q, directions=still, matrices=matrices
+        zero, matrices = np.zeros((members, n, m)), dict[float, Array]()
+        homogeneous = cls(
+            stage=stage, scheme=scheme, steps=steps, q=q, directions=zero, matrices=matrices
         )
         units = np.zeros((1 + n, 1, members, n))
         units[1:, 0] = np.eye(n)[:, None]
         for h in lengths:
-            some = np.flatnonzero(steps.lengths == h)[:1]
-            matrices[h] = bare._each(units, some, {})[1:, 0].transpose(1, 0, 2).copy()
+            first = np.flatnonzero(steps.lengths == h)[:1]
+            matrices[h] = homogeneous._advanced(units, first, {})[1:, 0].transpose(1, 0, 2).copy()
             if not np.isfinite(matrices[h]).all():
                 return None
-        return replace(bare, directions=directions)
+        return replace(homogeneous, directions=directions)
 
     @nonfinite_allowed()
     def blocks(self, columns: Array) -> Iterator[tuple[slice, Array]]:
@@ -144,39 +144,39 @@ class Sweep:
         for first in range(0, max(len(steps.of), 1), BLOCK):
             safe_point()
             some, factors = np.arange(first, min(first + BLOCK, len(steps.of))), dict[float, Any]()
-            still = np.zeros((1, len(some), *columns.shape[1:]))
-            states = self._recurred(columns[:1], some, self._each(still, some, factors))
-            found = states
+            zero = np.zeros((1, len(some), *columns.shape[1:]))
+            states = self._recursion(columns[:1], some, self._advanced(zero, some, factors))
+            at_steps = states
             if r:
-                still = np.broadcast_to(still, (r, *still.shape[1:]))
-                driven = self._each(np.concatenate([states[:, :-1], still]), some, factors)[1:]
-                found = np.concatenate([states, self._recurred(columns[1:], some, driven)])
-            columns = found[:, -1]
+                zero = np.broadcast_to(zero, (r, *zero.shape[1:]))
+                driven = self._advanced(np.concatenate([states[:, :-1], zero]), some, factors)[1:]
+                at_steps = np.concatenate([states, self._recursion(columns[1:], some, driven)])
+            columns = at_steps[:, -1]
             low, high = np.searchsorted(steps.after, [first, first + len(some)], side="right")
             part = slice(int(low) if first else 0, int(high))
             if part.start < part.stop:
-                yield part, found[:, steps.after[part] - first].swapaxes(0, 1)
+                yield part, at_steps[:, steps.after[part] - first].swapaxes(0, 1)
 
-    def _recurred(self, columns: Array, some: IntArray, driven: Array) -> Array:
+    def _recursion(self, columns: Array, some: IntArray, driven: Array) -> Array:
         """Return columns before the steps `some` and after the last, (c, steps + 1, members, n)."""
         c, count, members, n = driven.shape
-        found = np.empty((count + 1, members, c, n))
-        found[0], driven = columns.swapaxes(0, 1), driven.transpose(1, 2, 0, 3)
+        states = np.empty((count + 1, members, c, n))
+        states[0], driven = columns.swapaxes(0, 1), driven.transpose(1, 2, 0, 3)
         for k, h in enumerate(self.steps.lengths[some].tolist()):
-            np.matmul(found[k], self.matrices[h], out=found[k + 1])
-            found[k + 1] += driven[k]
-        return found.transpose(2, 0, 1, 3)
+            np.matmul(states[k], self.matrices[h], out=states[k + 1])
+            states[k + 1] += driven[k]
+        return states.transpose(2, 0, 1, 3)
 
-    def _each(self, columns: Array, some: IntArray, factors: dict[float, Any]) -> Array:
+    def _advanced(self, columns: Array, some: IntArray, factors: dict[float, Any]) -> Array:
         """Return columns, (1 + r, steps, members, n), each advanced by one of the steps `some`."""
-        found, lengths = np.empty(columns.shape), self.steps.lengths[some]
+        advanced, lengths = np.empty(columns.shape), self.steps.lengths[some]
         for h in np.unique(lengths).tolist():
-            own = np.flatnonzero(lengths == h)
-            found[:, own] = self._of_one_length(columns[:, own], some[own], h, factors)
-        return found
+            equal = np.flatnonzero(lengths == h)
+            advanced[:, equal] = self._advance_equal(columns[:, equal], some[equal], h, factors)
+        return advanced
 
-    def _of_one_length(
-        self, columns: Array, some: IntArray, h: float, factors: dict[float, Any]
+    def _advance_equal(
+        self, columns: Array, chosen: IntArray, h: float, factors: dict[float, Any]
     ) -> Array:
         """Return columns advanced by steps of equal length, which are members of one stage."""
         c, steps, members, n = columns.shape
@@ -185,9 +185,9 @@ class Sweep:
         zero, kept = np.zeros(len(q), dtype=np.int64), self.stage.kept(len(q))
 
         def stage(columns: Array, t: float, length: float) -> Array:
-            at = self.steps.moments(some, t, members)
+            at = self.steps.moments(chosen, t, members)
             work = StageOfMembers(zero, q, directions, length, at, kept, zero > 0, factors)
             return self.stage.advance(columns, work)[0]
 
-        flat = columns.reshape(c, steps * members, n)
-        return self.scheme.advance(stage, flat, 0.0, h).reshape(columns.shape)
+        joined = columns.reshape(c, steps * members, n)
+        return self.scheme.advance(stage, joined, 0.0, h).reshape(columns.shape)
