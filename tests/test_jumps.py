@@ -122,8 +122,18 @@ def test_the_onset_of_a_jump_is_where_the_innovations_became_too_large():
                 e[rng.random((1, 2)) < 0.1] = np.nan
                 if k < 59:
                     watch = replace(watch.add(e, np.zeros(1, bool)), usual=watch.usual)
-            hits += abs(jumps.onset(watch, e) - length) <= 2
+            hits += abs(jumps.onsets(watch, e)[0] - length) <= 2
     assert hits >= 72  # of 80
+
+
+def test_large_readings_by_chance_do_not_date_a_later_jump():
+    """The samples since decide between onsets that the innovations make almost as likely."""
+    stream = samples(lambda t: 0.3 if t < 10.0 else 0.45, 206, 1)
+    for k, size in ((184, 4.0), (186, 2.5), (187, 3.0)):
+        stream[k][1][1] += size * NOISE
+    found = run(filter_alone(jumps=Jumps(settle=20, probability=1e-7)), stream)
+    alarms = [k for k, one in enumerate(found) if one.diagnostics.jump > 0.0]
+    assert alarms[0] - found[alarms[0]].diagnostics.jump_samples + 1 == 200
 
 
 @pytest.mark.parametrize("options", [{"probability": 0.0}, {"window": 3}, {"size": 0.0}])
@@ -213,4 +223,4 @@ def test_a_large_jump_begins_with_its_first_sample():
     watch = jumps.start(3)
     for size in np.repeat([1.0, 1.3], [100, 60]):
         watch, _ = jumps.add(watch, size * rng.standard_normal((1, 3)))
-    assert jumps.onset(watch, np.array([[140.0, np.nan, -3.0]])) == 1
+    assert jumps.onsets(watch, np.array([[140.0, np.nan, -3.0]]))[0] == 1

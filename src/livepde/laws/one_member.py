@@ -209,14 +209,22 @@ def _reassimilated(
 
 
 def _most_likely_onset(
-    work: SensitivityWork, jumps: Jumps, x: FilterState, known: Sequence[Interval], guess: int
+    work: SensitivityWork,
+    jumps: Jumps,
+    x: FilterState,
+    known: Sequence[Interval],
+    guesses: Sequence[int],
 ) -> int:
-    """Return the number of samples before a jump that maximises the likelihood, near a guess.
+    """Return the number of samples before a jump that maximises the likelihood, near guesses.
+
+    The first guess is the most likely one: numbers near it are tried, too.
 
     A state propagated without the jump, or with the jump too early, misfits for a long time. The
     constants that do not jump would have to explain this misfit.
     """
-    tried = sorted({guess + shift for shift in NEAR_ONSETS} & set(range(len(known))))
+    guess = guesses[0]
+    near = {*guesses, *(guess + shift for shift in NEAR_ONSETS)}
+    tried = sorted(near & set(range(len(known))))
     # Refusals before the first trial onset stay; after it, each trial must explain all readings.
     open_gate = UpdateOptions(adaptive=work.options.adaptive)
     searching = replace(work.unaccompanied, options=open_gate)
@@ -289,9 +297,10 @@ def _with_jump_test(
     # `onset` ignores readings that the gate refused in a row, but the jump may explain them.
     doubted = int(np.where(screened.aside, 0, screened.refused).max())
     moving = np.where(state.watch.repeating(screened.run), np.nan, e)
-    onset = max(jumps.onset(state.watch, moving), doubted)
-    guess = len(known) - reaching([bool(item.present.any()) for item in known], onset)
-    before = _most_likely_onset(work, jumps, state.older, known, guess)
+    shown = [bool(item.present.any()) for item in known]
+    onsets = [max(onset, doubted) for onset in jumps.onsets(state.watch, moving)]
+    guesses = [len(known) - reaching(shown, onset) for onset in onsets]
+    before = _most_likely_onset(work, jumps, state.older, known, guesses)
     x = changed(work.filter.relinearised(state.older), kept=new.now.kept)
     x, status = _filtered_all(work, x, known[:before])
     start = work.filter.inflated(x, jumps.size, work.jumping)

@@ -15,6 +15,7 @@ from livepde.linalg import Array, IntArray, Mask
 from livepde.linalg.member_arrays import where
 
 LARGEST = 3.0  # Huber's bound: it clips 0.3 % of Gaussian innovations, and 1 % of their variance
+NEARLY = 3.0  # difference of log-likelihoods within which onsets are compared
 CHANCE = 1e-2  # a sensor seems stuck if its repetitions in a row are less probable than this
 
 
@@ -322,15 +323,19 @@ class Jumps:
             new = new.interrupted(alarm, self.settle)
         return new, alarm
 
-    def onset(self, watch: Watch, e: Array) -> int:
-        """Return the most likely number of samples since a jump, including this sample.
+    def onsets(self, watch: Watch, e: Array) -> list[int]:
+        """Return likely numbers of samples since a jump, including this sample.
 
-        It is the number n that maximises the log-likelihood ratio n (r - 1 - log r)/2 of
-        innovations with mean square r > 1 against 1. Parameters as for `add`, for one member.
+        First the number n that maximises the log-likelihood ratio n (r - 1 - log r)/2 of
+        innovations with mean square r > 1 against 1, then all others with nearly this ratio.
+        Parameters as for `add`, for one member.
         """
         new = watch.add(e, watch.seen < self.settle)
         freedom = np.cumsum(new.counts[0])
         # Ratios are comparable only with one reference size for all n, from before all samples.
         size = new.scatters[0, -1] ** 2 * np.maximum(freedom, 1.0)
         ratio = np.maximum(np.cumsum(new.squares[0]) / size, 1.0)
-        return 1 + int(np.argmax(freedom * (ratio - 1.0 - np.log(ratio))))
+        likely = 0.5 * freedom * (ratio - 1.0 - np.log(ratio))
+        order = np.argsort(-likely, kind="stable")
+        found: list[int] = (1 + order[likely[order] >= likely[order[0]] - NEARLY]).tolist()
+        return found
