@@ -72,7 +72,7 @@ STUCK_READINGS = 10  # equal readings in a row of a stuck sensor
 MOVES = 1.0  # shift, in standard deviations, from which an estimate is not usable
 EXPLAINED = 0.5  # share of the misfit from which its first cause accounts for it
 FACTOR = 2.0  # largest plausible error of the scale of a sensor or an input
-LONGEST_LAG = 0.25  # largest plausible delay of a sensor, as a share of the run
+LONGEST = 0.25  # largest plausible delay of a sensor, as a share of the run
 SEEN = 4.0  # standard errors from which an amplitude is detectable
 OUTSIDE = 2.0  # shift, in standard deviations, that exceeds the interval
 MOST_UNDETECTABLE = 3  # most sentences on undetectable errors
@@ -140,7 +140,7 @@ def _undetectable(dictionary: Dictionary, at: Position) -> list[str]:
                 shifts.append((shift, d, name))
     undetected = []
     for shift, d, name in sorted(shifts, reverse=True)[:MOST_UNDETECTABLE]:
-        text, remedy = _description(dictionary.directions[d], float(amplitude[d]), at)
+        text, remedy = _words(dictionary.directions[d], float(amplitude[d]), at)
         undetected.append(
             f"Undetectable: {text}, which would shift {name} by {shift:.1f} standard deviations. "
             f"{remedy}"
@@ -261,7 +261,7 @@ def _possible(
     if direction.kind in ("gain", "channel"):
         return 1.0 / FACTOR <= 1.0 + amount <= FACTOR
     if direction.kind == "lag":
-        return abs(size) * LAG <= LONGEST_LAG * float(at.ledger.seen)
+        return abs(size) * LAG <= LONGEST * float(at.ledger.seen)
     return direction.least <= amount <= direction.most
 
 
@@ -269,7 +269,7 @@ def _cause(
     direction: ScoreDirection, window: int, evidence: CauseEvidence, at: Position, number: int
 ) -> Cause:
     size, share = evidence.size[window, number], evidence.share[window, number]
-    text, remedy = _description(direction, float(size), at)
+    text, remedy = _words(direction, float(size), at)
     if window and direction.kind not in ("jump", "initial"):
         text += f" in the last {int(at.ledger.age[window])} samples"
     share = float(min(max(share, 0.0), 1.0))
@@ -335,7 +335,7 @@ def _jump(label: str) -> str:
     return f"law.jumps={json.dumps([label.partition('[')[0]])}"
 
 
-def _description(direction: ScoreDirection, size: float, at: Position) -> Sentence:
+def _words(direction: ScoreDirection, size: float, at: Position) -> Sentence:
     """Return a sentence on a cause of a size, with its remedy."""
     name, kind, amount = direction.subject, direction.kind, _amount(direction, size, at)
     unit, positive, values = direction.unit, size > 0.0, dict[str, str]()
