@@ -213,10 +213,10 @@ def grouted_borehole(
 
     def ground(q: Any, u: Any, v: Any, x: Place) -> Any:
         # Weak form in the coordinate x, see the docstring.
-        more, radial = q.rho_c / rho_0, _outwards(u, v)
-        square = r_b**2 + (x[0] ** 2 - r_b**2) / more
-        along = dot(grad(u), grad(v)) - radial
-        return q.k * (more * square / x[0] ** 2 * radial + along / more)
+        ratio, radial = q.rho_c / rho_0, _outwards(u, v)
+        square = r_b**2 + (x[0] ** 2 - r_b**2) / ratio
+        tangential = dot(grad(u), grad(v)) - radial
+        return q.k * (ratio * square / x[0] ** 2 * radial + tangential / ratio)
 
     return Model(
         state,
@@ -259,13 +259,13 @@ def _layered(mesh: Any, r_p: float, r_b: float) -> Any:
             "r_p, and use more cells or geometric spacing."
         )
     points[0] = np.where(radii == inner, r_p, np.where(radii == wall, r_b, radii))
-    moved = replace(mesh, doflocs=points)
-    ends = moved.p[:, moved.facets]
+    fitted = replace(mesh, doflocs=points)
+    ends = fitted.p[:, fitted.facets]
     boundaries = {"wall": np.flatnonzero(np.isclose(ends[0], r_b).all(axis=0))}
     if len(points) > 1:
         bottom = np.isclose(ends[1], points[1].min()).all(axis=0)
         boundaries["end"] = np.flatnonzero(bottom & (ends[0].mean(axis=0) > r_b))
-    return moved.with_boundaries(boundaries).with_subdomains(
+    return fitted.with_boundaries(boundaries).with_subdomains(
         {
             "pipes": lambda x: x[0] < r_p,
             "grout": lambda x: (x[0] > r_p) & (x[0] < r_b),

@@ -113,17 +113,17 @@ def with_conditions(
     >>> tuple(slab.parameter_space.labels)
     ('k', 'J')
     """
-    more = dict(unknowns or {})
-    terms = _Terms(model, tuple(more), per)
-    for name, given in (boundary or {}).items():
-        terms.through(name, given)
+    added = dict(unknowns or {})
+    terms = _Terms(model, tuple(added), per)
+    for name, conditions in (boundary or {}).items():
+        terms.through(name, conditions)
     for name, source in (sources or {}).items():
         terms.gained(source.value, *_region(model, name, source.over))
-    for name in more:
+    for name in added:
         if name not in terms.named:
             raise ModelError(f"with_conditions: no condition names the unknown '{name}'.")
-    whole = model.with_unknowns(more) if more else model
-    return whole.with_terms(terms.A, terms.B, terms.inputs)
+    extended = model.with_unknowns(added) if added else model
+    return extended.with_terms(terms.A, terms.B, terms.inputs)
 
 
 def _everywhere(x: Place) -> float:
@@ -193,7 +193,7 @@ class _Terms:
 
         # B and f must not depend on q, so a term with an unknown amount is part of A.
         form: Callable[..., Any]
-        if self.per is not None or any(isinstance(one, str | Multiple) for one in amounts):
+        if self.per is not None or any(isinstance(amount, str | Multiple) for amount in amounts):
             form, terms = plain, self.A
         else:
             form, terms = driving if ignores(plain, 1) else known, self.B
@@ -214,13 +214,13 @@ class _Terms:
             self.inputs.append(value.name)
             return lambda q, x: x.inputs[value.name]
         if isinstance(value, Multiple):
-            one = self._amount(value.unknown)
-            return lambda q, x: value.factor * one(q, x)
+            amount = self._amount(value.unknown)
+            return lambda q, x: value.factor * amount(q, x)
         if not isinstance(value, str):
-            given: Any = value
-            if not isinstance(given, Real) or not math.isfinite(given):
+            number: Any = value
+            if not isinstance(number, Real) or not math.isfinite(number):
                 raise ModelError(
-                    f"with_conditions: got {given!r:.60}; expected a finite number, a Channel, or "
+                    f"with_conditions: got {number!r:.60}; expected a finite number, a Channel, or "
                     "the name of an unknown."
                 )
             return lambda q, x: value

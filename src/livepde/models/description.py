@@ -165,17 +165,17 @@ class Equation:
 
     def about(self, unknowns: Collection[str] = ()) -> dict[str, Any]:
         """Return units and formula of a model, without the terms of optional unknowns it lacks."""
-        left = [
+        omitted = [
             name for name, one in self.unknowns.items() if one.optional and name not in unknowns
         ]
-        main, comma, rest = self.formula.partition(",  ")
+        main, comma, conditions = self.formula.partition(",  ")
         # Omit only terms outside brackets, because a sum in brackets has other terms.
-        first, *more = re.split(r" ([+-]) (?![^(]*\))", main)
-        parts = zip(more[::2], more[1::2], strict=True)
-        kept = [
-            (sign, term) for sign, term in parts if not set(left) & set(re.findall(r"\w+", term))
+        first, *signed_terms = re.split(r" ([+-]) (?![^(]*\))", main)
+        parts = zip(signed_terms[::2], signed_terms[1::2], strict=True)
+        terms = [
+            (sign, term) for sign, term in parts if not set(omitted) & set(re.findall(r"\w+", term))
         ]
-        formula = "".join([first, *(f" {sign} {term}" for sign, term in kept), comma, rest])
+        formula = "".join([first, *(f" {sign} {term}" for sign, term in terms), comma, conditions])
         units = {"time_unit": self.time_unit, "length_unit": self.length_unit}
         return {**units, "formula": formula}
 
@@ -221,13 +221,13 @@ class by_name:
         dirichlet: Mapping[str, Any],
         **options: Any,
     ) -> Model:
-        given = {**options, **unknowns}
+        arguments = {**options, **unknowns}
         if not self.closed:
-            return self.function(mesh, dirichlet=dirichlet or None, **given)
+            return self.function(mesh, dirichlet=dirichlet or None, **arguments)
         if dirichlet:
             name, places = self.function.__name__, sorted(dirichlet)
             raise ModelError(f"{name} {self.closed}: leave out the values on {places}.")
-        return self.function(mesh, **given)
+        return self.function(mesh, **arguments)
 
 
 Number: TypeAlias = Unknown | float
@@ -257,16 +257,16 @@ def everywhere(equation: str, mesh: Any, **unknowns: Any) -> None:
             continue
         count = np.zeros(mesh.nelements)
         for label, region in unknown.regions.items():
-            here = np.zeros(mesh.nelements, dtype=bool)
+            inside = np.zeros(mesh.nelements, dtype=bool)
             if callable(region):
-                here[:] = region(middle)
+                inside[:] = region(middle)
             else:  # an unknown name is an error when forms are evaluated
-                here[(mesh.subdomains or {}).get(region, [])] = True
-            if callable(region) and not here.any():
+                inside[(mesh.subdomains or {}).get(region, [])] = True
+            if callable(region) and not inside.any():
                 raise ModelError(
                     f"{equation}: no cell of the mesh lies in the region '{label}' of '{name}'."
                 )
-            count += here
+            count += inside
         wrong = np.flatnonzero(count != 1)
         if len(wrong):
             at = ", ".join(f"{x:.4g}" for x in middle[:, wrong[0]])
@@ -296,14 +296,14 @@ def autonomous(
     about: Mapping[str, Any],
 ) -> Model:
     """Return u_t + A(u) = 0, with A from a form (c, u, v) with known or unknown coefficients c."""
-    known = {k: float(v) for k, v in coefficients.items() if isinstance(v, int | float)}
-    unknown: dict[str, Any] = {k: v for k, v in coefficients.items() if k not in known}
-    begun, initial = _beginning(u0, u)
+    fixed = {k: float(v) for k, v in coefficients.items() if isinstance(v, int | float)}
+    unknown: dict[str, Any] = {k: v for k, v in coefficients.items() if k not in fixed}
+    initial_unknown, initial = _beginning(u0, u)
 
     def A(q: Any, u: Any, v: Any, x: Any) -> Any:
-        return form(SimpleNamespace(**known, **{k: getattr(q, k) for k in unknown}), u, v)
+        return form(SimpleNamespace(**fixed, **{k: getattr(q, k) for k in unknown}), u, v)
 
-    return Model(u, {**unknown, **begun}, A=A, initial=initial, **about)
+    return Model(u, {**unknown, **initial_unknown}, A=A, initial=initial, **about)
 
 
 def _beginning(u0: Unknown | None, u: Field) -> tuple[dict[str, Unknown], Integrand | None]:
@@ -314,6 +314,6 @@ def _beginning(u0: Unknown | None, u: Field) -> tuple[dict[str, Unknown], Integr
     if u0 is None:
         return {}, None
     if isinstance(u0, Field):
-        held = {name: 0.0 for name, value in u.dirichlet.items() if value == 0.0}
-        u0 = replace(u0, dirichlet=held, periodic=u.periodic)
+        zero_values = {name: 0.0 for name, value in u.dirichlet.items() if value == 0.0}
+        u0 = replace(u0, dirichlet=zero_values, periodic=u.periodic)
     return {"u0": u0}, lambda q, v, x: q.u0 * v

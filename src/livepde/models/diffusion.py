@@ -133,17 +133,17 @@ def conduction(
     """
     unknowns = {"k": k, "loss": loss, "transfer": transfer, "source": source}
     one_number("conduction", C=C)
-    given: Any = C
+    constant: Any = C
     if isinstance(C, fem.Scalar | fem.Prior):
-        unknowns["C"], given = C, 1.0
-    elif not callable(C) and not (isinstance(given, Real) and float(given) > 0.0):
+        unknowns["C"], constant = C, 1.0
+    elif not callable(C) and not (isinstance(constant, Real) and float(constant) > 0.0):
         raise ModelError(f"conduction: the heat capacity C must be positive; got {C!r:.60}.")
-    capacity = given if callable(given) else lambda x: given
-    least = float(np.min(capacity(Measure(mesh, 1).place(START))))
-    if not least > 0.0:
+    capacity = constant if callable(constant) else lambda x: constant
+    smallest = float(np.min(capacity(Measure(mesh, 1).place(START))))
+    if not smallest > 0.0:
         raise ModelError(
             f"conduction: the heat capacity C must be positive everywhere; its least value is "
-            f"{least:g}."
+            f"{smallest:g}."
         )
     return _model(CONDUCTION, mesh, unknowns, dirichlet, capacity, element, unit)
 
@@ -160,19 +160,19 @@ def _model(
     everywhere(equation.name, mesh, **{equation.conductivity: unknowns[equation.conductivity]})
     field = fem.Field(mesh, element or fem.linear(mesh), dirichlet=dict(dirichlet or {}), unit=unit)
     # Omit terms whose unknown is not given, and their inputs.
-    given = {key: unknown for key, unknown in unknowns.items() if unknown is not None}
+    used = {key: unknown for key, unknown in unknowns.items() if unknown is not None}
     # The equation is divided by an unknown heat capacity. The form is linear in the ratios, which
     # are its coefficients.
-    divided = "C" in given
-    part = {key: attrgetter(key + "_per_C" * divided) for key in given}
+    divided = "C" in used
+    part = {key: attrgetter(key + "_per_C" * divided) for key in used}
     return Model(
         field,
-        given,
+        used,
         A=_terms(equation, part, field),
         M=lambda u, v, x: capacity(x) * u * v,
-        inputs={AMBIENT: unit} if {"loss", "transfer"} & set(given) else {},
+        inputs={AMBIENT: unit} if {"loss", "transfer"} & set(used) else {},
         coefficients=(lambda q: _ratios(q, part)) if divided else None,
-        **equation.about(given),
+        **equation.about(used),
     )
 
 
@@ -199,9 +199,9 @@ def _terms(
 
 def _free_sides(equation: Equation, field: fem.Field) -> list[str]:
     """Return the named boundaries without a Dirichlet value, where heat transfer acts."""
-    held = field.dirichlet
-    sides = [] if "boundary" in held else [*(field.mesh.boundaries or {})]
-    free = [side for side in sides if side not in held]
+    dirichlet = field.dirichlet
+    sides = [] if "boundary" in dirichlet else [*(field.mesh.boundaries or {})]
+    free = [side for side in sides if side not in dirichlet]
     if not free:
         raise ModelError(
             f"{equation.name}: transfer acts at named boundaries without a value, and there is "

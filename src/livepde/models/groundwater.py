@@ -76,8 +76,8 @@ def pumping_test(
         terms.append(lambda q, u, v, x: q.leaked * u * v)
 
     def coefficients(q: Any) -> dict[str, Any]:
-        found = {"diffusivity": q.k / q.Ss, "per_storage": 1 / q.Ss}
-        return found if leakance is None else {**found, "leaked": q.leakance / (b * q.Ss)}
+        values = {"diffusivity": q.k / q.Ss, "per_storage": 1 / q.Ss}
+        return values if leakance is None else {**values, "leaked": q.leakance / (b * q.Ss)}
 
     return Model(
         state,
@@ -158,10 +158,10 @@ def groundwater(
             rate = rate + x.inputs[name] * well(x, at, radius)
         return rate / q.S * v
 
-    held = dict(dirichlet or {})
+    boundary_values = dict(dirichlet or {})
     return Model(
         # The source of a well is a polynomial of degree four.
-        Field(mesh, element or linear(mesh), dirichlet=held, unit="m", quadrature=4),
+        Field(mesh, element or linear(mesh), dirichlet=boundary_values, unit="m", quadrature=4),
         {"T": T, "S": S},
         A=[flow, taken],
         inputs=dict.fromkeys(sources, "m^3/s"),
@@ -302,18 +302,18 @@ def advection_dispersion(
     def flux(q: Any, c: Any, w: Any, x: Any) -> Any:
         return (q.D * grad(c)[0] - q.v * c) * grad(w)[0]
 
-    known, unknowns = True, {"D": D, "v": v}
+    fixed_decay, unknowns = True, {"D": D, "v": v}
     if not isinstance(decay, int | float):
-        known, unknowns = False, {**unknowns, "decay": decay}
+        fixed_decay, unknowns = False, {**unknowns, "decay": decay}
     return Model(
         state,
         unknowns,
         A=[
             flux,
             *_ends(lambda q: q.v, lambda u: u, inlet),
-            *([] if known else [lambda q, c, w, x: q.decay * c * w]),
+            *([] if fixed_decay else [lambda q, c, w, x: q.decay * c * w]),
         ],
-        B=[lambda c, w, x: decay * c * w] if known else [],
+        B=[lambda c, w, x: decay * c * w] if fixed_decay else [],
         M=lambda c, w, x: R * c * w,
         inputs={"c_in": unit},
         **ADVECTION_DISPERSION.about(),

@@ -109,7 +109,7 @@ def advection_diffusion(
         raise ModelError(f"advection_diffusion: {text}")
     for name, value in {"L": L, "ratio": ratio}.items():
         require_positive(f"advection_diffusion: {name}", value, ModelError)
-    every = {
+    all_unknowns = {
         "kappa": kappa,
         "v": v,
         "K": K,
@@ -117,7 +117,7 @@ def advection_diffusion(
         "loss": loss,
         "source": source,
     }
-    unknowns = {name: unknown for name, unknown in every.items() if unknown is not None}
+    unknowns = {name: unknown for name, unknown in all_unknowns.items() if unknown is not None}
     everywhere("advection_diffusion", mesh, kappa=kappa)
 
     def velocity(q: Any, x: Any) -> Any:
@@ -134,10 +134,10 @@ def advection_diffusion(
         if dispersivity is not None:
             # `absolute` instead of abs, because complex steps differentiate the term by w.
             spread = spread + q.dispersivity * absolute(w)
-        moved = spread * dot(grad(u), grad(test)) + w * grad(u)[0] * test
+        density = spread * dot(grad(u), grad(test)) + w * grad(u)[0] * test
         if stabilise:  # along the flow only
-            moved = moved + upwind(w, spread, x.h) * grad(u)[0] * grad(test)[0]
-        return moved if source is None else moved - q.source * test
+            density = density + upwind(w, spread, x.h) * grad(u)[0] * grad(test)[0]
+        return density if source is None else density - q.source * test
 
     units = {"flow": "m/s", "dH": "m", AMBIENT: unit}
     reads = {"flow": flow, "dH": K is not None, AMBIENT: loss is not None}
@@ -232,15 +232,15 @@ def wave(
     >>> list(model.state_space.blocks)
     ['w', 'p']
     """
-    held, moved = dict(dirichlet or {}), dict(velocity or {})
-    for name, value in held.items():
-        if name not in moved:
+    values_w, values_p = dict(dirichlet or {}), dict(velocity or {})
+    for name, value in values_w.items():
+        if name not in values_p:
             if not isinstance(value, int | float):
                 raise ModelError(
                     f"wave: w on '{name}' may move; give its time derivative, too: "
                     f"velocity={{'{name}': ...}}."
                 )
-            moved[name] = 0.0
+            values_p[name] = 0.0
     element = element or linear(mesh)
     everywhere("wave", mesh, c2=c2)
     unknown = {} if isinstance(d, int | float) else {"d": d}
@@ -253,8 +253,8 @@ def wave(
     # First-order form, because implicit one-step schemes and laws require a single time derivative.
     return Model(
         {
-            "w": Field(mesh, element, dirichlet=held, unit="m"),
-            "p": Field(mesh, element, dirichlet=moved, unit="m/s"),
+            "w": Field(mesh, element, dirichlet=values_w, unit="m"),
+            "p": Field(mesh, element, dirichlet=values_p, unit="m/s"),
         },
         {"c2": c2, **unknown},
         A=A,
