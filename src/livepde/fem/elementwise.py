@@ -39,10 +39,10 @@ def scatter(pairs: Pairs, shape: tuple[int, int]) -> Scatter:
     (j, elements).
     """
     key = _digest(np.array(shape), *(dofs for pair in pairs for dofs in pair))
-    found = _known.get(key)
-    if found is None:
-        _known[key] = found = Scatter(pairs, shape)
-    return found
+    known = _known.get(key)
+    if known is None:
+        _known[key] = known = Scatter(pairs, shape)
+    return known
 
 
 def _digest(*arrays: Any) -> bytes:
@@ -83,11 +83,11 @@ class Scatter:
         """Return the positions of a term's entries in the data, shape (i, j, elements)."""
         if term not in self._places:
             rows, cols = self.pairs[term]
-            found = np.empty((len(rows), *cols.shape), dtype=np.int32)
+            places = np.empty((len(rows), *cols.shape), dtype=np.int32)
             for i, row in enumerate(rows):
                 for j, col in enumerate(cols):
-                    found[i, j] = self.pattern.positions(row, col)
-            self._places[term] = found
+                    places[i, j] = self.pattern.positions(row, col)
+            self._places[term] = places
         return self._places[term]
 
     def _at(self, term: int, at: slice, keep: bool) -> IntArray:
@@ -135,26 +135,26 @@ class TensorTerm:
             basis = basis if basis.size else np.zeros((len(flat), 0))
             # Only tensors outside the current span extend the basis. Their leading singular vectors
             # keep it as small as possible.
-            left = flat - basis @ (basis.T @ flat)
+            remainder = flat - basis @ (basis.T @ flat)
             size = np.linalg.norm(flat, axis=0)
-            missed = np.linalg.norm(left, axis=0) > EXACT * size
-            if missed.any():
+            outside = np.linalg.norm(remainder, axis=0) > EXACT * size
+            if outside.any():
                 vectors, values, _ = np.linalg.svd(
-                    left[:, missed] / size[missed], full_matrices=False
+                    remainder[:, outside] / size[outside], full_matrices=False
                 )
-                known = basis.shape[1]
-                more = np.hstack([basis, vectors[:, values > EXACT * values.max()]])
+                rank = basis.shape[1]
+                extended = np.hstack([basis, vectors[:, values > EXACT * values.max()]])
                 # QR preserves the span of the known vectors but may flip their signs. They are
                 # restored, because shares of earlier parts depend on them.
-                basis = np.linalg.qr(more)[0]
-                basis[:, :known] *= np.sign((basis[:, :known] * more[:, :known]).sum(axis=0))
+                basis = np.linalg.qr(extended)[0]
+                basis[:, :rank] *= np.sign((basis[:, :rank] * extended[:, :rank]).sum(axis=0))
             shares.append(basis.T @ flat)
-        whole = np.zeros((basis.shape[1], sum(part.shape[1] for part in shares)))
+        coefficients = np.zeros((basis.shape[1], sum(part.shape[1] for part in shares)))
         stop = 0
         for part in shares:
             start, stop = stop, stop + part.shape[1]
-            whole[: len(part), start:stop] = part
-        return cls(basis.reshape(*shape, -1), whole, dofs)
+            coefficients[: len(part), start:stop] = part
+        return cls(basis.reshape(*shape, -1), coefficients, dofs)
 
 
 @dataclass(frozen=True, eq=False)

@@ -158,13 +158,13 @@ def _values(function: Callable[[Array], Any], x: Array) -> Array:
     try:
         if given.dtype.kind not in "biuf":
             raise ValueError
-        found: Array = given + 0.0 * x[0]
+        values_at: Array = given + 0.0 * x[0]
     except ValueError:
         raise SpaceError(
             f"a function of x returned an array of type {given.dtype} and shape {given.shape}; "
             f"expected one real number for each point, {x[0].shape}. x[0] is the first coordinate."
         ) from None
-    return found
+    return values_at
 
 
 class FieldBlock(Block):
@@ -195,12 +195,12 @@ class FieldBlock(Block):
     def places(self) -> Array:
         """Position of each of scikit-fem's degrees of freedom, shape (d, degrees of freedom)."""
         mesh, element = self.field.mesh, self.element
-        found = np.zeros((mesh.dim(), int(self.dofs.N)))
+        places = np.zeros((mesh.dim(), int(self.dofs.N)))
         for at, piece in Measure(mesh, 1).pieces():
             x = piece.mapped(element.doflocs.T)
             for i, dofs in enumerate(self.dofs.element_dofs[:, at]):
-                found[:, dofs] = x[:, :, i]
-        return found
+                places[:, dofs] = x[:, :, i]
+        return places
 
     @cached_property
     def doflocs(self) -> Array:
@@ -213,8 +213,8 @@ class FieldBlock(Block):
     def at(self, facets: Any = None, names: Sequence[str] | None = None) -> IntArray:
         """Return scikit-fem's degrees of freedom on facets, by default on the whole boundary."""
         facets = self.field.mesh.normalize_facets(facets)
-        found: IntArray = self.dofs.get_facet_dofs(facets).all(names)
-        return found
+        dofs: IntArray = self.dofs.get_facet_dofs(facets).all(names)
+        return dofs
 
     @cached_property
     def boundary(self) -> IntArray:
@@ -231,7 +231,7 @@ class FieldBlock(Block):
         return Basis(self.field.mesh, self.element, dofs=self.dofs)
 
     @cached_property
-    def _one(self) -> DiscreteField:
+    def _first_function(self) -> DiscreteField:
         """First shape function in the first cell, to inspect ranks and derivatives."""
         first = Measure(self.field.mesh, 1, members=np.zeros(1, dtype=np.int64), thin=True)
         return first.gbasis(self.element, 0)
@@ -239,7 +239,7 @@ class FieldBlock(Block):
     @property
     def vector(self) -> bool:
         """Whether the function has values in R^d."""
-        return np.ndim(self._one) > 2
+        return np.ndim(self._first_function) > 2
 
     def variables(self, name: str) -> list[str]:
         """Return the names of the components: the given name, or one for each axis of a vector."""
@@ -249,14 +249,14 @@ class FieldBlock(Block):
     @property
     def bends(self) -> bool:
         """Whether the element provides second derivatives."""
-        return self._one.hess is not None
+        return self._first_function.hess is not None
 
     def local(self, measure: Measure) -> Local:
         if measure.mesh is not self.field.mesh:
             raise SpaceError(
                 "State and parameter fields must share one mesh object; their elements may differ."
             )
-        jets = {name: _jet(self._one, name) for name in JETS}
+        jets = {name: _jet(self._first_function, name) for name in JETS}
         parts = [(name, np.shape(jet)[:-2]) for name, jet in jets.items() if jet is not None]
         dofs = self.dofs_on(measure)
         functions: list[DiscreteField] = []
@@ -332,10 +332,10 @@ class FieldBlock(Block):
             return self._mass_factor.solve(functional)
         mass = self._mass(self.measure)
         scale = mass.diagonal()
-        found, _ = conjugate_gradients(
+        coefficients, _ = conjugate_gradients(
             mass.__matmul__, lambda r: r / scale, functional, PROJECTED, ITERATIONS, FINER
         )
-        return found
+        return coefficients
 
     def fitted(self, cells: IntArray) -> tuple[Array, Callable[[Array], Array]]:
         """Return evaluation points for a function on given cells, and its fit.
@@ -350,11 +350,11 @@ class FieldBlock(Block):
             projection on the cells.
         """
         used = np.unique(self.element_dofs[:, cells])
-        found = np.zeros(self.size)
+        zeros = np.zeros(self.size)
         if self.nodal:
 
             def at_nodes(values: Array) -> Array:
-                coefficients = found.copy()
+                coefficients = zeros.copy()
                 coefficients[used] = values[0]
                 return coefficients
 
@@ -365,7 +365,7 @@ class FieldBlock(Block):
         def projected(values: Array) -> Array:
             grid = values.reshape(-1, *measure.shape)
             functional = self._tested(measure, lambda at, piece: grid[:, at])
-            coefficients = found.copy()
+            coefficients = zeros.copy()
             coefficients[used] = factor.solve(functional[used])
             return coefficients
 
@@ -413,9 +413,9 @@ class FieldBlock(Block):
         names = self.field.element.dofnames or []
         axes = [k for k in range(3) if f"u^{k + 1}" in names]
         if not (self.vector and axes):
-            what = "has no components" if self.vector else "is not a vector"
+            reason = "has no components" if self.vector else "is not a vector"
             raise SpaceError(
-                f"{where} has a value for each component, and the field {what}: give a number."
+                f"{where} has a value for each component, and the field {reason}: give a number."
             )
         return axes
 
@@ -445,9 +445,9 @@ class FieldBlock(Block):
         mesh = self.field.mesh
         sides = mesh.boundary_facets() if name == "boundary" else mesh.boundaries[name]
         ends = mesh.p[:, mesh.facets[:, sides]]
-        across = np.abs(ends[1 - axis, 1] - ends[1 - axis, 0])
-        along = np.abs(ends[axis, 1] - ends[axis, 0])
-        sides = np.asarray(sides)[across <= 1e-9 * along]
+        height = np.abs(ends[1 - axis, 1] - ends[1 - axis, 0])
+        length = np.abs(ends[axis, 1] - ends[axis, 0])
+        sides = np.asarray(sides)[height <= 1e-9 * length]
         names = [("u_x", "u_y")[axis]]
         return np.unique(self._tied(self.at(sides, names)))
 
@@ -458,15 +458,15 @@ class FieldBlock(Block):
         To interpolate g along the sides, Bogner-Fox-Schmit functions require the tangential
         derivative of g at the vertices in addition to its values.
         """
-        found: list[tuple[IntArray, Any]] = []
+        conditions: list[tuple[IntArray, Any]] = []
         for name, value in self.field.dirichlet.items():
-            found += self._valued(name, value)
+            conditions += self._valued(name, value)
             for axis in range(0 if self.field.clamped else self.field.mesh.dim()):
                 dofs = self._slope_dofs(name, axis)
                 if len(dofs):
                     slope = _slope(value, axis, self.width) if callable(value) else 0.0
-                    found.append((dofs, slope))
-        return tuple(found)
+                    conditions.append((dofs, slope))
+        return tuple(conditions)
 
     @cached_property
     def width(self) -> float:
@@ -507,10 +507,10 @@ class FieldBlock(Block):
                 continue
             # Exclude coefficients that another condition also fixes, where two boundaries meet.
             others = [item for j, (item, _) in enumerate(self.conditions) if j != k]
-            own = np.setdiff1d(dofs, np.concatenate([[], *others]))
-            own = own if len(own) else dofs
-            x = self.doflocs[:, own]
-            yield condition.name, value(x) + 0.0 * x[0] if exact else coefficients[own]
+            separate = np.setdiff1d(dofs, np.concatenate([[], *others]))
+            separate = separate if len(separate) else dofs
+            x = self.doflocs[:, separate]
+            yield condition.name, value(x) + 0.0 * x[0] if exact else coefficients[separate]
 
     def prolongation(self, finer: FieldBlock) -> sp.csr_array:
         """Return the matrix that maps coefficients to coefficients on a finer mesh.
@@ -571,10 +571,10 @@ class FieldBlock(Block):
 
     def _cells(self, points: Array) -> IntArray:
         """Return the cell of each point, shape (k,); raise ValueError for a point outside."""
-        mesh, whole = self._unnamed, Measure(self.field.mesh, 1)
-        if not whole.kept:  # scikit-fem would store its search tree on the mesh permanently
+        mesh, measure = self._unnamed, Measure(self.field.mesh, 1)
+        if not measure.kept:  # scikit-fem would store its search tree on the mesh permanently
             mesh = copy(mesh)
-        finder = mesh.element_finder(mapping=whole.mapping)
+        finder = mesh.element_finder(mapping=measure.mapping)
         width = max(1, SEARCHED // mesh.nelements)  # number of points that are searched at once
         starts = range(0, points.shape[1], width)
         parts = [finder(*points[:, k : k + width]) for k in starts]
@@ -588,10 +588,10 @@ class FieldBlock(Block):
             raise ObservationError(
                 f"{what}: coordinates of dimension {points.shape[0]}; the mesh has {len(low)}."
             )
-        cells, lost = self._located(points)
-        if lost is not None:
+        cells, outside = self._located(points)
+        if outside is not None:
             raise ObservationError(
-                f"{what} {lost} at {points[:, lost].tolist()} lies outside the mesh, which "
+                f"{what} {outside} at {points[:, outside].tolist()} lies outside the mesh, which "
                 f"spans {low.tolist()} to {high.tolist()}: check its coordinates and their unit."
             )
         points = np.clip(points.T, low, high).T
@@ -600,8 +600,8 @@ class FieldBlock(Block):
         count = len(self.element_dofs)
         phi = np.array([self.element.gbasis(mapping, X, i, tind=cells)[0] for i in range(count)])
         rows = phi[0].size
-        each = self.element_dofs[:, np.tile(cells, rows // max(len(cells), 1))]
-        entries = (phi.ravel(), (np.tile(np.arange(rows), count), each.ravel()))
+        dofs = self.element_dofs[:, np.tile(cells, rows // max(len(cells), 1))]
+        entries = (phi.ravel(), (np.tile(np.arange(rows), count), dofs.ravel()))
         return sp.csr_array(entries, shape=(rows, self.size))
 
     @cached_property

@@ -161,7 +161,7 @@ def interval(
 
 def _moved(nodes: Array, through: Sequence[float]) -> Array:
     """Return the nodes with the nearest inner node moved to each of the points."""
-    moved = nodes.copy()
+    fitted = nodes.copy()
     nearest = [1 + int(np.abs(nodes[1:-1] - x).argmin()) if len(nodes) > 2 else 0 for x in through]
     inside = all(nodes[0] < x < nodes[-1] for x in through)
     if not inside or len(set(nearest)) < len(nearest) or 0 in nearest:
@@ -169,8 +169,8 @@ def _moved(nodes: Array, through: Sequence[float]) -> Array:
             f"interval: through={list(through)} needs points between {nodes[0]:g} and "
             f"{nodes[-1]:g}, each near its own inner node: use more cells."
         )
-    moved[nearest] = through
-    return moved
+    fitted[nearest] = through
+    return fitted
 
 
 def line(nodes: Sequence[float]) -> MeshLine:
@@ -225,25 +225,25 @@ class _Declared:
         if not isinstance(self.prior, Normal):
             # Another law may report a value beyond the trust region; the interval must include it.
             value = np.asarray(value, dtype=float)
-            least, largest = self._ends
-            low = np.maximum(low, np.minimum(least, value))
+            lowest, largest = self._ends
+            low = np.maximum(low, np.minimum(lowest, value))
             high = np.minimum(high, np.maximum(largest, value))
         return low, high
 
     def _check(self) -> None:
-        what = type(self).__name__
+        kind = type(self).__name__
         if not isinstance(self.prior, Prior):
-            raise SpaceError(f"{what}: prior={self.prior!r:.60}; {_expected(self.prior)}.")
+            raise SpaceError(f"{kind}: prior={self.prior!r:.60}; {_expected(self.prior)}.")
         if not isinstance(self.evolution, Evolution):
             raise SpaceError(
-                f"{what}: evolution={self.evolution!r}; expected RandomWalk(rate), "
+                f"{kind}: evolution={self.evolution!r}; expected RandomWalk(rate), "
                 "MeanReverting(time) or Periodic(period), or nothing."
             )
         if not self.within > 0:
-            raise SpaceError(f"{what}: within must be a positive number; got {self.within}.")
+            raise SpaceError(f"{kind}: within must be a positive number; got {self.within}.")
         if self.evolution.copies > 1 and not self.prior.symmetric:
             raise SpaceError(
-                f"{what}: Periodic needs a prior without bounds and transform: a Normal."
+                f"{kind}: Periodic needs a prior without bounds and transform: a Normal."
             )
 
 
@@ -348,18 +348,18 @@ class Field(_Declared):
                 f"inner='{self.inner}': expected 'L2', 'H1', 'H2', a Sobolev(s) or a symmetric "
                 "form (u, v, x)."
             )
-        known = set(self.mesh.boundaries or {}) | {"boundary"}
-        self._check_dirichlet(known)
+        boundaries = set(self.mesh.boundaries or {}) | {"boundary"}
+        self._check_dirichlet(boundaries)
         # Arrays are stored as tuples, because comparison of arrays is elementwise.
-        given: Mapping[str, Any] = self.dirichlet
-        plain = {name: v if _is_plain(v) else tuple(v) for name, v in given.items()}
-        object.__setattr__(self, "dirichlet", plain)
-        if self.clamped and (not plain or any(value != 0.0 for value in plain.values())):
+        stated: Mapping[str, Any] = self.dirichlet
+        hashable = {name: v if _is_plain(v) else tuple(v) for name, v in stated.items()}
+        object.__setattr__(self, "dirichlet", hashable)
+        if self.clamped and (not hashable or any(value != 0.0 for value in hashable.values())):
             raise SpaceError(
                 'clamped=True fixes values and slopes to zero: give dirichlet={"boundary": 0.0}, '
                 "and no other value."
             )
-        self._check_periodic(known)
+        self._check_periodic(boundaries)
         self._check()
         self._check_pointwise()
 
@@ -480,10 +480,10 @@ class Piecewise(_Declared):
     def __post_init__(self) -> None:
         if not self.regions:
             raise SpaceError("Piecewise: needs at least one region.")
-        for name, given in self.own.items():
-            if name not in self.regions or not isinstance(given, Prior | Scalar):
+        for name, unknown in self.own.items():
+            if name not in self.regions or not isinstance(unknown, Prior | Scalar):
                 raise SpaceError(
-                    f"Piecewise: own={{'{name}': {given!r:.60}}}; expected the name of a region, "
+                    f"Piecewise: own={{'{name}': {unknown!r:.60}}}; expected the name of a region, "
                     f"one of {list(self.regions)}, and a prior or a Scalar."
                 )
         self._check()
@@ -492,14 +492,14 @@ class Piecewise(_Declared):
         """Return name -> unknown for each region, such as "k[soil]"; itself with a common prior."""
         if not self.own:
             return {name: self}
-        found = {}
+        pieces = {}
         for region, where in self.regions.items():
-            own = self.own.get(region, self)
-            one = Scalar(own) if isinstance(own, Prior) else own
-            found[f"{name}[{region}]"] = Piecewise(
+            stated = self.own.get(region, self)
+            one = Scalar(stated) if isinstance(stated, Prior) else stated
+            pieces[f"{name}[{region}]"] = Piecewise(
                 {region: where}, one.prior, one.unit or self.unit, one.evolution, one.within
             )
-        return found
+        return pieces
 
 
 @dataclass(frozen=True, eq=False)
@@ -621,6 +621,6 @@ def _even(w: Any) -> Any:
     small = np.abs(w) < SMALL
     z = np.sqrt(np.where(small, 1.0, w))
     decay = np.exp(-2.0 * z)
-    far = ((1.0 + decay) / (1.0 - decay) - 1.0 / z) / z
-    near = np.polynomial.polynomial.polyval(np.where(small, w, 0.0), SERIES)
-    return np.where(small, near, far)
+    closed_form = ((1.0 + decay) / (1.0 - decay) - 1.0 / z) / z
+    series = np.polynomial.polynomial.polyval(np.where(small, w, 0.0), SERIES)
+    return np.where(small, series, closed_form)

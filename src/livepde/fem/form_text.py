@@ -18,9 +18,9 @@ def terms_text(given: Any) -> list[str]:
     """Return the terms of a form as source code."""
     terms = given if isinstance(given, Sequence) else [given]
     return [
-        f"{terms_text(one.form)[0]} on {one.name!r}" if isinstance(one, On) else expression(one)
-        for one in terms
-        if one is not no_term
+        f"{terms_text(term.form)[0]} on {term.name!r}" if isinstance(term, On) else expression(term)
+        for term in terms
+        if term is not no_term
     ]
 
 
@@ -28,11 +28,11 @@ def equation_text(parts: Mapping[str, Any]) -> str:
     """Return the weak form of the process as text."""
     mass = "u' * v" if parts["M"] is None else "M(u', v)"
     left = " + ".join([mass, *terms_text(parts["A"]), *terms_text(parts["B"])])
-    given = parts["f"]
+    source = parts["f"]
     sources = [
-        str(one) if isinstance(one, int | float | Mapping) else terms_text(one)[0]
-        for one in (given if isinstance(given, Sequence) else [given])
-        if one != 0.0
+        str(item) if isinstance(item, int | float | Mapping) else terms_text(item)[0]
+        for item in (source if isinstance(source, Sequence) else [source])
+        if item != 0.0
     ]
     right = f"integral of ({' + '.join(sources)}) * v" if sources else "0"
     return f"integral of {left} = {right}"

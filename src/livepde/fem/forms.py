@@ -70,8 +70,8 @@ class _Term:
     @cached_property
     def spaces(self) -> dict[str, LocalSpace]:
         """Local space of each argument; arguments of the same space share one object."""
-        found = {id(space): space.local(self.measure) for space in self.over.values()}
-        return {key: found[id(space)] for key, space in self.over.items()}
+        by_space = {id(space): space.local(self.measure) for space in self.over.values()}
+        return {key: by_space[id(space)] for key, space in self.over.items()}
 
     def pieces(self) -> Iterator[tuple[slice, _Term]]:
         """Yield (slice of elements, term on them), small enough to evaluate at once."""
@@ -171,8 +171,8 @@ class Form(FormMatrices):
         parameter: str | None = None,
     ) -> None:
         items = integrands if isinstance(integrands, Sequence) else [integrands]
-        given = derivative if isinstance(derivative, Sequence) else [derivative] * len(items)
-        if len(given) != len(items):
+        derivatives = derivative if isinstance(derivative, Sequence) else [derivative] * len(items)
+        if len(derivatives) != len(items):
             raise ModelError(
                 f"Form {name}: give one derivative for each of its {len(items)} terms."
             )
@@ -182,10 +182,10 @@ class Form(FormMatrices):
         self.parameter = parameter
         self.terms: list[_Term] = []
         weight = volume_element(spaces.values())
-        for item, one in zip(items, given, strict=True):
+        for item, derivative_of_item in zip(items, derivatives, strict=True):
             integrand, where = placed(item)
             at = where if isinstance(where, Measure) else Measure(mesh, order, where, weight=weight)
-            self.terms.append(_Term(integrand, at, self.spaces, one))
+            self.terms.append(_Term(integrand, at, self.spaces, derivative_of_item))
         self._inputs = Inputs(dict.fromkeys(inputs, 1.0))
         self._forget()
         self._moving: list[bool] = []  # whether a term uses time or inputs, and the state
@@ -254,18 +254,18 @@ class Form(FormMatrices):
     def _check_linear(self, slot: str) -> None:
         """Raise an error if a term is not linear in an argument, such as the test function."""
         rng = np.random.default_rng(3)
-        for number, whole in enumerate(self.terms):
-            for term in whole.samples():
+        for number, piece in enumerate(self.terms):
+            for term in piece.samples():
                 values = term.drawn(rng)
-                at, one = term.along(slot, values, Moment(0.3, self._inputs)), values[slot]
-                other = rng.standard_normal(one.shape)
+                at, value = term.along(slot, values, Moment(0.3, self._inputs)), values[slot]
+                second = rng.standard_normal(value.shape)
                 with np.errstate(all="ignore"):  # roots and logarithms of random numbers
-                    parts = at(one), at(other), at(one + other)
+                    parts = at(value), at(second), at(value + second)
                     size = np.abs(parts[0]) + np.abs(parts[1]) + np.abs(parts[2])
                     wrong = np.abs(parts[2] - parts[0] - parts[1]) > 1e-9 * size  # false for NaN
                     if not wrong.any():
                         continue
-                    lacks = np.abs(at(np.zeros_like(one)))[wrong].any()
+                    lacks = np.abs(at(np.zeros_like(value)))[wrong].any()
                 which = f", term {number + 1}" if len(self.terms) > 1 else ""
                 why = f"has a part without {slot}" if lacks else f"is not linear in {slot}"
                 raise ModelError(
@@ -285,9 +285,9 @@ class Form(FormMatrices):
         components.
         """
         moment, total = Moment(0.3, self._inputs), np.zeros(1)
-        for whole in (term for term in self.terms if term.measure.name is None):
+        for parent in (term for term in self.terms if term.measure.name is None):
             factors: list[Array] = []
-            for term in whole.samples():
+            for term in parent.samples():
                 local = term.spaces["u"]
                 given = {key: term.spaces[key].values(x) for key, x in coefficients.items()}
                 level, raised, test = local.zeros(), local.zeros(), local.zeros()
@@ -330,7 +330,7 @@ class Form(FormMatrices):
         """Return whether the form is affine (linear, if homogeneous) in an argument."""
         # The fixed seed makes the result reproducible between runs.
         rng = np.random.default_rng(1)
-        for term in (piece for whole in self.terms for piece in whole.samples()):
+        for term in (piece for parent in self.terms for piece in parent.samples()):
             values = term.drawn(rng)
             at = term.along(slot, values, Moment(0.3, self._inputs))
             for scale in MAGNITUDES:
@@ -357,8 +357,8 @@ class Form(FormMatrices):
         rng = np.random.default_rng(2)
         return any(
             self._reads(term, slot, test, scale, rng)
-            for whole in self.terms
-            for term in whole.samples()
+            for parent in self.terms
+            for term in parent.samples()
             for scale in MAGNITUDES
         )
 
@@ -371,9 +371,9 @@ class Form(FormMatrices):
         steep = np.where(term.spaces[slot].derivatives[:, None, None], there, here)
         flux = np.where(term.spaces[test].derivatives[:, None, None], values[test], 0.0)
 
-        def differ(one: Array, other: Array, v: Array, t: float) -> bool:
+        def differ(first: Array, second: Array, v: Array, t: float) -> bool:
             moment = Moment(t, self._inputs)
-            pair = ({**values, slot: u, test: v} for u in (one, other))
+            pair = ({**values, slot: u, test: v} for u in (first, second))
             change = np.subtract(*(term.evaluate(given, moment)[0] for given in pair))
             return bool(change[np.isfinite(change)].any())  # other points are not informative
 
@@ -396,8 +396,8 @@ class Form(FormMatrices):
             slope, offset = self._affine_part(slot, others[0])
             return slope @ coefficients[others[0]] + offset
         linear = next(key for key in others if key != self.nonlinear)
-        rest = {key: coefficients[key] for key in others if key != linear}
-        return self.product(slot, linear, coefficients[linear], moment, **rest)
+        fixed = {key: coefficients[key] for key in others if key != linear}
+        return self.product(slot, linear, coefficients[linear], moment, **fixed)
 
     def _affine_part(self, slot: str, other: str) -> tuple[sp.csr_array, Array]:
         """Return the slope and the offset of an affine form of one argument; they are cached."""
@@ -416,7 +416,7 @@ class Form(FormMatrices):
         """
         read: set[str] = set()
         result = np.zeros(self.spaces[slot].dim)
-        for term in (piece for whole in self.terms for _, piece in whole.pieces()):
+        for term in (piece for parent in self.terms for _, piece in parent.pieces()):
             place = term.measure.place(moment)
             jets = [
                 local.unit_jets(0, 1)
@@ -464,8 +464,8 @@ class Form(FormMatrices):
     @cached_property
     def fixed_by_numbers(self) -> bool:
         """Whether the form is constant and affine in u for fixed values of a few unknowns."""
-        few = self.parameter is not None and self.spaces[self.parameter].dim <= FEW
-        curved = few and not self.linear_in_parameter and self._stores_products
+        small = self.parameter is not None and self.spaces[self.parameter].dim <= FEW
+        curved = small and not self.linear_in_parameter and self._stores_products
         return curved and self.constant and self.affine
 
     def about(self, q: Array) -> FormAbout:
@@ -473,10 +473,10 @@ class Form(FormMatrices):
 
         Many steps have the same q, and each would otherwise integrate the form.
         """
-        kept = self._about  # read only once: copies of an identifier may step in other threads
-        if kept is None or not np.array_equal(kept.q, q):
-            self._about = kept = FormAbout(self, q.copy())
-        return kept
+        cached = self._about  # read only once: copies of an identifier may step in other threads
+        if cached is None or not np.array_equal(cached.q, q):
+            self._about = cached = FormAbout(self, q.copy())
+        return cached
 
     def product(
         self, rows: str, cols: str, x: Array, moment: Moment = START, **coefficients: Array
@@ -498,12 +498,12 @@ class Form(FormMatrices):
     ) -> Array:
         places = self._scatter(rows, cols)
         result = np.zeros(places.pattern.nnz)
-        for number, whole in enumerate(self.terms):
-            for at, term in whole.pieces():
+        for number, parent in enumerate(self.terms):
+            for at, term in parent.pieces():
                 density = self._density(term, rows, cols, moment, coefficients)
                 r, c = term.spaces[rows], term.spaces[cols]
                 local = r.paired(density, term.measure.weights, c)
-                places.add(result, number, at, local, keep or whole.measure.kept)
+                places.add(result, number, at, local, keep or parent.measure.kept)
         return result
 
     def _density(
@@ -522,8 +522,8 @@ class Form(FormMatrices):
         argument, which is chosen accordingly.
         """
         place = term.measure.place(moment)
-        given = term.derivative if self.nonlinear in (rows, cols) else None
-        stepped, shifted = self._differenced(rows, cols, given)
+        derivative = term.derivative if self.nonlinear in (rows, cols) else None
+        stepped, shifted = self._differenced(rows, cols, derivative)
 
         def evaluate(shift: float) -> Array:
             jets: list[Any] = []
@@ -542,9 +542,9 @@ class Form(FormMatrices):
                 if stepped in axes:
                     value = value + 1j * STEP * local.units(axes[-1], 2)
                 jets.append(local.jets(value))
-                if given is not None and key == self.nonlinear:
+                if derivative is not None and key == self.nonlinear:
                     jets.append(local.unit_jets(axes[0], 2))
-            density = (term.integrand if given is None else given)(*jets, place)
+            density = (term.integrand if derivative is None else derivative)(*jets, place)
             return np.asarray(density) if stepped is None else np.imag(density) / STEP
 
         if shifted is None:
@@ -553,9 +553,9 @@ class Form(FormMatrices):
         local = term.spaces[key]
         here = local.values(coefficients[key]) if key in coefficients else local.zeros()
         # Fourth order in SHIFT. Complex steps are exact up to rounding, so few digits are lost.
-        near = evaluate(SHIFT) - evaluate(-SHIFT)
-        far = evaluate(2.0 * SHIFT) - evaluate(-2.0 * SHIFT)
-        difference = (8.0 * near - far) / (12.0 * SHIFT)
+        single = evaluate(SHIFT) - evaluate(-SHIFT)
+        double = evaluate(2.0 * SHIFT) - evaluate(-2.0 * SHIFT)
+        difference = (8.0 * single - double) / (12.0 * SHIFT)
         return difference / np.swapaxes(self._scale(key, local, here)[:, 0], 0, shifted)
 
     def _differenced(
@@ -578,14 +578,14 @@ class Form(FormMatrices):
         It is bounded from below; for the parameter, the prior standard deviation contributes.
         """
         size = np.abs(values)
-        whole = size.max(axis=(1, 2), keepdims=True)
+        largest = size.max(axis=(1, 2), keepdims=True)
         if key == self.parameter:
             unknowns = [local.space.unknowns[name] for name in local.blocks]
             counts = [item.components for item in local.locals]
             std = np.repeat([float(item.prior.std) for item in unknowns], counts)
-            whole = np.maximum(whole, std[:, None, None])
-        whole = np.where(whole > 0.0, whole, 1.0)
-        return np.where(size > SMALL * whole, size, whole)[:, None, None]
+            largest = np.maximum(largest, std[:, None, None])
+        largest = np.where(largest > 0.0, largest, 1.0)
+        return np.where(size > SMALL * largest, size, largest)[:, None, None]
 
     def _constant(self, rows: str, cols: str) -> Array:
         """Return data(rows, cols) of an affine form at zero, which are cached."""
@@ -658,8 +658,8 @@ class Form(FormMatrices):
         for at, term in whole.pieces():
             values = {key: local.units(axes[key], 3) for key, local in term.spaces.items()}
             if q is not None and self.parameter is not None:
-                own = term.spaces[self.parameter].values(q)[:, None, None, None]
-                values[self.parameter] = own + 1j * STEP * values[self.parameter]
+                parameter_values = term.spaces[self.parameter].values(q)[:, None, None, None]
+                values[self.parameter] = parameter_values + 1j * STEP * values[self.parameter]
             density, _ = term.evaluate(values, START)
             if self.nonlinear is not None:
                 values[self.nonlinear] = 0.0 * values[self.nonlinear]

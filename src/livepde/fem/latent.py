@@ -25,17 +25,17 @@ from livepde.linalg import Array, IntArray, Pattern, sandwich
 
 def numbers(parameter: FunctionSpace, q: Array) -> Any:
     """Return the parameter as an argument of sensor functions: numbers, arrays or mappings."""
-    seen: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for name in parameter.names:
         part = q[parameter.part(name)]
         unknown = parameter.unknowns.get(name)
         if isinstance(unknown, Scalars):
-            seen[name] = dict(zip(unknown.names, part, strict=True))
+            values[name] = dict(zip(unknown.names, part, strict=True))
         else:
-            seen[name] = part[0] if len(part) == 1 else part
+            values[name] = part[0] if len(part) == 1 else part
     if parameter.single:
-        return next(iter(seen.values()))
-    return Named(**seen)
+        return next(iter(values.values()))
+    return Named(**values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,10 +59,10 @@ class Coefficients:
     @cached_property
     def _computed(self) -> Mapping[str, Any]:
         """Values for typical unknowns; arrays if they depend on unknowns that vary in space."""
-        seen = vars(numbers(self.parameter, self.typical))
+        named = vars(numbers(self.parameter, self.typical))
         # Reduce arrays to one entry: regions and nodes of different unknowns differ in number.
-        one = {name: v[:1] if isinstance(v, np.ndarray) else v for name, v in seen.items()}
-        return self.function(Named(**one))
+        single = {name: v[:1] if isinstance(v, np.ndarray) else v for name, v in named.items()}
+        return self.function(Named(**single))
 
     @property
     def names(self) -> list[str]:
@@ -77,8 +77,8 @@ class Coefficients:
     @cached_property
     def space(self) -> FunctionSpace:
         """Space of the unknowns and the computed numbers, of dimension p."""
-        more = dict.fromkeys(self.names, declared(Normal(0.0, std=1.0)))
-        return FunctionSpace({**self.parameter.unknowns, **more}, single=False)
+        added = dict.fromkeys(self.names, declared(Normal(0.0, std=1.0)))
+        return FunctionSpace({**self.parameter.unknowns, **added}, single=False)
 
     def value(self, q: Array) -> Array:
         """Return (q, c(q)), shape (p,), for unknowns of shape (m,)."""
@@ -87,13 +87,13 @@ class Coefficients:
 
     def slopes(self, q: Array) -> Array:
         """Return the derivative of `value`, shape (p, m), by a complex step."""
-        found = np.zeros((self.space.dim, len(q)))
-        found[: len(q)] = np.eye(len(q))
+        slopes = np.zeros((self.space.dim, len(q)))
+        slopes[: len(q)] = np.eye(len(q))
         for column in self.parameter.labels.values():
             stepped = q.astype(complex)
             stepped[column] += 1j * STEP
-            found[len(q) :, column] = np.imag(self.value(stepped)[len(q) :]) / STEP
-        return found
+            slopes[len(q) :, column] = np.imag(self.value(stepped)[len(q) :]) / STEP
+        return slopes
 
     def expanded(self, terms: Integrand | On | Sequence[Integrand | On]) -> list[Integrand | On]:
         """Return terms that depend only on unknowns and compute the numbers at each point."""
@@ -218,19 +218,19 @@ class Latent:
         if self.plain:
             return directions
         # A contiguous copy, because NumPy may round differently for strided arrays.
-        each = self.slopes(a.T.copy()).T[:, :, None] * directions
+        tangents = self.slopes(a.T.copy()).T[:, :, None] * directions
         if self.dim == self.space.dim:
-            return np.asarray(each)
-        return np.array([self.visible(columns) for columns in each])
+            return np.asarray(tangents)
+        return np.array([self.visible(columns) for columns in tangents])
 
     def deviation(self, a: Array, std: Array) -> Array:
         """Return standard deviations of q, (m,), for independent latent coefficients, (dim,)."""
         if self.plain:
             return std
-        each = self.slopes(a) * std
+        parts = self.slopes(a) * std
         if self.dim == self.space.dim:
-            return each
-        deviation: Array = np.sqrt(self.V**2 @ each**2)
+            return parts
+        deviation: Array = np.sqrt(self.V**2 @ parts**2)
         return deviation
 
     def inverse(self, q: Array) -> Array:
@@ -313,13 +313,13 @@ class Latent:
     @cached_property
     def fixed(self) -> IntArray:
         """Latent coefficients fixed at zero by boundary conditions."""
-        found = []
+        fixed_dofs = []
         for p in self.parts.values():
             if p.name in self.space.fields:
                 fixed = self.space.fields[p.name].fixed
                 # All components of a harmonic satisfy the boundary conditions of the field.
-                found += [fixed + p.part.start + c * p.size for c in range(p.evolution.copies)]
-        return np.concatenate(found) if found else np.zeros(0, dtype=np.int64)
+                fixed_dofs += [fixed + p.part.start + c * p.size for c in range(p.evolution.copies)]
+        return np.concatenate(fixed_dofs) if fixed_dofs else np.zeros(0, dtype=np.int64)
 
     @cached_property
     def generator(self) -> sp.csr_array:
@@ -393,8 +393,8 @@ class Composed(FormMatrices):
             i, j, weights = sandwich(left, inner, right)
             shape = (left.shape[0], right.shape[1])
             # The second derivative in a has entries on the diagonal that the form in q may lack.
-            more = np.arange(dim if rows == cols == "q" else 0)
-            pattern = Pattern.from_entries(np.append(i, more), np.append(j, more), shape)
+            diagonal = np.arange(dim if rows == cols == "q" else 0)
+            pattern = Pattern.from_entries(np.append(i, diagonal), np.append(j, diagonal), shape)
             self._maps[rows, cols] = (pattern, sp.csr_array(pattern.gather(i, j) @ weights))
         return self._maps[rows, cols]
 

@@ -33,9 +33,9 @@ class Inputs(dict[str, float]):
     """Immutable values of the input channels at a time; a missing name is an error."""
 
     def __missing__(self, name: str) -> float:
-        known = ", ".join(sorted(self)) or "none"
+        channels = ", ".join(sorted(self)) or "none"
         raise MissingInputError(
-            f"Input channel '{name}' has no value; channels with one: {known}. "
+            f"Input channel '{name}' has no value; channels with one: {channels}. "
             "Name it in inputs= of the model and send it with every sample."
         )
 
@@ -202,9 +202,9 @@ def own(element: Element) -> Element:
     if type(element) is ElementLineHermite:
         return _LineHermite()
     if isinstance(element, ElementGlobal):
-        fresh = copy(element)
-        fresh.V = None
-        return fresh
+        copied = copy(element)
+        copied.V = None
+        return copied
     return element
 
 
@@ -248,10 +248,10 @@ class Measure:
             return None
         for named in (self.mesh.boundaries or {}, self.mesh.subdomains or {}):
             if self.name in named:
-                found: IntArray = named[self.name]
-                return found
-        known = [*(self.mesh.boundaries or {}), *(self.mesh.subdomains or {})]
-        raise SpaceError(f"On('{self.name}', ...): the mesh names {known or 'nothing'}.")
+                elements: IntArray = named[self.name]
+                return elements
+        names = [*(self.mesh.boundaries or {}), *(self.mesh.subdomains or {})]
+        raise SpaceError(f"On('{self.name}', ...): the mesh names {names or 'nothing'}.")
 
     @property
     def _where(self) -> IntArray | None:
@@ -259,11 +259,11 @@ class Measure:
 
     def on(self, cells: IntArray) -> Measure:
         """Return the restriction to given cells of the mesh, or to their facets."""
-        mine = self.cells
-        mine = np.arange(self.mesh.nelements) if mine is None else mine
-        at = np.flatnonzero(np.isin(mine, cells))
+        own_cells = self.cells
+        own_cells = np.arange(self.mesh.nelements) if own_cells is None else own_cells
+        at = np.flatnonzero(np.isin(own_cells, cells))
         where = self._where
-        return replace(self, members=mine[at] if where is None else _chosen(where, at))
+        return replace(self, members=own_cells[at] if where is None else _chosen(where, at))
 
     @property
     def kept(self) -> bool:
@@ -358,8 +358,8 @@ class Measure:
         cells = slice(None) if self.cells is None else self.cells
         corners = self.mesh.p[:, self.mesh.t[:, cells]]
         distances = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=0)
-        found: Array = distances.max(axis=(0, 1))[:, None]
-        return found
+        largest: Array = distances.max(axis=(0, 1))[:, None]
+        return largest
 
     def gbasis(self, element: Any, i: int) -> DiscreteField:
         """Return a shape function of an element at the quadrature points of cells."""
@@ -427,13 +427,13 @@ def crossed(measure: Measure, region: Callable[[Array], Any]) -> IntArray:
 
     A crossing is not detected if all corners and quadrature points of the cell are on one side.
     """
-    found = []
+    crossed_cells = []
     for at, piece in measure.pieces():
         corners = _Corners(measure.mesh, 1, members=np.arange(at.start, at.stop))
         points = np.concatenate([piece.points, corners.points], axis=2)
-        seen = np.broadcast_to(np.asarray(region(points), dtype=bool), points.shape[1:])
-        found.append(at.start + np.flatnonzero(seen.any(axis=1) & ~seen.all(axis=1)))
-    return np.concatenate(found)
+        inside = np.broadcast_to(np.asarray(region(points), dtype=bool), points.shape[1:])
+        crossed_cells.append(at.start + np.flatnonzero(inside.any(axis=1) & ~inside.all(axis=1)))
+    return np.concatenate(crossed_cells)
 
 
 def sizes(measure: Measure, region: Callable[[Array], Any]) -> tuple[float, float]:
@@ -443,8 +443,8 @@ def sizes(measure: Measure, region: Callable[[Array], Any]) -> tuple[float, floa
     for at, piece in measure.pieces():
         inside = piece.weights * region(piece.points)
         plain += float(inside.sum())
-        whole = np.isin(np.arange(at.start, at.stop), cut, invert=True)
-        exact += float(inside[whole].sum())
+        uncut = np.isin(np.arange(at.start, at.stop), cut, invert=True)
+        exact += float(inside[uncut].sum())
     if len(cut):
         fine = FineMeasure(measure.mesh, measure.order, members=cut, weight=measure.weight)
         exact += sum(float((x.weights * region(x.points)).sum()) for _, x in fine.pieces())

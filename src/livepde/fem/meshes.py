@@ -169,7 +169,7 @@ def halved(mesh: Mesh) -> Mesh:
         return finer
     cell = mesh.element_finder()(finer.p[0][finer.t].mean(axis=0))
     return finer.with_subdomains(
-        {name: np.flatnonzero(np.isin(cell, own)) for name, own in mesh.subdomains.items()}
+        {name: np.flatnonzero(np.isin(cell, members)) for name, members in mesh.subdomains.items()}
     )
 
 
@@ -348,32 +348,32 @@ def tied(field: Field, block: Any) -> IntArray | None:
 
 def _matched(field: Field, block: Any, one: str, other: str) -> tuple[IntArray, IntArray]:
     names = dict.fromkeys(field.element.dofnames or [])
-    what = f"periodic: '{one}' and '{other}'"
+    sides = f"periodic: '{one}' and '{other}'"
     i, j = [], []
     for name in names:
         left, right = (block.at(side, [name]) for side in (one, other))
         if len(left) != len(right):
             raise SpaceError(
-                f"{what} have {len(left)} and {len(right)} coefficients '{name}': their meshes "
+                f"{sides} have {len(left)} and {len(right)} coefficients '{name}': their meshes "
                 "must match."
             )
         if not len(left):
             continue
         a, b = block.places[:, left], block.places[:, right]
         shift = (b.mean(axis=1) - a.mean(axis=1))[:, None]
-        found, nearest = scipy.spatial.cKDTree((a + shift).T).query(b.T)
-        distance = float(np.max(found))
+        distances, nearest = scipy.spatial.cKDTree((a + shift).T).query(b.T)
+        distance = float(np.max(distances))
         size = np.ptp(field.mesh.p, axis=1).max()
         if distance > SLACK * size or len(np.unique(nearest)) < len(left):
             raise SpaceError(
-                f"{what} do not match: shifted onto each other, their nodes are up to "
+                f"{sides} do not match: shifted onto each other, their nodes are up to "
                 f"{distance:.3g} apart. Mesh both sides alike."
             )
         i.append(left[nearest])
         j.append(right)
     if not i:
         raise SpaceError(
-            f"{what}: {type(field.element).__name__} has no coefficients there, so it cannot be "
+            f"{sides}: {type(field.element).__name__} has no coefficients there, so it cannot be "
             "periodic; take a continuous element."
         )
     return np.concatenate(i), np.concatenate(j)

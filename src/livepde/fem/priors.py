@@ -182,10 +182,10 @@ class Transform(ABC):
         """
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             latent = self.inverse(q)
-            moved = latent + z * std / self.slope(latent)
+            shifted = latent + z * std / self.slope(latent)
             # At an end of the range, the latent value is infinite, and the quantiles are the ends.
-            moved = np.where(np.isfinite(moved), moved, np.copysign(np.inf, z))
-            return np.where(np.isnan(std), np.nan, self.value(moved))
+            shifted = np.where(np.isfinite(shifted), shifted, np.copysign(np.inf, z))
+            return np.where(np.isnan(std), np.nan, self.value(shifted))
 
     def moments(self, q: Array, std: Array) -> tuple[Array, Array]:
         """Return mean and standard deviation of T(Gaussian); see `shifted` for `q` and `std`.
@@ -358,18 +358,18 @@ class Prior(ABC):
 
     def _check(self, centre: str) -> None:
         """Raise an error for invalid numbers; `centre` is the name of the centre: "mean"."""
-        what, at = type(self).__name__, self.centre
-        require_positive(f"{what}: std", self.std, SpaceError)
+        kind, at = type(self).__name__, self.centre
+        require_positive(f"{kind}: std", self.std, SpaceError)
         lower, upper = self.bounds
         if not lower < upper:
             raise SpaceError(
-                f"{what}: bounds must be (lower, upper) with lower < upper; got {self.bounds}."
+                f"{kind}: bounds must be (lower, upper) with lower < upper; got {self.bounds}."
             )
         if not lower <= at <= upper:
-            raise SpaceError(f"{what}: {centre} {at} is outside its bounds {self.bounds}.")
+            raise SpaceError(f"{kind}: {centre} {at} is outside its bounds {self.bounds}.")
         if not np.isfinite(self.transform.inverse(np.array(at))):
             raise SpaceError(
-                f"{what}: {centre} {at} must be finite, and strictly inside {self.bounds}."
+                f"{kind}: {centre} {at} must be finite, and strictly inside {self.bounds}."
             )
 
 

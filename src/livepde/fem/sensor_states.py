@@ -64,9 +64,9 @@ class SensorBlock(Block):
 
     def local(self, measure: Measure) -> Local:
         def evaluate(_: str) -> Array:
-            both = np.zeros((2, len(self._dofs), 1, 1))
-            both[0, :-1, 0, 0], both[1, -1] = self.row.data, 1.0
-            return both
+            values = np.zeros((2, len(self._dofs), 1, 1))
+            values[0, :-1, 0, 0], values[1, -1] = self.row.data, 1.0
+            return values
 
         return Local(self._dofs, [("value", (2,))], evaluate)
 

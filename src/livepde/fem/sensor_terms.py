@@ -24,13 +24,13 @@ class SensorTerms:
         # The mass of a sensor state is the mean mass of a coefficient of the fields.
         weight = float(form_M.matrix("v", "u").diagonal().sum()) / form_M.spaces["u"].dim
         mesh, order = form_M.terms[0].measure.mesh, form_M.terms[0].measure.order
-        for name, one in sensors.items():
+        for name, sensor in sensors.items():
             measure = SensorMeasure(mesh, order, name, sensor=name)
             self.mass.append(On(measure, lambda u, v, x: weight * u.shown * v.shown))
-            if one.time_constant is None:
+            if sensor.time_constant is None:
                 self.unknown_response.append(On(measure, _unknown_response(name, weight)))
             else:
-                self.response.append(On(measure, _response(weight / one.time_constant)))
+                self.response.append(On(measure, _response(weight / sensor.time_constant)))
 
 
 def _response(rate: float) -> Integrand:

@@ -137,9 +137,9 @@ class Sobolev:
 def _border(s: float, M: Any, K: Any) -> Any:
     if s > 2:  # G_s = K M^-1 G_{s-2} M^-1 K: y = M^-1 K q, M p = G_{s-2} y, G_s q = K p
         n, inner = M.shape[0], _border(s - 2, M, K)
-        rest = inner.shape[0] - n
+        auxiliary = inner.shape[0] - n
         corner = sp.csr_array((n, inner.shape[0]))
-        mass = sp.vstack([-M, sp.csr_array((rest, n))])
+        mass = sp.vstack([-M, sp.csr_array((auxiliary, n))])
         return sp.block_array([[None, corner, K], [corner.T, inner, mass], [K, mass.T, None]])
     if s == 2:
         return sp.block_array([[None, K], [K, -M]])
@@ -157,10 +157,10 @@ def _fractional_border(s: float, M: Any, K: Any) -> Any:
     if s > 1:
         E, F, H = c * K, [K] * len(poles), [-matrix for matrix in shifted]
     else:  # lambda/(lambda + b) = 1 - b/(lambda + b) = lambda/b - lambda^2/b/(lambda + b)
-        near = poles <= np.sqrt(largest)  # choose the form with less cancellation
-        E = (c + weights[near].sum()) * M + (weights / poles)[~near].sum() * K
-        F = [M if close else K for close in near]
-        H = [m / b if n else m * b for m, b, n in zip(shifted, poles, near, strict=True)]
+        small = poles <= np.sqrt(largest)  # choose the form with less cancellation
+        E = (c + weights[small].sum()) * M + (weights / poles)[~small].sum() * K
+        F = [M if is_small else K for is_small in small]
+        H = [m / b if n else m * b for m, b, n in zip(shifted, poles, small, strict=True)]
     side = sp.hstack(F)
     return sp.block_array([[E, side], [side.T, sp.block_diag(H)]])
 
@@ -190,8 +190,8 @@ def _balakrishnan(sigma: float, largest: float) -> tuple[float, Array, Array]:
     w = np.sin(np.pi * sigma) / np.pi * SPACING * b**sigma
     below, above = np.exp(-sigma * SPACING), np.exp(-(1 - sigma) * SPACING)
     c = w[0] * below / (1 - below)
-    far = b[-1] * REACH
-    return float(c), np.append(w, w[-1] * REACH * above / (1 - above)), np.append(b, far)
+    last_pole = b[-1] * REACH
+    return float(c), np.append(w, w[-1] * REACH * above / (1 - above)), np.append(b, last_pole)
 
 
 MOST = 8  # most functions of a field
@@ -223,16 +223,16 @@ class _Kernel:
 
     def features(self, at: Array) -> Array:
         """Return functions whose squares sum to the conditional variance, (functions, points)."""
-        own = self.covariance(self.places, self.places)
-        root = cholesky(own + NUGGET * np.eye(len(own)), lower=True)
-        found: Array = solve_triangular(root, self.covariance(self.places, at), lower=True)
-        return found[self.known :]
+        covariance = self.covariance(self.places, self.places)
+        root = cholesky(covariance + NUGGET * np.eye(len(covariance)), lower=True)
+        features: Array = solve_triangular(root, self.covariance(self.places, at), lower=True)
+        return features[self.known :]
 
     def mixed(self, mix: Array, x: Any) -> Array:
         """Return a linear combination of the functions at x of shape (d, ...)."""
         x = np.asarray(x, dtype=float)
-        found: Array = mix @ self.features(x.reshape(len(x), -1).T)
-        return found.reshape(x.shape[1:])
+        values: Array = mix @ self.features(x.reshape(len(x), -1).T)
+        return values.reshape(x.shape[1:])
 
 
 def random_field(
@@ -289,14 +289,14 @@ def random_field(
     at = np.array([np.atleast_1d(place) for place in known]).reshape(-1, vertices.shape[1])
     points = vertices[:: -(-len(vertices) // CANDIDATES)]
     kernel = _Kernel(at, length, len(at))
-    left = 1.0 - _explained(kernel, points)
-    if left.max(initial=0.0) < ROUNDING:  # each vertex has a known value
+    variance = 1.0 - _explained(kernel, points)
+    if variance.max(initial=0.0) < ROUNDING:  # each vertex has a known value
         return ()
-    kernel = _with_pivots(kernel, points, left, 3 * most)
+    kernel = _with_pivots(kernel, points, variance, 3 * most)
     features = kernel.features(points)
     # Order the directions of the features by their share of the mean variance.
     square, vectors = np.linalg.eigh(features @ features.T)
-    share = np.cumsum(square[::-1]) / left.sum()
+    share = np.cumsum(square[::-1]) / variance.sum()
     count = min(int(np.searchsorted(share, KEPT)) + 1, most, len(share))
     mixes = vectors[:, ::-1][:, :count].T
     if std is None:
@@ -329,13 +329,13 @@ def _straight(nodes: Array, values: Array, x: Any) -> Array:
     return np.asarray(np.interp(x[0], nodes, values))
 
 
-def _with_pivots(kernel: _Kernel, points: Array, left: Array, most: int) -> _Kernel:
+def _with_pivots(kernel: _Kernel, points: Array, variance: Array, most: int) -> _Kernel:
     """Return the kernel with added positions, each at the largest remaining variance."""
-    first = float(left.max())
-    while len(kernel.places) - kernel.known < most and left.max() > 1e-3 * first:
-        places = np.vstack([kernel.places, points[int(left.argmax())]])
+    first = float(variance.max())
+    while len(kernel.places) - kernel.known < most and variance.max() > 1e-3 * first:
+        places = np.vstack([kernel.places, points[int(variance.argmax())]])
         kernel = _Kernel(places, kernel.length, kernel.known)
-        left = 1.0 - _explained(kernel, points)
+        variance = 1.0 - _explained(kernel, points)
     return kernel
 
 
@@ -343,13 +343,13 @@ def _explained(kernel: _Kernel, points: Array) -> Array:
     """Return the share of the variance at points that the positions of a kernel explain."""
     if not len(kernel.places):
         return np.zeros(len(points))
-    whole = _Kernel(kernel.places, kernel.length, 0)
-    return np.asarray((whole.features(points) ** 2).sum(axis=0))
+    unconditioned = _Kernel(kernel.places, kernel.length, 0)
+    return np.asarray((unconditioned.features(points) ** 2).sum(axis=0))
 
 
 def _spread(kernel: _Kernel, values: Array) -> float:
     """Return the estimated standard deviation of a field with unknown mean and given values."""
     places = kernel.places[: kernel.known]
     weights = np.linalg.inv(kernel.covariance(places, places) + NUGGET * np.eye(len(values)))
-    off = values - (weights @ values).sum() / weights.sum()
-    return float(np.sqrt(max(off @ weights @ off, 0.0) / (len(values) - 1)))
+    deviations = values - (weights @ values).sum() / weights.sum()
+    return float(np.sqrt(max(deviations @ weights @ deviations, 0.0) / (len(values) - 1)))

@@ -59,12 +59,12 @@ class LocalSpace:
     @cached_property
     def _owners(self) -> list[tuple[Local, slice, str, int]]:
         """Block, slice of local functions, derivative, and index in it for each component."""
-        owners, left = [], 0
+        owners, start = [], 0
         for local in self.locals:
-            columns = slice(left, left + len(local.dofs))
+            columns = slice(start, start + len(local.dofs))
             for (name, _), size in zip(local.parts, local.sizes, strict=True):
                 owners += [(local, columns, name, k) for k in range(size)]
-            left = columns.stop
+            start = columns.stop
         return owners
 
     @property
@@ -138,8 +138,8 @@ class LocalSpace:
         if self.kept:
             weighted = np.broadcast_to(density * weights, (*shape, *self.shape))
             half = np.einsum("klep,kiep->liep", weighted, self.phi, optimize=False)
-            whole: Array = np.einsum("liep,ljep->ije", half, other.phi, optimize=False)
-            return whole
+            paired: Array = np.einsum("liep,ljep->ije", half, other.phi, optimize=False)
+            return paired
         result = np.zeros((len(self.dofs), *other.dofs.shape))
         for (k, m), part in _parts(density, shape):
             (rows, phi), (cols, psi) = self.component(k), other.component(m)
@@ -155,14 +155,14 @@ class LocalSpace:
             weighted = np.broadcast_to(density * weights, (*shape, *self.shape))
             step = np.einsum("klmep,kiep->ilmep", weighted, self.phi, optimize=False)
             step = np.einsum("ilmep,ljep->ijmep", step, second.phi, optimize=False)
-            whole: Array = np.einsum("ijmep,mnep->ijne", step, third.phi, optimize=False)
-            return whole
+            tripled: Array = np.einsum("ijmep,mnep->ijne", step, third.phi, optimize=False)
+            return tripled
         result = np.zeros((len(self.dofs), len(second.dofs), *third.dofs.shape))
         for (k, l, m), part in _parts(density, shape):
             at, phi = self.component(k)
             (rows, psi), (cols, chi) = second.component(l), third.component(m)
-            both = np.einsum("iep,jep->ijep", part * weights * phi, psi)
-            result[at, rows, cols] += np.einsum("ijep,nep->ijne", both, chi)
+            product = np.einsum("iep,jep->ijep", part * weights * phi, psi)
+            result[at, rows, cols] += np.einsum("ijep,nep->ijne", product, chi)
         return result
 
     def zeros(self) -> Array:
@@ -191,10 +191,10 @@ class LocalSpace:
         if self.space.single or any(name in self.space.sensors for name in self.blocks):
             return jets[0]
         # Regions with separate priors, such as k[soil], sum to q.k: each is zero elsewhere.
-        found: dict[str, Any] = {}
+        by_name: dict[str, Any] = {}
         for name, jet in zip(map(base_name, self.blocks), jets, strict=True):
-            found[name] = found[name] + jet if name in found else jet
-        return Named(**found)
+            by_name[name] = by_name[name] + jet if name in by_name else jet
+        return Named(**by_name)
 
 
 def _parts(density: Array, axes: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], Array]]:
@@ -257,41 +257,41 @@ class FunctionSpace:
                 if not key.isidentifier():
                     raise SpaceError(f"unknown '{key}': the name must be a Python identifier.")
             separated: dict[str, Declaration] = {}
-            for key, given in unknown.items():
-                item = declared(given)
+            for key, value in unknown.items():
+                item = declared(value)
                 separated |= item.separated(key) if isinstance(item, Piecewise) else {key: item}
             return cls(separated, single=False)
-        one = declared(unknown)
-        if isinstance(one, Piecewise) and one.own:
+        single = declared(unknown)
+        if isinstance(single, Piecewise) and single.own:
             raise SpaceError(
                 "Piecewise: with own= it needs a name: parameter={'k': Piecewise(...)}."
             )
-        return cls({getattr(one, "name", "") or name: one}, single=True)
+        return cls({getattr(single, "name", "") or name: single}, single=True)
 
     @cached_property
     def blocks(self) -> dict[str, Any]:
         """Name -> block, for all unknowns and slow sensors."""
-        found: dict[str, Any] = {name: block_of(item) for name, item in self.unknowns.items()}
-        size = sum(block.size for block in found.values())
+        blocks: dict[str, Any] = {name: block_of(item) for name, item in self.unknowns.items()}
+        size = sum(block.size for block in blocks.values())
         rows = enumerate(self.sensors.items(), size)
-        return found | {name: SensorBlock(number, row) for number, (name, row) in rows}
+        return blocks | {name: SensorBlock(number, row) for number, (name, row) in rows}
 
     def blocks_on(self, measure: Measure) -> dict[str, Any]:
         """Return name -> block, for the arguments of forms on a measure."""
         if not isinstance(measure, SensorMeasure):
-            return {name: one for name, one in self.blocks.items() if name not in self.sensors}
+            return {name: block for name, block in self.blocks.items() if name not in self.sensors}
         if self.sensors:
             return {measure.sensor: self.blocks[measure.sensor]}
         # In a space of unknowns, only blocks with named numbers are available.
-        return {name: one for name, one in self.blocks.items() if isinstance(one, NamesBlock)}
+        return {name: block for name, block in self.blocks.items() if isinstance(block, NamesBlock)}
 
     def with_sensors(self, sensors: Mapping[str, SensorState]) -> FunctionSpace:
         """Return the space with additional states of slow sensors."""
         if not sensors:
             return self
-        if taken := sorted(set(sensors) & set(self.parts)):
-            raise ModelError(f"sensor and component are both called '{taken[0]}': rename one.")
-        return replace(self, sensors={name: one.row(self) for name, one in sensors.items()})
+        if clashes := sorted(set(sensors) & set(self.parts)):
+            raise ModelError(f"sensor and component are both called '{clashes[0]}': rename one.")
+        return replace(self, sensors={name: state.row(self) for name, state in sensors.items()})
 
     @property
     def seen(self) -> int:
@@ -307,10 +307,10 @@ class FunctionSpace:
         """Return states, (dim,) or (dim, k), with outputs of slow sensors equal to their inputs."""
         if not self.sensors:
             return u
-        found = u.copy()
+        completed = u.copy()
         for name, row in self.sensors.items():
-            found[self.part(name)] = row @ u[: row.shape[1]]
-        return found
+            completed[self.part(name)] = row @ u[: row.shape[1]]
+        return completed
 
     @cached_property
     def mesh(self) -> Mesh:
@@ -333,8 +333,8 @@ class FunctionSpace:
         Raises `ModelError`: it differs between components, or is negative at a vertex.
         """
         points = self.mesh.p
-        given = [block.field.weight for block in self.fields.values()]
-        first, *others = (np.broadcast_to(one(points), points.shape[1:]) for one in given)
+        weights = [block.field.weight for block in self.fields.values()]
+        first, *others = (np.broadcast_to(weight(points), points.shape[1:]) for weight in weights)
         if not (np.isfinite(first).all() and (first >= 0.0).all() and first.any()):
             raise ModelError(
                 "state: weight must be 0 or more at each vertex of the mesh, and not 0 everywhere; "
@@ -344,7 +344,7 @@ class FunctionSpace:
             raise ModelError(
                 f"state: the components {list(self.fields)} must have one weight in common."
             )
-        return given[0]
+        return weights[0]
 
     def product(self, u: Any, v: Any, x: Any) -> Any:
         """Return the integrand of the L2 inner product of a state: a sum over components."""
@@ -368,12 +368,12 @@ class FunctionSpace:
     @cached_property
     def parts(self) -> dict[str, slice]:
         """Slice of coefficients for each block, and for each name in forms."""
-        found: dict[str, slice] = {}
+        parts: dict[str, slice] = {}
         for (name, block), start in zip(self.blocks.items(), self.starts, strict=True):
-            found[name] = slice(start, start + block.size)
-            first = found.get(base_name(name), found[name])
-            found[base_name(name)] = slice(first.start, start + block.size)
-        return found
+            parts[name] = slice(start, start + block.size)
+            first = parts.get(base_name(name), parts[name])
+            parts[base_name(name)] = slice(first.start, start + block.size)
+        return parts
 
     def part(self, name: str) -> slice:
         """Return the slice of coefficients of a block, or of all regions of an unknown."""
@@ -402,10 +402,10 @@ class FunctionSpace:
     @cached_property
     def labels(self) -> dict[str, int]:
         """Label of a scalar unknown -> index of its coefficient."""
-        found: dict[str, int] = {}
+        labels: dict[str, int] = {}
         for (name, block), start in zip(self.blocks.items(), self.starts, strict=True):
-            found |= {label: start + k for k, label in enumerate(block.labels(name))}
-        return found
+            labels |= {label: start + k for k, label in enumerate(block.labels(name))}
+        return labels
 
     @cached_property
     def described(self) -> NamedUnknowns:
@@ -415,8 +415,8 @@ class FunctionSpace:
             parts=self.parts,
             fields=dict.fromkeys(self.fields),
             unknowns={
-                name: Scalar(each.prior, each.unit, each.evolution, each.within)
-                for name, each in self.unknowns.items()
+                name: Scalar(unknown.prior, unknown.unit, unknown.evolution, unknown.within)
+                for name, unknown in self.unknowns.items()
             },
         )
 
@@ -473,11 +473,11 @@ class FunctionSpace:
     def dofs_on(self, measure: Measure) -> IntArray:
         """Return the coefficient of each local function on a measure, shape (local, elements)."""
         starts = dict(zip(self.blocks, self.starts, strict=True))
-        each: list[IntArray] = [
+        dofs: list[IntArray] = [
             block.dofs_on(measure) if starts[name] == 0 else block.dofs_on(measure) + starts[name]
             for name, block in self.blocks_on(measure).items()
         ]
-        return each[0] if len(each) == 1 else np.concatenate(each)
+        return dofs[0] if len(dofs) == 1 else np.concatenate(dofs)
 
     def local(self, measure: Measure) -> LocalSpace:
         """Return the local space on a measure; all forms share cached ones."""
