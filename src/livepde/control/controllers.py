@@ -27,8 +27,8 @@ def _finite(value: Any) -> bool:
 
 def _range(ends: Any) -> bool:
     """Return True for (least, largest); either may be infinite."""
-    two = np.shape(ends) == (2,) and all(isinstance(end, Real) for end in ends)
-    return two and bool(ends[0] < ends[1])
+    pair = np.shape(ends) == (2,) and all(isinstance(end, Real) for end in ends)
+    return pair and bool(ends[0] < ends[1])
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Goal:
     penalty: float | None = None
 
     def __post_init__(self) -> None:
-        for what, valid, expected in (
+        for option, valid, expected in (
             ("track", lambda weight: _finite(weight) and weight >= 0.0, "a positive number"),
             # These weights are the diagonal of R in the Riccati equation, which must be regular.
             ("move", lambda weight: _finite(weight) and weight >= 1e-300, "a positive number"),
@@ -72,15 +72,15 @@ class Goal:
             ("limits", _range, "(least, largest) with least < largest"),
             ("price", _finite, "a number"),
         ):
-            values = getattr(self, what)
+            values = getattr(self, option)
             if not isinstance(values, Mapping):
                 raise ConfigurationError(
-                    f"Goal: {what} must be a mapping from names to numbers; got {values!r}."
+                    f"Goal: {option} must be a mapping from names to numbers; got {values!r}."
                 )
             for name, value in values.items():
                 if not valid(value):
                     raise ConfigurationError(
-                        f"Goal: {what}['{name}'] must be {expected}; got {value!r}."
+                        f"Goal: {option}['{name}'] must be {expected}; got {value!r}."
                     )
         if not (np.isfinite(self.beyond) and self.beyond >= 0.0):
             raise ConfigurationError(f"Goal: penalty must be at least 0; got {self.penalty}.")
@@ -92,7 +92,7 @@ class Goal:
 
     def check(self, model: ReducedModel) -> None:
         """Raise `ConfigurationError` if the goal does not fit a reduced model."""
-        for what, names, known in (
+        for option, names, allowed in (
             ("track", self.track, model.outputs.names),
             ("limits", self.limits, model.outputs.names),
             ("move", self.move, model.controls),
@@ -100,9 +100,9 @@ class Goal:
             ("price", self.price, model.controls),
         ):
             for name in names:
-                if name not in known:
+                if name not in allowed:
                     raise ConfigurationError(
-                        f"Goal: {what} names '{name}'; the reduced model has {list(known)}."
+                        f"Goal: {option} names '{name}'; the reduced model has {list(allowed)}."
                     )
         missing = [name for name in model.controls if name not in self.move]
         if missing or not (self.track or self.price):
@@ -250,14 +250,14 @@ class Controller(Protocol):
 def check(controller: Controller) -> None:
     """Raise `ConfigurationError` if the numbers of a controller are invalid."""
     controller.goal.check(controller.model)
-    what = type(controller).__name__
+    kind = type(controller).__name__
     if not (np.isfinite(controller.period) and controller.period > 0):
         raise ConfigurationError(
-            f"{what}: period must be a positive number; got {controller.period}."
+            f"{kind}: period must be a positive number; got {controller.period}."
         )
     if controller.horizon != int(controller.horizon) or controller.horizon < 1:
         raise ConfigurationError(
-            f"{what}: horizon must be a whole number, at least 1; got {controller.horizon}."
+            f"{kind}: horizon must be a whole number, at least 1; got {controller.horizon}."
         )
 
 
@@ -313,20 +313,20 @@ class LQ:
         step = model.matrices(known.q, self.period).with_offset(known.offset)
         try:
             x, v = self.target(step, plan.reference[0], plan.disturbances[0])
-            m, kept = len(known.q), np.isfinite(memory).all()
+            m, cached = len(known.q), np.isfinite(memory).all()
             if known.model is not None:  # it differs at each sample: the gain is not cached
                 gain = self.gain(step)
-            elif kept and np.array_equal(memory[:m], known.q):
+            elif cached and np.array_equal(memory[:m], known.q):
                 gain = memory[m:].reshape(len(before), -1)
             else:
                 gain = self.gain(step)
                 memory = np.concatenate([known.q, gain.ravel()])
         except np.linalg.LinAlgError as error:
             return Decision(before, f"no gain ({error}): the inputs were held", memory)
-        wanted = before - gain @ np.concatenate([known.x - x, before - v])
-        if not np.isfinite(wanted).all():
+        inputs = before - gain @ np.concatenate([known.x - x, before - v])
+        if not np.isfinite(inputs).all():
             return Decision(before, "no finite state or target: the inputs were held", memory)
-        return Decision(np.clip(wanted, low, high), "ok", memory)
+        return Decision(np.clip(inputs, low, high), "ok", memory)
 
     def _parts(self) -> tuple[list[int], list[int], list[int], Array]:
         """Return columns of controls and disturbances, rows of tracked outputs, their weights."""
@@ -350,8 +350,8 @@ class LQ:
         Q += TINY * np.trace(Q) * np.eye(len(Q))
         R = np.diag([self.goal.move[name] for name in self.model.controls])
         P = solve_discrete_are(A, B, Q, R)
-        found: Array = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
-        return found
+        gain: Array = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+        return gain
 
     def target(self, step: Discrete, reference: Array, disturbances: Array) -> tuple[Array, Array]:
         """Return the steady state (x, v) that is closest to the reference within the ranges."""
@@ -362,22 +362,22 @@ class LQ:
         # the tracked outputs are fitted.
         steady = np.hstack([np.eye(r) - step.A, -step.B[:, controls]])
         one = np.linalg.lstsq(steady, step.B[:, others] @ disturbances + step.f, rcond=None)[0]
-        along = null_space(steady)
+        null = null_space(steady)
         C = np.hstack([model.outputs.C[rows], model.outputs.D[np.ix_(rows, controls)]])
         offset = model.outputs.D[np.ix_(rows, others)] @ disturbances + model.outputs.d[rows]
         root = np.sqrt(weights)
-        missed = root * (reference - offset - C @ one)
-        pair = one + along @ np.linalg.lstsq(root[:, None] * (C @ along), missed, rcond=None)[0]
+        misfit = root * (reference - offset - C @ one)
+        pair = one + null @ np.linalg.lstsq(root[:, None] * (C @ null), misfit, rcond=None)[0]
         v = np.clip(pair[r:], low, high)
         if not np.array_equal(v, pair[r:]):
             if len(v) > 1:  # if one control is at its bound, the others may compensate for it
                 from scipy.optimize import lsq_linear
 
-                move = along @ np.linalg.pinv(along[r:])  # derivative of (x, v) in v
+                move = null @ np.linalg.pinv(null[r:])  # derivative of (x, v) in v
                 effect = root[:, None] * (C @ move)
-                rest = missed + effect @ one[r:]
-                v = np.clip(lsq_linear(effect, rest, (low, high), method="bvls").x, low, high)
-            pair = pair + along @ np.linalg.lstsq(along[r:], v - pair[r:], rcond=None)[0]
+                right_side = misfit + effect @ one[r:]
+                v = np.clip(lsq_linear(effect, right_side, (low, high), method="bvls").x, low, high)
+            pair = pair + null @ np.linalg.lstsq(null[r:], v - pair[r:], rcond=None)[0]
         return np.asarray(pair[:r]), v
 
 
@@ -432,8 +432,8 @@ class MPC:
     @property
     def scenarios(self) -> int:
         """Number of scenarios."""
-        most = min(self.directions, len(self.model.unknowns)) if self.kappa else 0
-        return 1 + 2 * most
+        directions = min(self.directions, len(self.model.unknowns)) if self.kappa else 0
+        return 1 + 2 * directions
 
     def start(self) -> Array:
         """Return the initial memory: the starting point of the optimisation."""
@@ -512,10 +512,10 @@ class MPC:
     def decide(self, known: Known, plan: Plan, before: Array, memory: Array) -> Decision:
         """Return the control inputs for the coming period; see `Controller.decide`."""
         mpc, model = self.problem, known.model or self.model
-        found = known.scenarios(self.kappa, (self.scenarios - 1) // 2)
-        found = np.array([model.shifted(known.q, one - known.q) for one in found])
+        scenarios = known.scenarios(self.kappa, (self.scenarios - 1) // 2)
+        scenarios = np.array([model.shifted(known.q, scenario - known.q) for scenario in scenarios])
         # The optimisation problem has a fixed number of scenarios; unused ones repeat the estimate.
-        q = np.vstack([found, np.tile(known.q, (self.scenarios - len(found), 1))])
+        q = np.vstack([scenarios, np.tile(known.q, (self.scenarios - len(scenarios), 1))])
         # A scenario on a bound can make the model degenerate (zero diffusivity), so scenarios stop
         # short of the bounds.
         q = np.clip(
@@ -540,12 +540,12 @@ class MPC:
         mpc.opt_x_num.master = memory
         mpc.solve()
         if mpc.solver_stats["return_status"] not in SOLVED:
-            why = f"Ipopt: {mpc.solver_stats['return_status']}: the inputs were held"
-            return Decision(before, why, memory)
+            reason = f"Ipopt: {mpc.solver_stats['return_status']}: the inputs were held"
+            return Decision(before, reason, memory)
         low, high = self.goal.range(model)
-        wanted = (mpc.opt_x_num["_u", 0, 0] * mpc._u_scaling).full().ravel()
+        inputs = (mpc.opt_x_num["_u", 0, 0] * mpc._u_scaling).full().ravel()
         solution = mpc.opt_x_num.master.full().ravel()
-        return Decision(np.clip(wanted, low, high), "ok", solution)
+        return Decision(np.clip(inputs, low, high), "ok", solution)
 
 
 @contextmanager

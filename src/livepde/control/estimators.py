@@ -130,8 +130,8 @@ class Kalman:
         t = number(t, "time t")
         if not math.isfinite(t):
             raise SampleError(f"time t must be a finite number; got {t}.")
-        seen, own, *_ = self._channels.parse(z, None)
-        noise = self._noise if own is None else np.where(np.isnan(own), self._noise, own)
+        measured, stated, *_ = self._channels.parse(z, None)
+        noise = self._noise if stated is None else np.where(np.isnan(stated), self._noise, stated)
         if not np.isnan(self._t):
             h = t - self._t
             if not h > 0.0:
@@ -140,7 +140,7 @@ class Kalman:
                 )
             self._predict(h, inputs)
         self._t = t
-        self._update(seen, noise, inputs)
+        self._update(measured, noise, inputs)
         r, offset = self.model.size, np.zeros(len(self.model.channels))
         offset[self._moving] = self._x[r:]
         return Known(
@@ -164,13 +164,13 @@ class Kalman:
         # Sensors see an offset only through the state that it drives.
         H = np.hstack([H, np.zeros((len(H), len(self._moving)))])
         used = np.isfinite(seen) & np.isfinite(expected)
-        H, missed = H[used], (seen - expected)[used]
+        H, innovation = H[used], (seen - expected)[used]
         S = H @ self._P @ H.T + np.diag(noise[used] ** 2)
         gain = np.linalg.solve(S, H @ self._P).T
-        self._x = self._x + gain @ missed
+        self._x = self._x + gain @ innovation
         # Joseph's form (I - K H) P (I - K H)^T + K R K^T stays symmetric and positive.
-        left = np.eye(len(self._x)) - gain @ H
-        self._P = left @ self._P @ left.T + (gain * noise[used] ** 2) @ gain.T
+        remaining = np.eye(len(self._x)) - gain @ H
+        self._P = remaining @ self._P @ remaining.T + (gain * noise[used] ** 2) @ gain.T
 
     def dump(self) -> bytes:
         """Return the state as bytes."""
@@ -303,47 +303,47 @@ class Learned:
                 "Learned: a sample of a loop contains the inputs applied since the last one; build "
                 f"the identifier with between={dict.fromkeys(lines, 'next')}."
             )
-        for what, mine, theirs in (
+        for kind, own, reduced in (
             ("sensors", identifier.observed.names, nominal.model.sensors.names),
             ("unknown numbers", identifier.model.parameter_space.labels, nominal.model.unknowns),
         ):
-            if list(mine) != list(theirs):
+            if list(own) != list(reduced):
                 raise ConfigurationError(
-                    f"Learned: the identifier has the {what} {list(mine)}, the reduced model "
-                    f"{list(theirs)}: reduce the identifier's model, with its sensors."
+                    f"Learned: the identifier has the {kind} {list(own)}, the reduced model "
+                    f"{list(reduced)}: reduce the identifier's model, with its sensors."
                 )
         self.identifier = identifier
         self.nominal = nominal
         self.trust = trust or Trust()
         self.estimate: Estimate | None = None
-        self._good = 0
+        self._trusted_samples = 0
 
     def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
         identifier, model = self.identifier, self.nominal.model
         self.estimate = estimate = identifier.step(t, z, inputs)  # a bad sample changes nothing
         # The nominal filter uses only the assimilated sensors.
-        seen, noise, *_ = identifier._channels.parse(z, inputs)
-        pairs = seen if noise is None else np.column_stack([seen, noise])
+        measured, noise, *_ = identifier._channels.parse(z, inputs)
+        pairs = measured if noise is None else np.column_stack([measured, noise])
         # The nominal filter runs at every sample, trusted or not, so that a fallback starts from a
         # converged state.
         nominal = self.nominal.step(estimate.t, pairs, inputs)  # a date as a number
         doubt = self.trust.doubt(estimate, model)
-        self._good = 0 if doubt else min(self._good + 1, self.trust.patience)
-        if self._good < self.trust.patience:
-            why = doubt or f"trusted only after {self.trust.patience} good samples in a row"
-            return replace(nominal, source="fallback", why=why)
+        self._trusted_samples = 0 if doubt else min(self._trusted_samples + 1, self.trust.patience)
+        if self._trusted_samples < self.trust.patience:
+            reason = doubt or f"trusted only after {self.trust.patience} good samples in a row"
+            return replace(nominal, source="fallback", why=reason)
         belief = estimate.belief
         root = belief.q_factor if belief.q_factor is not None else np.zeros((len(belief.q), 0))
         factor = model.numbers(root)
         x, q = model.project(estimate.u), model.numbers(estimate.q)
-        here = model.about(estimate.u, estimate.q, inputs) if model.frame.moves else None
-        return Known(x, q, factor, model=here)
+        local = model.about(estimate.u, estimate.q, inputs) if model.frame.moves else None
+        return Known(x, q, factor, model=local)
 
     def dump(self) -> bytes:
         leaves = {
             "identifier": np.frombuffer(self.identifier.dump(), dtype=np.uint8),
             "nominal": np.frombuffer(self.nominal.dump(), dtype=np.uint8),
-            "good": self._good,
+            "good": self._trusted_samples,
         }
         return packed({"kind": "learned"}, leaves)
 
@@ -353,4 +353,4 @@ class Learned:
             raise RunError(f"{where} is of another estimator: build it as it was then.")
         self.identifier.restore(leaves["identifier"].tobytes(), where)
         self.nominal.restore(leaves["nominal"].tobytes(), where)
-        self._good = int(leaves["good"])
+        self._trusted_samples = int(leaves["good"])

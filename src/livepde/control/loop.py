@@ -97,12 +97,12 @@ class Loop:
         model = controller.model
         low, high = controller.goal.range(model)
         if isinstance(estimator, Identifier):
-            given = dict(drive or {})
-            if not given:
+            amplitudes = dict(drive or {})
+            if not amplitudes:
                 width = np.where(np.isfinite(high - low), 0.1 * (high - low), 1.0)
-                given = dict(zip(model.controls, width.tolist(), strict=True))
+                amplitudes = dict(zip(model.controls, width.tolist(), strict=True))
             start = model.project(estimator.u0)
-            nominal = Kalman(model, controller.period, drive=given, x=start)
+            nominal = Kalman(model, controller.period, drive=amplitudes, x=start)
             estimator = Learned(estimator, nominal, trust)
         elif trust is not None:
             raise ConfigurationError("Loop: trust is for an Identifier; give it to `Learned`.")
@@ -157,9 +157,9 @@ class Loop:
             none.
         """
         controller, model = self.controller, self.controller.model
-        z, given = self._separated(labelled(z), inputs or {})
-        applied = _held(model.controls, self._before, given)
-        now = _held(model.disturbances, self._disturbances, given)
+        z, stated = self._separated(labelled(z), inputs or {})
+        applied = _held(model.controls, self._before, stated)
+        now = _held(model.disturbances, self._disturbances, stated)
         if missing := [n for n, v in zip(model.disturbances, now, strict=True) if np.isnan(v)]:
             raise SampleError(
                 f"input '{missing[0]}' has no value yet; send it with the first sample."
@@ -169,16 +169,16 @@ class Loop:
         plan = self._plan(reference or {}, forecast or {}, now, limits or {})
         # All arguments are validated before the estimator is stepped, so that an invalid sample
         # changes nothing.
-        known = self.estimator.step(t, z, channels)
+        belief = self.estimator.step(t, z, channels)
         self._before, self._disturbances = applied, now  # also if the controller raises an error
-        decision = self._possible(controller.decide(known, plan, applied, self._memory), applied)
+        decision = self._possible(controller.decide(belief, plan, applied, self._memory), applied)
         self._before, self._memory = decision.inputs, decision.memory
-        y = model.outputs(known.x, model.values(channels))
+        y = model.outputs(belief.x, model.values(channels))
         estimate = getattr(self.estimator, "estimate", None)
         return Action(
             t=number(t, "time t") if estimate is None else estimate.t,
             inputs=dict(zip(model.controls, decision.inputs.tolist(), strict=True)),
-            known=known,
+            known=belief,
             outputs=dict(zip(model.outputs.names, y.tolist(), strict=True)),
             status=decision.status,
             estimate=estimate,
@@ -191,28 +191,28 @@ class Loop:
             inputs = {name: z[name] for name in model.channels if name in z} | dict(inputs)
             # A channel that a sensor of the same name measures is both.
             z = {k: v for k, v in z.items() if k not in model.channels or k in model.sensors.names}
-        given = {name: number(v, f"input '{name}'") for name, v in inputs.items()}
-        for name in given:
+        named = {name: number(v, f"input '{name}'") for name, v in inputs.items()}
+        for name in named:
             if name not in model.channels:
                 raise SampleError(f"unknown input '{name}'; there are {list(model.channels)}.")
-        return z, given
+        return z, named
 
     def _possible(self, decision: Decision, applied: Array) -> Decision:
         """Return a decision within the actuator ranges, whatever the controller returned."""
-        model, found = self.controller.model, np.asarray(decision.inputs, dtype=float)
-        if found.shape != applied.shape:
+        model, inputs = self.controller.model, np.asarray(decision.inputs, dtype=float)
+        if inputs.shape != applied.shape:
             raise ConfigurationError(
-                f"{type(self.controller).__name__}.decide returned inputs of shape {found.shape}; "
+                f"{type(self.controller).__name__}.decide returned inputs of shape {inputs.shape}; "
                 f"the controls are {list(model.controls)}: return {applied.shape}."
             )
-        finite, status = np.isfinite(found), decision.status
+        finite, status = np.isfinite(inputs), decision.status
         if not finite.all():
-            found, status = applied, "an input that is not finite: the inputs were held"
-        inside = np.clip(found, *self.controller.goal.range(model))
-        if status == "ok" and not np.array_equal(inside, found):
+            inputs, status = applied, "an input that is not finite: the inputs were held"
+        clipped = np.clip(inputs, *self.controller.goal.range(model))
+        if status == "ok" and not np.array_equal(clipped, inputs):
             status = "an input beyond its range: it was set to the end of it"
         memory = decision.memory if finite.all() else self._memory
-        return Decision(inside, status, memory)
+        return Decision(clipped, status, memory)
 
     def _plan(
         self,
@@ -226,28 +226,28 @@ class Loop:
         for name, ends in _mapping(limits, "limits").items():
             if not isinstance(ends, tuple | list) or len(ends) != 2:
                 raise SampleError(f"limits['{name}'] must be (least, largest); got {ends!r}.")
-        found = []
+        sides = []
         for k, side in enumerate(("least", "largest")):
-            held = np.array([ends[k] for ends in goal.limits.values()])
-            given = {name: ends[k] for name, ends in limits.items()}
-            values = _ahead(given, tuple(goal.limits), held, count, "limits")
+            default = np.array([ends[k] for ends in goal.limits.values()])
+            stated = {name: ends[k] for name, ends in limits.items()}
+            values = _ahead(stated, tuple(goal.limits), default, count, "limits")
             # A controller has slack variables only for the limits that the goal has.
-            new = np.isinf(held) & np.isfinite(values).any(axis=0)
+            new = np.isinf(default) & np.isfinite(values).any(axis=0)
             if new.any():
                 name = list(goal.limits)[int(np.flatnonzero(new)[0])]
                 raise SampleError(
                     f"limits['{name}'] has a {side} value, and the goal has none; give one in "
                     "Goal.limits, so that the controller is built with it."
                 )
-            found.append(values)
-        crossed = (found[0] > found[1]).any(axis=0)
+            sides.append(values)
+        crossed = (sides[0] > sides[1]).any(axis=0)
         if crossed.any():
             name = list(goal.limits)[int(np.flatnonzero(crossed)[0])]
             raise SampleError(f"limits['{name}']: the least value is above the largest one.")
         return Plan(
             _ahead(reference, tuple(goal.track), None, count, "reference"),
             _ahead(forecast, model.disturbances, now, count, "forecast"),
-            *found,
+            *sides,
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -268,8 +268,8 @@ class Loop:
         where = str(path)
         header, leaves = checkpoint.unpacked(checkpoint.read(path), where)
         own = {"before": self._before, "disturbances": self._disturbances, "memory": self._memory}
-        fits = all(k in leaves and leaves[k].shape == mine.shape for k, mine in own.items())
-        if header.get("kind") != "loop" or not fits:
+        matches = all(k in leaves and leaves[k].shape == value.shape for k, value in own.items())
+        if header.get("kind") != "loop" or not matches:
             raise RunError(f"{where} is of another loop: build it as it was when it was saved.")
         self.estimator.restore(leaves["estimator"].tobytes(), where)
         self._before, self._memory = leaves["before"], leaves["memory"]
