@@ -104,7 +104,7 @@ def plate() -> lp.Model:
         ({"q": 1.2}, "k", wall, r"'q' is at 1.2, outside the mesh from 0 to 1"),
         ({"q": 1.0}, "k", wall, r"'q' is at 1, the end of the mesh; give the name of this end"),
         ({"q": "top"}, "k", wall, r"'q' is at 'top'; the mesh names \['left', 'right'\]"),
-        ({"q": 0.1}, "alpha", wall, r"no unknown 'alpha'; it has \['k'\]"),
+        ({"q": 0.1}, "alpha", wall, r"'alpha'; it has \['k'\]. Set conductivity"),
         ({"q": 0.1}, "k", lambda: wall(1), "two cells or more"),
         ({"q": "left"}, "k", plate, "requires a mesh of one dimension; use Functionals"),
     ],

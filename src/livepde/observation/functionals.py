@@ -124,7 +124,8 @@ def in_cells(parameter: FunctionSpace, mesh: Any, name: str) -> sp.csr_array:
     """Return the matrix from q to the mean of an unknown over each cell, shape (cells, m)."""
     if name not in parameter.names:
         raise ObservationError(
-            f"FluxPlates: the model has no unknown '{name}'; it has {list(parameter.names)}."
+            f"FluxPlates: the model has no unknown '{name}'; it has {list(parameter.names)}. Set "
+            "conductivity to the name of the unknown coefficient."
         )
     measure = Measure(mesh, 2)
     local = LocalSpace(parameter, measure)
