@@ -546,7 +546,7 @@ REFUSED = [
     ("bounds = [", "regions = { a = [0, 0.3], b = [0.2, 0.4] }\nbounds = [", "lies in 2 layers"),
     ("bounds = [", "regions = { a = [3, 4] }\nbounds = [", "contains no cell"),
     ('equation = "heat"', 'equation = "heet"', "did you mean 'heat'?"),
-    ("[law]", "[options]\nD = 1\n[law]", "has no 'D' here; expected one of unit"),
+    ("[law]", "[options]\nD = 1\n[law]", "has no 'D' here; expected one of"),
     ('kind = "sensitivity"', 'kind = "sensitive"', "law.kind: got 'sensitive'; did you mean"),
     (DRIFT, "refit = {strat = 3}", "did you mean 'start'?"),
     (DRIFT, "noise = -1", "law.noise: got -1"),

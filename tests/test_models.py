@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from factories import broad, last_state, observe
+from scipy.special import j0, jn_zeros
 from skfem import ElementLineP2
 
 import livepde as lp
@@ -440,3 +441,36 @@ def test_layers_with_gaps_or_overlaps_are_refused(name, regions, said):
 def test_a_heat_capacity_is_positive_everywhere(C, said):
     with pytest.raises(ModelError, match=said):
         conduction(lp.interval(0.0, 1.0, 10), lp.LogNormal(1.0, std=0.5), LEFT, C=C)
+
+
+@pytest.mark.parametrize(
+    ("coordinates", "shape", "rate"),
+    [
+        ("cylinder", lambda r: j0(jn_zeros(0, 1)[0] * r), jn_zeros(0, 1)[0] ** 2),
+        ("sphere", np.sinc, np.pi**2),
+    ],
+)
+def test_heat_around_an_axis_or_a_centre_decays_at_its_rate(coordinates, shape, rate):
+    model = heat(
+        lp.interval(0.0, 1.0, 40), lp.LogNormal(2.0, 1.0), {"right": 0.0}, coordinates=coordinates
+    )
+    places = {"centre": 0.0, "half": 0.5}
+    sensors, scheme = lp.Points(places, noise=1e-4), lp.Alexander2()
+    identifier = lp.Identifier(model, sensors, scheme=scheme, u0=lambda x: shape(x[0]))
+    for t in np.arange(0.0, 0.2, 0.005):
+        decayed = {name: shape(r) * np.exp(-1.3 * rate * t) for name, r in places.items()}
+        estimate = identifier.step(t, decayed)
+    assert estimate.parameters["alpha"][0] == pytest.approx(1.3, rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "coordinates", "told"),
+    [
+        (lp.interval(-1.0, 1.0, 4), "cylinder", "begins at -1; expected 0 or more"),
+        (lp.rectangle((0.0, 1.0), (0.0, 1.0), (2, 2)), "sphere", "requires an interval of radii"),
+        (lp.interval(0.0, 1.0, 4), "polar", "expected one of cartesian, cylinder, sphere"),
+    ],
+)
+def test_coordinates_that_do_not_fit_the_mesh(mesh, coordinates, told):
+    with pytest.raises(lp.errors.ModelError, match=told):
+        heat(mesh, lp.LogNormal(1.0, 1.0), coordinates=coordinates)

@@ -23,6 +23,7 @@ from livepde.cases.schema import (
 )
 from livepde.errors import CaseError, ModelError, NameClashError, SpaceError
 from livepde.fem.field_blocks import base_name
+from livepde.fem.measure import unweighted
 from livepde.model import Model
 from livepde.models import EQUATIONS, Exchange, Flux, Fluxes, Source, Variable, with_conditions
 from livepde.models.boundary_conditions import Amount, Multiple
@@ -294,7 +295,7 @@ def _wall_layers(case: CaseContent, model: Model) -> dict[str, float]:
     """Return label of a scalar conductivity -> thickness of its layer; empty without a wall."""
     name, space = case.equation.conductivity, model.parameter_space
     unit = case.equation.unknowns[name].unit if name else ""
-    if unit != "W/(m K)" or len(case.mesh.p) != 1:
+    if unit != "W/(m K)" or len(case.mesh.p) != 1 or model.state_space.weight is not unweighted:
         return {}
     lengths = np.ptp(case.mesh.p[0][case.mesh.t], axis=0) @ in_cells(space, case.mesh, name)
     rows = space.labels.items()

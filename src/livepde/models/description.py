@@ -13,6 +13,7 @@ import numpy as np
 from livepde.errors import ModelError
 from livepde.fem import Field, Integrand, Piecewise, Place, Scalars, Unknown
 from livepde.fem.fields import SIDES
+from livepde.fem.measure import unweighted
 from livepde.model import Model
 
 AMBIENT = "ambient"  # input of an exchange with the surroundings
@@ -29,6 +30,25 @@ def exchange(coefficient: Callable[[Any], Any]) -> list[Any]:
 def around_axis(x: Any) -> Any:
     """Return the volume element for a first coordinate that is the distance from an axis."""
     return x[0]
+
+
+POWERS = {"cartesian": 0, "cylinder": 1, "sphere": 2}
+"""Coordinates -> power of the radius in the volume element."""
+
+
+def volume_element(equation: str, mesh: Any, coordinates: str) -> Callable[[Any], Any]:
+    """Return the volume element of a mesh in coordinates by name."""
+    if coordinates not in POWERS:
+        text = f"coordinates = {coordinates!r}; expected one of {', '.join(POWERS)}."
+        raise ModelError(f"{equation}: {text}")
+    if coordinates == "sphere" and len(mesh.p) > 1:
+        raise ModelError(f"{equation}: coordinates = 'sphere' requires an interval of radii.")
+    if coordinates != "cartesian" and not mesh.p[0].min() >= 0.0:
+        text = f"the first coordinate is a radius, and begins at {mesh.p[0].min():g}; expected 0 "
+        raise ModelError(f"{equation}: {text}or more.")
+    # It is of order one, which keeps the matrices well scaled.
+    power, largest = POWERS[coordinates], float(mesh.p[0].max())
+    return (lambda x: (x[0] / largest) ** power) if power else unweighted
 
 
 @dataclass(frozen=True)
@@ -276,6 +296,7 @@ def everywhere(equation: str, mesh: Any, **unknowns: Any) -> None:
             )
 
 
+COORDINATES = Option("", "whether the first coordinate is a radius", "cartesian", tuple(POWERS))
 UNIT = Option("", "unit of the state, such as mg/l", "degC")
 INITIAL = Variable("", "initial state, a field; else the case's `initial`", optional=True)
 

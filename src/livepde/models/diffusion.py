@@ -15,6 +15,7 @@ from livepde.fem.measure import START, Measure
 from livepde.model import Model
 from livepde.models.description import (
     AMBIENT,
+    COORDINATES,
     UNIT,
     Equation,
     Fluxes,
@@ -24,6 +25,7 @@ from livepde.models.description import (
     everywhere,
     exchange,
     one_number,
+    volume_element,
 )
 
 
@@ -37,6 +39,7 @@ def heat(
     source: fem.Unknown | None = None,
     element: Any = None,
     unit: str = "degC",
+    coordinates: str = "cartesian",
 ) -> Model:
     """Return u_t - div(alpha grad u) + loss (u - ambient) = source in any dimension.
 
@@ -66,11 +69,14 @@ def heat(
         Element of the state; by default of first order.
     unit
         Unit of u.
+    coordinates
+        "cartesian"; or "cylinder" or "sphere", where the first coordinate is the radius.
 
     Raises
     ------
     ModelError
-        `transfer` is given, but every boundary has a value.
+        `transfer` is given, but every boundary has a value; a radius is negative, or a mesh around
+        a centre is not an interval.
 
     Examples
     --------
@@ -80,7 +86,7 @@ def heat(
     ('T0',)
     """
     unknowns = {"alpha": alpha, "loss": loss, "transfer": transfer, "source": source}
-    return _model(HEAT, mesh, unknowns, dirichlet, lambda x: 1.0, element, unit)
+    return _model(HEAT, mesh, unknowns, dirichlet, lambda x: 1.0, element, unit, coordinates)
 
 
 def conduction(
@@ -94,6 +100,7 @@ def conduction(
     source: fem.Unknown | None = None,
     element: Any = None,
     unit: str = "degC",
+    coordinates: str = "cartesian",
 ) -> Model:
     """Return C u_t - div(k grad u) + loss (u - ambient) = source with heat capacity C.
 
@@ -104,7 +111,7 @@ def conduction(
 
     Parameters
     ----------
-    mesh, dirichlet, element, unit
+    mesh, dirichlet, element, unit, coordinates
         See `heat`.
     k
         Conductivity in W/(m K).
@@ -145,7 +152,7 @@ def conduction(
             f"conduction: the heat capacity C must be positive everywhere; its least value is "
             f"{smallest:g}."
         )
-    return _model(CONDUCTION, mesh, unknowns, dirichlet, capacity, element, unit)
+    return _model(CONDUCTION, mesh, unknowns, dirichlet, capacity, element, unit, coordinates)
 
 
 def _model(
@@ -156,9 +163,16 @@ def _model(
     capacity: Callable[[fem.Place], Any],
     element: Any,
     unit: str,
+    coordinates: str,
 ) -> Model:
     everywhere(equation.name, mesh, **{equation.conductivity: unknowns[equation.conductivity]})
-    field = fem.Field(mesh, element or fem.linear(mesh), dirichlet=dict(dirichlet or {}), unit=unit)
+    field = fem.Field(
+        mesh,
+        element or fem.linear(mesh),
+        dirichlet=dict(dirichlet or {}),
+        unit=unit,
+        weight=volume_element(equation.name, mesh, coordinates),
+    )
     # Omit terms whose unknown is not given, and their inputs.
     used = {key: unknown for key, unknown in unknowns.items() if unknown is not None}
     # The equation is divided by an unknown heat capacity. The form is linear in the ratios, which
@@ -226,7 +240,7 @@ HEAT = Equation(
         "source": Variable("K/s", "heat gained over heat capacity", True),
     },
     inputs=SURROUNDINGS,
-    options={"unit": UNIT},
+    options={"unit": UNIT, "coordinates": COORDINATES},
     build=by_name(heat),
     element=fem.linear,
     fluxes=Fluxes("K m/s", "m/s", "K/s"),
@@ -246,7 +260,10 @@ CONDUCTION = Equation(
         "source": Variable("W/m^3", "heat gained", True),
     },
     inputs=SURROUNDINGS,
-    options={"C": Option("J/(m^3 K)", "volumetric heat capacity")},
+    options={
+        "C": Option("J/(m^3 K)", "volumetric heat capacity"),
+        "coordinates": COORDINATES,
+    },
     build=by_name(conduction),
     element=fem.linear,
     fluxes=Fluxes("W/m^2", "W/(m^2 K)", "W/m^3"),
