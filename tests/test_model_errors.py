@@ -555,6 +555,12 @@ def test_the_level_follows_from_fit_and_effect(of, doubted, level):
     assert sum(finding.what == "effect" for finding in more.findings) == (level != "trusted")
 
 
+def test_intervals_that_are_the_plain_ones_are_not_told_apart_from_others():
+    """The table had one column of intervals, and the remedy named others."""
+    same = ModelErrors(1.6, 0.05, {"T": 1.6}, (Allowed("c", "", 1.0, 0.9, 1.1, 0.9, 1.1, 1.0),))
+    assert same.remedy == "The plain intervals include these errors."
+
+
 def test_one_unknown_that_is_too_uncertain_leaves_the_others_their_use():
     wide, narrow = errors(0.8, 9.0), Allowed("c", "", 1.0, 0.8, 1.3, 0.99, 1.01, 12.0)
     misfit = Finding("misfit", "do not trust", "Model misfit.")

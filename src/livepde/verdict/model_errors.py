@@ -188,6 +188,8 @@ class ModelErrors:
         if self.failed:
             return "Do not use the estimates. Find the error in the model or the data first."
         if not (useless := self.useless):
+            if not self.differ:
+                return "The plain intervals include these errors."
             return "Use these intervals: the others assume an exact model."
         if len(useless) == len(self.asked):
             return "These intervals are too wide to use. Find the error first."
