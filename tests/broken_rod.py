@@ -1,7 +1,5 @@
 """Readings of rods by their own finite differences, and what broken sensors make of them."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

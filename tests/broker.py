@@ -1,7 +1,5 @@
 """A message broker of one's own."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import socket

@@ -1,7 +1,5 @@
 """A real browser, and what a page shows in it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from contextlib import contextmanager

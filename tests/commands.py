@@ -1,7 +1,5 @@
 """Commands as users give them: in this process, in one of their own, or as a service."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 import signal

@@ -4,8 +4,6 @@ Of livepde its damping rules are used, and nothing of its forms, spaces or stage
 assembled by loops over elements, with the integrals over omega apart from those over the rest.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any

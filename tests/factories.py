@@ -1,7 +1,5 @@
 """Meshes, models and measurements that several test files use."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ The rod is u_t = 0.3 u_xx - 0.4 u + s + c x + Q on (0, 1) with u(0) = T_0, linea
 are unknown numbers, and so is an offset that all sensors share.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """A rod whose rows come from a file that grows, and its run."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Ports of one's own."""
 
-from __future__ import annotations
-
 import socket
 
 

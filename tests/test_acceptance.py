@@ -1,7 +1,5 @@
 """Accepted stages are solved: the run with a constant mu against strict solves, in every unit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

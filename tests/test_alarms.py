@@ -1,7 +1,5 @@
 """Jumps from the case file to the report, what the data have told, and the benchmark of alarms."""
 
-from __future__ import annotations
-
 import json
 from functools import cache
 from itertools import pairwise

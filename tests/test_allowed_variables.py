@@ -1,7 +1,5 @@
 """Which environment variables a case may send to a server."""
 
-from __future__ import annotations
-
 import socket
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The battery particle: against the sphere with a constant flux, balances, and twins."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

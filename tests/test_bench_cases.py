@@ -1,7 +1,5 @@
 """The benchmark of the cases: means over seeds, checks, failures as rows, the page."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """The benchmarks of runs for months, in small: they measure what they say, and can fail."""
 
-from __future__ import annotations
-
 import shutil
 from collections import Counter
 from dataclasses import replace

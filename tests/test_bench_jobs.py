@@ -1,7 +1,5 @@
 """Fits that a user would write find the truths of other codes: what livepde is timed against."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The benchmark suite on a tiny problem: truth, offline fit, scores, rows that cannot run."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The suite that asv runs: it finds the numbers of `python -m benchmarks`, here at quick sizes."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import shutil

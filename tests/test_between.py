@@ -1,7 +1,5 @@
 """How inputs behave between two readings: lines, values that hold, and means since the last one."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections import deque

@@ -1,7 +1,5 @@
 """Large coupled stages by blocks: the same results as by one factor, in few iterations."""
 
-from __future__ import annotations
-
 import tracemalloc
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Both figures of the paper: reduced runs; `livepde reproduce boiger2016` makes all of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

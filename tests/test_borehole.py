@@ -1,7 +1,5 @@
 """The grouted borehole: against steady states, balances, the line source, and a twin."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

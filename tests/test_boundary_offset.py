@@ -1,7 +1,5 @@
 """An unknown offset of a boundary value: `offset` of a channel of role boundary."""
 
-from __future__ import annotations
-
 import pandas as pd
 import pytest
 from factories import short_rod

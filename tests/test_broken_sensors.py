@@ -1,7 +1,5 @@
 """Sensors that break, and processes that are disturbed: what was learned before stays."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Case files: what they may say, what is refused, and the shipped ones on real measurements."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import subprocess
@@ -363,8 +361,7 @@ def test_sensitivity_options(rod):
 @pytest.mark.slow
 def test_the_level_of_the_noise_is_found(rod):
     path = rod(
-        (DRIFT, 'noise = "auto"'),
-        ('kind = "sensitivity"', 'kind = "sensitivity"\ngate = 9'),
+        (DRIFT, 'noise = "auto"'), ('kind = "sensitivity"', 'kind = "sensitivity"\ngate = 9')
     )
     case = cases.load(path)
     assert (case.law.noise, case.law.gate) == ("auto", 9.0)

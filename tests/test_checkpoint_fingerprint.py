@@ -1,7 +1,5 @@
 """A checkpoint continues the problem that it was saved by, and no other."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from functools import cache

@@ -1,7 +1,5 @@
 """The command line as users meet it: output, files, exit codes."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """`livepde fleet`: a run directory for each row of a table."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

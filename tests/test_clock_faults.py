@@ -4,8 +4,6 @@ The right samples of each run follow from a definition: of the rows that come, t
 later than all used ones are used, each at the time that it states, and once.
 """
 
-from __future__ import annotations
-
 import math
 from zoneinfo import ZoneInfo
 
@@ -112,10 +110,7 @@ def test_a_block_that_comes_again_with_new_rows(tmp_path):
     block = [*given[60:71], lost, *given[71:110]]
     run = run_of(tmp_path, [*given[:100], *block, *given[110:]], source=AtOnce)
     run.run()
-    assert run.journal.counts == {
-        ("repeated", ""): 40,
-        **{("late", name): 1 for name in COLUMNS},
-    }
+    assert run.journal.counts == {("repeated", ""): 40, **{("late", name): 1 for name in COLUMNS}}
     same_run(run, given, tmp_path / "alone")
 
 

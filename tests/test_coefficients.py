@@ -1,7 +1,5 @@
 """Numbers computed from the unknowns, in which a form is linear: the numbers of the plain form."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One wrong column of the data, late, scaled, off, in another unit or exchanged, is named first."""
 
-from __future__ import annotations
-
 import shutil
 from functools import cache
 from pathlib import Path

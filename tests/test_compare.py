@@ -1,7 +1,5 @@
 """`livepde compare`: variants of a case side by side, and the one that is recommended."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

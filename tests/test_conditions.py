@@ -1,7 +1,5 @@
 """Fluxes, exchange and sources as conditions of a model and of a case: known, measured, unknown."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 The truth is a code of its own: finite volumes with a resistance between two cells, no layer.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A reduced model is the full one in few coordinates; what a loop does with it, and when it may."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from datetime import datetime, timedelta
 from importlib.util import find_spec

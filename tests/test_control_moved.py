@@ -1,7 +1,5 @@
 """Loops whose reduced model follows the estimate: unknown fields, models that are not linear."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any

@@ -1,7 +1,5 @@
 """The room behind the wall, the battery particle, and do-mpc's moving horizon in the loop."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from typing import Any
 

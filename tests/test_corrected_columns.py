@@ -1,7 +1,5 @@
 """Keys of a channel that correct its column: `factor` and `late`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Damping rules, and the operators M and N of the paper."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

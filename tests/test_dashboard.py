@@ -1,7 +1,5 @@
 """The live page: figures of datasets, the view of a run, and the page in a real browser."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -580,10 +578,7 @@ def test_many_runs_are_a_table(several):
     assert told.children == "2 runs."
     titles = [cell.children for cell in table.children[0].children.children]
     # The marginal of alpha, which is log-normal, has no single number for its width.
-    assert titles[4:] == [
-        "alpha [m²/s], median ± first-order std. dev.",
-        "loss [1/s] ± std. dev.",
-    ]
+    assert titles[4:] == ["alpha [m²/s], median ± first-order std. dev.", "loss [1/s] ± std. dev."]
     rows = {row.children[0].children.children: row.children for row in table.children[1].children}
     assert {*rows} == {"east", "north west"}
     assert rows["north west"][0].children.href == "/run/north%20west/"

@@ -1,7 +1,5 @@
 """The examples of a service: what they call exists, and does what it should."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """The shipped checks pass on good objects and name what is wrong with bad ones."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,9 +80,7 @@ def test_a_form_that_is_not_analytic_is_found():
 @pytest.mark.slow
 def test_a_form_that_is_not_linear_in_q_has_its_derivatives_checked():
     model = lp.Model(
-        lp.Field(line(6), ElementLineP1()),
-        lp.Normal(1.0),
-        A=lambda q, u, v, x: q**2 * u * v,
+        lp.Field(line(6), ElementLineP1()), lp.Normal(1.0), A=lambda q, u, v, x: q**2 * u * v
     )
     report = check_model(model, u=1.0)
     report.raise_if_failed()

@@ -1,7 +1,5 @@
 """One, two and three dimensions: orders of convergence, boundary values g(t, x), any omega."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

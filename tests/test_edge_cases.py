@@ -1,7 +1,5 @@
 """Edge cases of models, samples and checkpoints, each by its smallest example."""
 
-from __future__ import annotations
-
 import math
 from datetime import datetime, timedelta
 

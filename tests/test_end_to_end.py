@@ -1,7 +1,5 @@
 """From a broker to a browser: real soil temperatures, replayed through all of it."""
 
-from __future__ import annotations
-
 import json
 import queue
 import re

@@ -1,7 +1,5 @@
 """Every ready-made equation and every kind of unknown passes the shipped checks: random draws."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any

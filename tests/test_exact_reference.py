@@ -3,8 +3,6 @@
 A part of the settings, meshes and rules of the experiment, with the bounds of all of it.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

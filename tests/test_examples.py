@@ -1,7 +1,5 @@
 """Every example runs and finds what it says; every equation has its page."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import json

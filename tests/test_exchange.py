@@ -1,7 +1,5 @@
 """Units for other programs (FMI), and online learners: the numbers are those of the identifier."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math
@@ -25,11 +23,7 @@ from benchmarks.__main__ import app as benchmarks
 from benchmarks.fmu import compare_fmu, running
 from livepde.cases import load
 from livepde.cli import app
-from livepde.exchange import (
-    OnlineRegressor,
-    export_fmu,
-    river_regressor,
-)
+from livepde.exchange import OnlineRegressor, export_fmu, river_regressor
 from livepde.exchange.fmu_export import recipe_of
 from livepde.exchange.unit_process import REFUSED, WAITING, Component, of_code
 from livepde.models import heat

@@ -1,7 +1,5 @@
 """Runs in formats of other programs, read back with their readers."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import re

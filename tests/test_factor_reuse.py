@@ -1,7 +1,5 @@
 """A factor that is kept from step to step."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

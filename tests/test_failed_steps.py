@@ -1,7 +1,5 @@
 """Numbers that no step can take: the step fails, the estimate of before stays, the next goes on."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -14,10 +12,7 @@ from livepde.errors import LinearAlgebraError, SampleError
 from livepde.laws import numerical
 from livepde.models import heat
 
-LAWS = {
-    "sensitivity": lp.SensitivityLaw(),
-    "gradient": lp.GradientLaw(),
-}
+LAWS = {"sensitivity": lp.SensitivityLaw(), "gradient": lp.GradientLaw()}
 
 
 def rod(law: Any) -> lp.Identifier:

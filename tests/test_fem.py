@@ -1,7 +1,5 @@
 """Weak forms: matrices, vectors and derivatives against formulas; upwinding."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 
@@ -86,10 +84,7 @@ def test_matrices_are_those_of_scikit_fem(integrand, mesh, element, where):
     ("mesh", "element"),
     [
         (lp.interval(0, 1, 7), ElementLineP2()),
-        (
-            MeshTri().refined(2).with_boundaries({"left": lambda x: x[0] == 0}),
-            ElementTriP2(),
-        ),
+        (MeshTri().refined(2).with_boundaries({"left": lambda x: x[0] == 0}), ElementTriP2()),
     ],
 )
 def test_boundary_terms(mesh, element):

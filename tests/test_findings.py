@@ -3,8 +3,6 @@
 The list of findings is read from the source: a new one without its two runs fails here.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Callable
 from dataclasses import dataclass

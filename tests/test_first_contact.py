@@ -1,7 +1,5 @@
 """What a user of pandas and xarray types first, without our documentation."""
 
-from __future__ import annotations
-
 import pickle
 from functools import cache
 

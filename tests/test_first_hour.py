@@ -3,8 +3,6 @@
 The page itself is run by tests/test_pages.py, word for word.
 """
 
-from __future__ import annotations
-
 import re
 import tomllib
 

@@ -1,7 +1,5 @@
 """A fleet: the numbers of separate identifiers, whatever happens to some of its members."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np
@@ -26,10 +24,7 @@ def rod(prior=ALPHA, **alpha):
     """Two unknowns; inputs in the boundary values and beside an unknown."""
     ends = {"left": lp.Channel("T_0"), "right": 0.0}
     return heat(
-        line(16),
-        lp.Scalar(prior, unit="m^2/s", **alpha),
-        ends,
-        loss=lp.Normal(0.3, std=0.2),
+        line(16), lp.Scalar(prior, unit="m^2/s", **alpha), ends, loss=lp.Normal(0.3, std=0.2)
     )
 
 
@@ -245,11 +240,7 @@ def test_a_member_that_fails_does_not_disturb_the_others():
                 inputs["T_0"][2] = 1e308
             yield t, z, inputs
 
-    for model, guards in (
-        (rod(), None),
-        (rod(), lp.laws.Guards()),
-        (rod(BOUNDED), None),
-    ):
+    for model, guards in ((rod(), None), (rod(), lp.laws.Guards()), (rod(BOUNDED), None)):
         fleet, estimate = compare(model, law(guards=guards), stream)
         assert fleet.together
         assert estimate.ok.all()
@@ -340,9 +331,7 @@ def test_other_models_step_one_by_one_and_say_so(build, why):
 def test_sensors_that_see_an_unknown_step_one_by_one():
     model = rod().with_unknowns({"offset": lp.Normal(0.0, std=0.1)})
     sensors = lp.Points(
-        {"T_1": 0.3, "T_2": 0.5, "T_3": 0.8},
-        noise=0.02,
-        direct={"T_1": lambda q, x: q.offset},
+        {"T_1": 0.3, "T_2": 0.5, "T_3": 0.8}, noise=0.02, direct={"T_1": lambda q, x: q.offset}
     )
     fleet, _ = compare(model, LAWS["plain"], sensors=sensors)
     assert "sensors" in fleet.note

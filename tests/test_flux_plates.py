@@ -1,7 +1,5 @@
 """Heat-flux plates as sensors, an unknown heat capacity with them, and R and U of a wall."""
 
-from __future__ import annotations
-
 import json
 import math
 import tomllib

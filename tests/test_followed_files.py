@@ -1,7 +1,5 @@
 """Files that grow while they are rotated, cut, copied, written again, or end in NUL bytes."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import threading

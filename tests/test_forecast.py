@@ -1,7 +1,5 @@
 """What sensors will show, without anything being learned; copies; a controller in the loop."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

@@ -3,8 +3,6 @@
 Data are those of a line; a sheet has them, too, as its sides are closed.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any

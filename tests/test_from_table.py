@@ -1,7 +1,5 @@
 """`livepde init --data`: what a table tells is filled in, what it does not tell is named."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib
@@ -58,11 +56,7 @@ def test_a_table_of_a_german_excel(here, encoding):
         **how,
     }
     assert found["channels"] == {
-        "Tiefe_5_cm": {
-            "role": "sensor",
-            "column": "Tiefe 5 cm [°C]",
-            "at": "5 cm",
-        },
+        "Tiefe_5_cm": {"role": "sensor", "column": "Tiefe 5 cm [°C]", "at": "5 cm"},
         "Fühler": {"role": "sensor", "column": "Fühler (0,2 m)", "at": "0.2 m"},
     }
     assert "steps" not in found
@@ -224,7 +218,7 @@ def test_numbered_columns_are_one_line(here):
     row = ",".join("1" for _ in names)
     found = begun(f"time_s,{','.join(names)}\n0,{row}\n1,{row}\n")
     assert found["channels"] == {
-        "u": {"role": "sensor", "column": "u_{}", "each": ["? m", "? m", 12]},
+        "u": {"role": "sensor", "column": "u_{}", "each": ["? m", "? m", 12]}
     }
 
 

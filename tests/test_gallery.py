@@ -1,7 +1,5 @@
 """The gallery shows every case and every experiment with its figure, its table and its command."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from pathlib import Path

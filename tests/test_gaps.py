@@ -1,7 +1,5 @@
 """Gaps and spikes of input and boundary channels: interpolated, refused, counted and told."""
 
-from __future__ import annotations
-
 import math
 from contextlib import ExitStack
 from pathlib import Path

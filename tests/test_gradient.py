@@ -1,7 +1,5 @@
 """The paper's law: energy, the coupled stage, damping, missing samples."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

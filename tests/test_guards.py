@@ -1,7 +1,5 @@
 """Guards: trouble without them, none with them, and nothing at all where all is well."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Cases that ask for too much: one sentence, before anything is spent."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

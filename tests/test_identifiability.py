@@ -1,7 +1,5 @@
 """What a belief says to be pinned, flat, traded off, at a bound."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The identifier: bad input, inputs that are held, checkpoints, and what a result holds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -368,10 +366,7 @@ def test_numbers_where_something_else_is_expected():
     [
         ((SENSORS, rod(), lp.SensitivityLaw()), "as model, got Points"),
         ((rod(), lp.SensitivityLaw(), SENSORS), "as observation, got Sensitivity"),
-        (
-            (rod(), SENSORS, lp.SensitivityLaw),
-            "as law, got .*Law'>: call it",
-        ),
+        ((rod(), SENSORS, lp.SensitivityLaw), "as law, got .*Law'>: call it"),
         ((rod(), SENSORS, "gradient"), "as law, got 'gradient'"),
     ],
 )

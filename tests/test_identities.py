@@ -1,7 +1,5 @@
 """Identities of estimates that hold whatever the options are, over options drawn at random."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -162,7 +160,7 @@ def model(motion: str, calibrated: bool, multiplies: bool, frame: Frame) -> lp.M
     )
 
 
-def observation(calibrated: str, frame: Frame) -> lp.Observation:
+def observation(calibrated: str, frame: Frame) -> lp.observation.Observation:
     size, places = frame.state, {name: PLACES[name] for name in frame.order}
     noise = NOISE * size
     curve = 0.2 / size if calibrated == "curve" else 0.0

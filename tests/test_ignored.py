@@ -1,7 +1,5 @@
 """Validation sensors count against a run; those that are ignored do not."""
 
-from __future__ import annotations
-
 import pandas as pd
 import pytest
 from commands import call

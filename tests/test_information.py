@@ -1,7 +1,5 @@
 """GradientLaw(gain="auto"): the law tunes itself."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -404,8 +402,7 @@ def test_what_the_data_taught_does_not_depend_on_how_well_a_stage_is_solved() ->
 def test_noise_is_detected(noise: float) -> None:
     model, twin = rod(cells=40)
     detector = NoiseDetector(
-        observe(model, twin.observation),
-        observe(model, twin.observation).split(),
+        observe(model, twin.observation), observe(model, twin.observation).split()
     )
     balance = Balance.none(39, model.X.dim)
     rng, told = np.random.default_rng(0), []

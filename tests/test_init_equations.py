@@ -1,7 +1,5 @@
 """`livepde init --equation X` for every equation: filled in, the case runs as written."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass, field
@@ -128,10 +126,7 @@ FILLED = {
     "burgers": Filled(WAVES, on(0, 4) | RING, {"nu": 0.2}, 0.1),
     "kdv": Filled(WAVES, on(0, 4) | RING, {"advection": 1.0, "dispersion": 0.05}, 0.05),
     "kuramoto_sivashinsky": Filled(
-        WAVES,
-        on(0, 4) | RING,
-        {"advection": 1.0, "instability": 1.0, "damping": 0.5},
-        0.05,
+        WAVES, on(0, 4) | RING, {"advection": 1.0, "instability": 1.0, "damping": 0.5}, 0.05
     ),
     "allen_cahn": Filled(WAVES, on(0, 4) | RING, {"D": 0.1, "r": 1.0}, 0.1),
     "groundwater": Filled(

@@ -1,7 +1,5 @@
 """An initial state with errors of its own: random fields, and what the laws learn of them."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

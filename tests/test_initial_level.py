@@ -1,7 +1,5 @@
 """A u0 that is made of readings is as uncertain as they are, also where their noise is found."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

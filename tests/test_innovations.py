@@ -1,7 +1,5 @@
 """The factor on deviations: one for white innovations, by theory for those that are not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The mistakes that a newcomer makes most: one sentence each, and nothing is written."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Callable, Sequence

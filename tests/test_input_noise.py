@@ -1,7 +1,5 @@
 """Noise of input channels, and of readings that an initial state is made of, in the intervals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from factories import INTERPOLATED_ROD_CASE, filter_alone

@@ -1,7 +1,5 @@
 """The benchmark that counts how often the truth lies in the interval."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

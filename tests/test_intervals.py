@@ -1,7 +1,5 @@
 """Intervals of unknowns: quantiles that go through a transform and stay within bounds."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +15,7 @@ MESH = lp.interval(0.0, 1.0, 8)
 TIMES = 0.1 * np.arange(1, 11)
 
 
-def identifier(law: lp.AnyLaw | None = None, **unknowns: Any) -> lp.Identifier:
+def identifier(law: lp.laws.AnyLaw | None = None, **unknowns: Any) -> lp.Identifier:
     model = lp.Model(
         lp.Field(MESH, ElementLineP1(), dirichlet={"boundary": 0.0}),
         unknowns,

@@ -1,7 +1,5 @@
 """The journal: what a kill, a full disk, a damaged or a hostile file make of it."""
 
-from __future__ import annotations
-
 import csv
 import itertools
 import json
@@ -169,8 +167,7 @@ class Breaks:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("method", "waits"),
-    halved(["accept", "append", "commit", "checkpoint", "step"], [True, False]),
+    ("method", "waits"), halved(["accept", "append", "commit", "checkpoint", "step"], [True, False])
 )
 def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(
     tmp_path, monkeypatch, method, waits
@@ -1078,10 +1075,7 @@ def test_a_page_that_hides_rows_is_found(tmp_path):
         damaged = bytearray(content)
         damaged[page + 3 : page + 5] = (count - 1).to_bytes(2)
         path.write_bytes(damaged)
-        with (
-            pytest.raises(lp.errors.RunError, match="is damaged"),
-            Journal.open(path) as kept,
-        ):
+        with pytest.raises(lp.errors.RunError, match="is damaged"), Journal.open(path) as kept:
             list(kept)
         hidden += 1
     assert hidden > 10

@@ -1,7 +1,5 @@
 """The JSON schema of case files: it accepts what the program accepts, and says what keys mean."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Sudden changes are flagged soon, hardly ever without cause, and learned without a restart."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import islice
 from typing import Any
@@ -42,12 +40,7 @@ def run(law: lp.SensitivityLaw, stream: Any, guess: float = NOISE, **options: An
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("seed", "refit", "change"),
-    [
-        (0, None, 0.8),
-        (0, lp.Refit(), 1.2),
-        (1, None, 1.2),
-        (1, lp.Refit(), 0.8),
-    ],
+    [(0, None, 0.8), (0, lp.Refit(), 1.2), (1, None, 1.2), (1, lp.Refit(), 0.8)],
 )
 def test_a_jump_of_a_fifth_is_flagged_and_learned(refit: Any, change: float, seed: int):
     def a(t: float) -> float:

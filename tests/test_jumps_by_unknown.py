@@ -1,7 +1,5 @@
 """A flux may jump while a material constant stays, and one jump does not hide the next."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path

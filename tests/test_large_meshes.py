@@ -1,7 +1,5 @@
 """Forms on large meshes, piece by piece and element by element: the numbers of small ones."""
 
-from __future__ import annotations
-
 import factories
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Latent values stay within a stated number of prior deviations; the filter stays linear."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

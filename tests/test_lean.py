@@ -1,7 +1,5 @@
 """The lean reference and the filters as arrays, against our law and against naive loops."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.linalg import sqrtm

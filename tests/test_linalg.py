@@ -1,7 +1,5 @@
 """Fixed patterns, block assembly, and engines that agree with dense algebra."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec

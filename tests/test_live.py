@@ -1,7 +1,5 @@
 """Runs beside a process: journal, resume after a kill, rows out of order."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """`Result.log_evidence`: the same readings count whatever the gate refuses."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tables as loggers write them: hours that clocks show twice, titles and units around a header."""
 
-from __future__ import annotations
-
 import json
 import math
 import tomllib

@@ -1,7 +1,5 @@
 """Pauses of more substeps than a step may have, long steps, and samples that are taken again."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 from pathlib import Path

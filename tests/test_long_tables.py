@@ -1,7 +1,5 @@
 """Tables with a row for each reading (long format): a column of sensors and one of values."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock

@@ -1,7 +1,5 @@
 """Stages and states of several members: the numbers of one after the other."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Mesh files, periodic boundaries, and boundary values of vectors."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The process M u' + B(u) + A(u) q = F: data, components, algebraic equations."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -415,10 +413,7 @@ def electrolyte(held: bool = True, mass: Any = None) -> lp.Model:
         "c": lp.Field(MESH, ElementLineP1(), dirichlet=inflow),
         "phi": lp.Field(MESH, ElementLineP1(), dirichlet={"right": 0.0} if held else {}),
     }
-    unknowns = {
-        "D": lp.LogNormal(0.3, 0.2),
-        "sigma": lp.LogNormal(1.0, 0.5),
-    }
+    unknowns = {"D": lp.LogNormal(0.3, 0.2), "sigma": lp.LogNormal(1.0, 0.5)}
 
     def fluxes(q: Any, u: Any, v: Any, x: Any) -> Any:
         diffusion = q.D * lp.dot(lp.grad(u.c), lp.grad(v.c))

@@ -1,7 +1,5 @@
 """Intervals that allow for errors of the model, and the level that follows from fit and effect."""
 
-from __future__ import annotations
-
 import json
 import math
 from functools import cache
@@ -17,15 +15,7 @@ from livepde.laws.error_columns import SMALL, ErrorColumns
 from livepde.laws.model_errors import linear_model, model_errors
 from livepde.laws.stored_samples import StoredSamples
 from livepde.streams import AbsoluteNoise, Twin
-from livepde.verdict import (
-    Allowed,
-    Cause,
-    Finding,
-    ModelErrors,
-    Shifts,
-    Verdict,
-    discretised,
-)
+from livepde.verdict import Allowed, Cause, Finding, ModelErrors, Shifts, Verdict, discretised
 from livepde.verdict.evidence import NU, TEMPER, Causes, Family, LinearModel, Mixture, averaged
 
 

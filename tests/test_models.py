@@ -1,7 +1,5 @@
 """Ready-made equations against formulas: heat, columns, waves, populations."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from factories import broad, last_state, observe

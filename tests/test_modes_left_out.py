@@ -1,7 +1,5 @@
 """How much of the interval of a field is that of modes that the law leaves out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from skfem import ElementLineP1

@@ -1,7 +1,5 @@
 """Moving and transformed unknowns: the Kalman filter, refits, checkpoints, the theory."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -75,9 +73,7 @@ MOVING = {
 def test_unknowns_that_move_are_not_fitted(name: str):
     unknown, drift = MOVING[name]
     model = lp.Model(
-        lp.Field(mesh, ElementLineP1()),
-        {"k": unknown},
-        A=lambda q, u, v, x: q.k * u * v,
+        lp.Field(mesh, ElementLineP1()), {"k": unknown}, A=lambda q, u, v, x: q.k * u * v
     )
     points = lp.Points([0.5], noise=NOISE)
     identifier = lp.Identifier(model, points, lp.SensitivityLaw(drift=drift), u0=1.0)
@@ -312,9 +308,7 @@ def test_a_run_finds_the_most_probable_parameter():
 
 def test_the_excitation_of_a_transformed_unknown_is_that_at_the_estimate():
     model = lp.Model(
-        lp.Field(mesh, ElementLineP1()),
-        lp.LogNormal(2.0, 1.0),
-        A=lambda q, u, v, x: q * u * v,
+        lp.Field(mesh, ElementLineP1()), lp.LogNormal(2.0, 1.0), A=lambda q, u, v, x: q * u * v
     )
     full = observe(model, lp.Full())
     excitation = Excitation(Spaces(model, full), window=0.5)

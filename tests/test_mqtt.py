@@ -1,7 +1,5 @@
 """A real broker: rows come, are acknowledged when they are safe, and come again after a crash."""
 
-from __future__ import annotations
-
 import gc
 import json
 import logging

@@ -1,7 +1,5 @@
 """Names that would stand for two things in a run's dataset are refused before the run."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

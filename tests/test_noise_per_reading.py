@@ -1,7 +1,5 @@
 """Noise of a single reading: in samples, cases, fleets, journals and checkpoints."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """Burgers, Korteweg-de Vries, Kuramoto-Sivashinsky, Allen-Cahn: exact solutions, checks, data."""
 
-from __future__ import annotations
-
 import importlib.util
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Notebooks run from their folder, and agree with the tool that the field uses."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """R and P from the discrete null space of G, and sensor functions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

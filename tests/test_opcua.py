@@ -1,7 +1,5 @@
 """A real OPC UA server: changes come as rows, also after it was away."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import threading

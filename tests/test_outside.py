@@ -1,7 +1,5 @@
 """The study of what laws find outside the observed part: its data fit its sensors, all laws run."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

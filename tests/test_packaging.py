@@ -1,7 +1,5 @@
 """What a release is made of: one version everywhere, the changelog, how to cite, completion."""
 
-from __future__ import annotations
-
 import datetime as dt
 import re
 import shutil

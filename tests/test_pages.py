@@ -12,8 +12,6 @@ that holds links to `cases` and `examples`. What a block is says the word behind
 A block with title="FILE" is a file of that name for the blocks after it.
 """
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import csv
@@ -47,8 +45,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 FENCE = re.compile(
-    r'^```(?P<kind>\w*)(?: title="(?P<title>[^"]+)")?\n(?P<text>.*?)^```$',
-    re.MULTILINE | re.DOTALL,
+    r'^```(?P<kind>\w*)(?: title="(?P<title>[^"]+)")?\n(?P<text>.*?)^```$', re.MULTILINE | re.DOTALL
 )
 ALIKE = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 COMPLETES = ROOT / "cases" / "soil_layers.toml"  # gives what a part of a case leaves out
@@ -70,16 +67,16 @@ ELSEWHERE = {
     ],
     "test_dashboard.py::test_watch_says_where_and_ends_with_ctrl_c": ["livepde watch"],
     "test_dashboard.py::test_the_page_follows_a_run_and_looks_back": [
-        "livepde run mycase/case.toml --watch",
+        "livepde run mycase/case.toml --watch"
     ],
     "test_dashboard.py::test_a_solid_is_drawn_and_a_token_is_asked_for": [
-        "LIVEPDE_TOKEN=... livepde watch",
+        "LIVEPDE_TOKEN=... livepde watch"
     ],
     "test_service.py::test_it_follows_a_file_stops_gracefully_and_goes_on": [
-        "livepde run case.toml",
+        "livepde run case.toml"
     ],
     "test_end_to_end.py::test_soil_from_a_broker_to_a_browser": [
-        "livepde run cases/soil_layers.toml --realtime",
+        "livepde run cases/soil_layers.toml --realtime"
     ],
     "test_petsc.py::test_examples_find_their_truth_on_two_ranks": [
         "mpirun -n 4 /opt/livepde/bin/python",

@@ -1,7 +1,5 @@
 """The paper: its settings, and the table of what is where."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Samples from Parquet files."""
 
-from __future__ import annotations
-
 import builtins
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """`gain="auto"` on partial data: refused with derivatives of u in A, unsmoothed without."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A field outside of the part that is observed: found as far as the dynamics carry, else honest."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

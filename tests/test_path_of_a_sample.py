@@ -1,7 +1,5 @@
 """The path of one sample in CONTRIBUTING.md is the one that a profiler sees."""
 
-from __future__ import annotations
-
 import cProfile
 import pstats
 import re

@@ -1,7 +1,5 @@
 """Pauses of a logger, clocks that leap and units of time that change: named, and outlived."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any

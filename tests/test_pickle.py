@@ -1,7 +1,5 @@
 """Estimates and results are pickled with their values, models with what they were made of."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 import subprocess

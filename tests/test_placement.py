@@ -1,7 +1,5 @@
 """Advice on one more sensor: what it promises is what the sensor does."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -72,9 +70,7 @@ def test_a_field_counts_with_its_mean_over_the_domain(rod: Path):
     assert 0 < found.then["alpha"] < found.now["alpha"] < 1
 
 
-WALK = {
-    "unknowns.alpha.evolution": {"kind": "random-walk", "rate": "1e-6 m^2/s/s^0.5"},
-}
+WALK = {"unknowns.alpha.evolution": {"kind": "random-walk", "rate": "1e-6 m^2/s/s^0.5"}}
 
 
 @pytest.mark.long

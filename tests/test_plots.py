@@ -1,7 +1,5 @@
 """Figures: what is drawn, and what is said where nothing can be."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import warnings

@@ -1,7 +1,5 @@
 """Point sensors: uncertain positions, components of vectors."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -63,10 +61,7 @@ def test_shifts_are_found_and_what_they_cost_is_in_the_interval():
         std = belief.q_std
         inside += abs(belief.q[0] - k) < 1.96 * std[0]
         shifts_inside += int((np.abs(belief.q[1:] - shifts) < 1.96 * std[1:]).sum())
-    assert one.model.parameter_space.labels.keys() == {
-        "k",
-        *(f"position[{name}]" for name in AT),
-    }
+    assert one.model.parameter_space.labels.keys() == {"k", *(f"position[{name}]" for name in AT)}
     assert inside >= 9
     assert shifts_inside >= 26
 

@@ -1,7 +1,5 @@
 """The public face: what is exported, what is imported, what is drawn."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import inspect

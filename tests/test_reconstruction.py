@@ -259,14 +259,8 @@ def once(z, how, delta=None):
         (lambda: once([1.0], Tikhonov()), "Discrepancy needs the noise level"),
         (lambda: once([1.0, 2.0], Tikhonov()), "shape"),
         (lambda: once([1.0], Tikhonov(), -1.0), "delta must be a positive"),
-        (
-            lambda: once([1.0], Tikhonov(lambda u, v, x: u * lp.grad(v)[0], 1.0)),
-            "not symmetric",
-        ),
-        (
-            lambda: once([1.0], Tikhonov(lambda u, v, x: x.t * u * v, 1.0)),
-            "may not depend on time",
-        ),
+        (lambda: once([1.0], Tikhonov(lambda u, v, x: u * lp.grad(v)[0], 1.0)), "not symmetric"),
+        (lambda: once([1.0], Tikhonov(lambda u, v, x: x.t * u * v, 1.0)), "may not depend on time"),
         (lambda: Tikhonov("H7"), "expected 'X', 'V'"),
         (lambda: Tikhonov("V", -1.0), "alpha must be a number >= 0"),
         (lambda: Discrepancy(tau=0.0), "tau must be a positive"),
@@ -306,9 +300,7 @@ def test_the_gradient_law_uses_and_reports_it():
 @pytest.mark.slow
 def test_checked_contract_of_the_law():
     lp.diagnostics.check_law(
-        lp.GradientLaw(gain=100.0),
-        lambda law: identifier(Tikhonov("V"), dt_max=0.04),
-        samples(),
+        lp.GradientLaw(gain=100.0), lambda law: identifier(Tikhonov("V"), dt_max=0.04), samples()
     ).raise_if_failed()
 
 

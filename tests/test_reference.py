@@ -3,8 +3,6 @@
 livepde itself is not used here: what is tested is what livepde is compared with.
 """
 
-from __future__ import annotations
-
 import ast
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The refit: the best fit of stored samples, against SciPy on a forward model of its own."""
 
-from __future__ import annotations
-
 import copy
 import math
 import threading
@@ -136,10 +134,7 @@ def test_the_filter_goes_on_from_the_fit():
     for t, z in stream():
         who.step(t, z)
     samples, found = fitted(who)
-    one, other = (
-        samples.updated(found.best, found.used),
-        samples.judged(found.best, found.used),
-    )
+    one, other = (samples.updated(found.best, found.used), samples.judged(found.best, found.used))
     assert one is not None
     assert other is not None
     std = np.linalg.norm(other.C[0], axis=0)

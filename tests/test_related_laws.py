@@ -1,7 +1,5 @@
 """The laws of the experiment: Baumeister et al. (1997) and Kügler (2010)."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -41,11 +39,7 @@ def identifier(model: lp.Model, observation: lp.observation.Observation, law: An
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("law", "observation"),
-    [
-        (BaumeisterLaw(100.0), lp.Full()),
-        (KueglerLaw(100.0), lp.Full()),
-        (KueglerLaw(100.0), PART),
-    ],
+    [(BaumeisterLaw(100.0), lp.Full()), (KueglerLaw(100.0), lp.Full()), (KueglerLaw(100.0), PART)],
 )
 def test_contract(law: Any, observation: lp.observation.Observation) -> None:
     model = excited(10)

@@ -1,7 +1,5 @@
 """The published and stated experiments show the numbers they must."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

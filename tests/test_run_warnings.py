@@ -1,7 +1,5 @@
 """What a run says against its own estimates."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

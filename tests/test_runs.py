@@ -1,7 +1,5 @@
 """The loop of a run, its directory, and what it says in numbers."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -17,16 +15,7 @@ import livepde as lp
 from livepde import runs
 from livepde.models import heat
 from livepde.result import Result
-from livepde.runs import (
-    Check,
-    RunWriter,
-    Table,
-    checks_of,
-    drive,
-    measures,
-    tables,
-    verdict,
-)
+from livepde.runs import Check, RunWriter, Table, checks_of, drive, measures, tables, verdict
 from livepde.runs.directory import attempted, markdown, plain
 from livepde.runs.summary import digits
 

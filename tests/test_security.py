@@ -1,7 +1,5 @@
 """What comes from outside is read, never run; too large, refused; who asks must be allowed to."""
 
-from __future__ import annotations
-
 import hashlib
 import http.client
 import io

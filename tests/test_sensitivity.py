@@ -1,7 +1,5 @@
 """The sensitivity law: against closed forms, through refits, bounds, drift and modes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from factories import excited, excited_q, excited_u, laplace, line, observe, truth

@@ -1,7 +1,5 @@
 """Sensors of every kind: exact values for polynomials, derivatives, and what they identify."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sentences that users read: plain terms of the field, and no more digits than six."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """`livepde run` beside a process, as a service would start and stop it."""
 
-from __future__ import annotations
-
 import json
 import math
 import signal

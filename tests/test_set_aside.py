@@ -1,7 +1,5 @@
 """What may be wrong with a sensor that is set aside, and the variants that test it."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What step, mesh and input lines have shifted an estimate by: predicted against actual shifts."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A shard: the numbers of separate identifiers, from a stream with an offset."""
 
-from __future__ import annotations
-
 import os
 import runpy
 import signal

@@ -1,7 +1,5 @@
 """Where estimates and logs go, what happens when they cannot, and what reaches standard error."""
 
-from __future__ import annotations
-
 import io
 import json
 import logging

@@ -1,7 +1,5 @@
 """Sensors that respond slowly: against finite differences and closed forms of our own."""
 
-from __future__ import annotations
-
 import math
 from copy import deepcopy
 from dataclasses import replace
@@ -18,13 +16,7 @@ from livepde.cases.proposals import proposed
 from livepde.cases.read import parse
 from livepde.cases.remedies import freed, held, with_settings
 from livepde.cases.variants import Variant, VariantRun
-from livepde.errors import (
-    CaseError,
-    ConfigurationError,
-    LawError,
-    ModelError,
-    ObservationError,
-)
+from livepde.errors import CaseError, ConfigurationError, LawError, ModelError, ObservationError
 from livepde.models import heat
 from livepde.observation import Averages, Moving, Slow
 from livepde.stepping import Advance, Alexander2, ForwardStage

@@ -1,7 +1,5 @@
 """The smoother against dense least squares over all times, and what it leaves as it was."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 

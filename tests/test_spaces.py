@@ -1,22 +1,10 @@
 """Hilbert spaces: Gram matrix, Riesz map, modes, operators with adjoints; H^s."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.linalg as sl
 import scipy.sparse as sp
-from factories import (
-    CASES,
-    excited,
-    excited_q,
-    excited_u,
-    few,
-    laplace,
-    line,
-    product,
-    reaction,
-)
+from factories import CASES, excited, excited_q, excited_u, few, laplace, line, product, reaction
 from skfem import ElementLineHermite, ElementLineP1, ElementQuadBFS, ElementTriP1, MeshTri
 
 import livepde as lp

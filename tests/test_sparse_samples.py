@@ -1,7 +1,5 @@
 """Unknowns that move between sparse samples, against the exact filter and smoother."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

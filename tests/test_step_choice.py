@@ -4,8 +4,6 @@ Truths come from `benchmarks.first_hour.moved`, cells that move with the water: 
 scheme nor mesh with the package.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any

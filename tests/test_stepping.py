@@ -1,7 +1,5 @@
 """Time schemes, the nonlinear iteration, substeps and failures."""
 
-from __future__ import annotations
-
 import functools
 from itertools import pairwise
 
@@ -13,16 +11,7 @@ from skfem import ElementLineHermite, ElementLineP1, ElementTriP1, MeshTri
 import livepde as lp
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Pattern, analyse
-from livepde.stepping import (
-    End,
-    ForwardStage,
-    Held,
-    Interval,
-    Near,
-    StepFailed,
-    advance,
-    simulate,
-)
+from livepde.stepping import End, ForwardStage, Held, Interval, Near, StepFailed, advance, simulate
 
 SCHEMES = {"euler": lp.ImplicitEuler(), "alexander": lp.Alexander2()}
 

@@ -1,7 +1,5 @@
 """Studies as commands: `python -m experiments NAME`, with --quick, --json and --out."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

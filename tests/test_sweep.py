@@ -1,7 +1,5 @@
 """Passes over stored samples by products with small matrices: those of the stages one by one."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

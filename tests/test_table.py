@@ -1,7 +1,5 @@
 """Samples from CSV files and JSON lines."""
 
-from __future__ import annotations
-
 import math
 import re
 from contextlib import closing

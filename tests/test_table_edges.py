@@ -1,7 +1,5 @@
 """Where a table begins, ends or has gaps, and files whose clocks differ."""
 
-from __future__ import annotations
-
 import gzip
 import re
 from pathlib import Path
@@ -123,10 +121,7 @@ def test_the_clock_of_one_of_several_files_is_corrected_before_they_are_joined(t
         ahead = table[[time, "T_left"]].assign(**{time: table[time] + shift})
         ahead.to_csv(path.parent / "ends.csv", index=False)
         table[[time, *others]].to_csv(path.parent / "sensors.csv", index=False)
-        settings = {
-            "data.file": ["sensors.csv", "ends.csv"],
-            "channels.T_left.late": f"{shift} s",
-        }
+        settings = {"data.file": ["sensors.csv", "ends.csv"], "channels.T_left.late": f"{shift} s"}
         found = cases.load(path, settings=settings).prepare().raw
         assert found is not None
         np.testing.assert_allclose(found.t, plain.t)

@@ -1,7 +1,5 @@
 """The theory of the paper, computed: constants, error bounds, T*, excitation, link conditions."""
 
-from __future__ import annotations
-
 import importlib
 import json
 from dataclasses import replace

@@ -6,8 +6,6 @@ one comes in. That finds what is shared in a few trials, each of which sleeps el
 harder, with 100 trials of each law: `make test-threads`.
 """
 
-from __future__ import annotations
-
 import copy
 import inspect
 import os

@@ -1,7 +1,5 @@
 """Twin experiments: truth apart from the estimator, noise as stated, errors against the truth."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

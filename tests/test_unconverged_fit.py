@@ -1,7 +1,5 @@
 """A refit that ends without a minimum: the verdict reports it, and the estimate is kept."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from factories import driven_rod, line, readings

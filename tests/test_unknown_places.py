@@ -1,7 +1,5 @@
 """An unknown number anywhere in the process or in a sensor is found, with an honest deviation."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 
@@ -141,9 +139,7 @@ def test_an_unknown_in_a_sensor_is_found_with_one_in_the_process(what: str):
         unknowns["gain"] = lp.Scalars(("A", "B"), lp.Normal(1.0, 0.2))
         truth["gain"] = [1.1, 0.9]
         sensors = lp.observation.Calibrated(
-            points,
-            lambda y, q, x: y * np.array([q.gain["A"], q.gain["B"], 1.0]),
-            noise=NOISE,
+            points, lambda y, q, x: y * np.array([q.gain["A"], q.gain["B"], 1.0]), noise=NOISE
         )
     else:
         unknowns["R"] = lp.Normal(0.1, 0.1)

@@ -1,7 +1,5 @@
 """Unknowns that are positive, bounded, named, moving, nonlinear, or make the initial state."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 
@@ -106,10 +104,7 @@ def test_models_in_latent_coefficients_pass_the_checks(name: str):
 @settings(max_examples=15, deadline=None)
 @given(st.floats(0.2, 3.0), st.floats(0.2, 3.0), st.integers(0, 100))
 def test_residuals_nonlinear_in_q_pass_the_checks(k: float, s: float, seed: int):
-    unknowns = {
-        "k": lp.LogNormal(k, 0.3 * k),
-        "S": lp.LogNormal(s, 0.3 * s),
-    }
+    unknowns = {"k": lp.LogNormal(k, 0.3 * k), "S": lp.LogNormal(s, 0.3 * s)}
 
     def A(q: Any, u: Any, v: Any, x: Any) -> Any:
         return q.k / q.S * (1 + u**2) * lp.dot(lp.grad(u), lp.grad(v)) - x.t / q.S * v

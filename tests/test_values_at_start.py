@@ -1,7 +1,5 @@
 """Values of inputs at the initial time where no sample gives them: what u0 states, and what not."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

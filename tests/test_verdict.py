@@ -1,7 +1,5 @@
 """A run judges itself: what speaks against it is found, named, and said no louder than it is."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import cache

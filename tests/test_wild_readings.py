@@ -1,7 +1,5 @@
 """A law without a covariance, and one reading of 9999."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

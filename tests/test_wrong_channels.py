@@ -1,21 +1,12 @@
 """`python -m benchmarks first-hour --wrong`: tables with one wrong channel, and what names it."""
 
-from __future__ import annotations
-
 import tomllib
 
 import numpy as np
 import pytest
 
 from benchmarks.first_hour import FOLDER, TABLES
-from benchmarks.wrong_channels import (
-    FAULTS,
-    SCALE,
-    Fault,
-    first_named,
-    with_fault,
-    wrong_channels,
-)
+from benchmarks.wrong_channels import FAULTS, SCALE, Fault, first_named, with_fault, wrong_channels
 from livepde.verdict import Cause, Finding, Verdict
 
 HEADER = ["t", "a", "b", "switch"]
