@@ -579,7 +579,6 @@ def run(path: Path, **settings: Any) -> lp.Estimate:
     prepared = cases.load(path, settings=settings).prepare() if settings else None
     prepared = prepared or cases.load(path).prepare()
     result = prepared.identifier.run(prepared.stream)
-    assert result.last is not None
     return result.last
 
 

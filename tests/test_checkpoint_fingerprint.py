@@ -83,11 +83,10 @@ def saved() -> bytes:
 def test_a_checkpoint_of_another_problem_is_refused(case):
     changed, message = CASES[case]
     other = rod(**changed)
+    before = other.dump()
     with pytest.raises(lp.errors.RunError, match=message):
         other.restore(saved())
-    # Nothing has changed: it begins as if nothing had been tried.
-    again = rod(**changed)
-    np.testing.assert_array_equal(other.step(0.1, [0.05]).q, again.step(0.1, [0.05]).q)
+    assert other.dump() == before
 
 
 @pytest.mark.parametrize(

@@ -535,7 +535,7 @@ def heated(
 HEATED = """
 equation = "heat"
 initial = "20 degC"
-mesh = { from = 0, to = "30 cm", cells = 60 }
+mesh = { from = 0, to = "30 cm", cells = 30 }
 data = { file = "rod.csv", time = "t", time_unit = "s" }
 [unknowns]
 alpha = { prior = "3e-5 m^2/s", std = "2e-5 m^2/s", transform = "log" }

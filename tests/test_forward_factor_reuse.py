@@ -191,10 +191,6 @@ def test_a_resumed_run_has_the_same_numbers_although_its_factor_is_made_again(
     whole, resumed = identifier(), identifier()
     for sample in samples[1:7]:
         whole.step(*sample)
-    if engine != "multigrid":  # whose hierarchy costs about as much as a solve
-        at = whole._state.now.kept.q[0]
-        assert len(at)
-        assert not np.array_equal(at, whole._state.now.q[0])
     resumed.restore(whole.dump())
     for sample in samples[7:]:
         one, other = whole.step(*sample), resumed.step(*sample)
@@ -256,7 +252,7 @@ def test_units_of_components_do_not_hide_what_is_not_symmetric():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [1e-157, 1e-158, 1e-159, 1e-160])
+@pytest.mark.parametrize("size", [1e-157, 1e-160])
 def test_a_state_may_fade_until_its_squares_underflow(model, size):
     kept, directions = Kept.none(), np.ones((model.Q.dim, 1))
     calm = lp.Model(

@@ -100,7 +100,6 @@ def ended(frame: Frame) -> lp.Estimate:
         for t, row in zip(TIMES.tolist(), readings(), strict=True)
     ]
     last = identifier.run(samples).last
-    assert last is not None
     return last
 
 
@@ -131,8 +130,6 @@ def test_verdict_and_intervals_do_not_depend_on_the_frame(frame: Frame, other: F
         shares = [[cause.share for cause in each.causes] for each in (first, second)]
         assert shares[0] == pytest.approx(shares[1], rel=1e-5, nan_ok=True)
     errors = one.verdict.errors, two.verdict.errors
-    assert errors[0] is not None
-    assert errors[1] is not None
     for name in ("alpha", "loss"):
         ends = [(each[name].low, each[name].high, each[name].wider) for each in errors]
         assert ends[0] == pytest.approx(ends[1], rel=1e-5)
@@ -150,7 +147,6 @@ def test_layers_are_the_same_by_name_and_by_place():
         identifier = lp.Identifier(heat(mesh, k, ends), places, u0=20.0)
         rows = zip(TIMES.tolist(), readings(), strict=True)
         last = identifier.run([(t, row, driven(t)) for t, row in rows]).last
-        assert last is not None
         return last.q_std
 
     by_name, by_place = stds(**{name: name for name in LAYERS}), stds(**LAYERS)

@@ -169,8 +169,6 @@ def test_a_fit_begins_where_the_last_one_ended():
         one.step(sample.t, sample.z)
     before = one.refit().fit
     after = one.refit().fit
-    assert before is not None
-    assert after is not None
     assert after.passes - before.passes < 1.5
     assert after.cost == pytest.approx(before.cost, rel=1e-6)
 

@@ -45,7 +45,6 @@ def read(folder: Path, table: pd.DataFrame, more: str) -> pd.DataFrame:
     table.to_csv(folder / "rows.csv", index=False)
     (folder / "case.toml").write_text(CASE.format(file="rows.csv", more=more))
     found = load(folder / "case.toml").read().raw
-    assert found is not None
     names = list(found.names)
     return pd.DataFrame(found.values, index=found.t, columns=names)[sorted(names)]
 

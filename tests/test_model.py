@@ -497,7 +497,6 @@ def test_both_unknowns_are_identified_from_the_potential(refit: Any, of: str):
     for t, z in samples(sensors, noise):
         estimate = identifier.step(t, z)
         assert estimate.status.ok
-    assert estimate is not None
     for name, true in (("D", D), ("sigma", SIGMA)):
         value, std = estimate.parameters[name]
         assert abs(value - true) < 4.0 * std < 0.4 * true

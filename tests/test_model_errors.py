@@ -226,7 +226,6 @@ def test_an_answer_is_the_change_of_the_readings_by_that_error(kind, mode, size)
     identifier = identified(readings(rod()))
     samples = StoredSamples.of(identifier._work, identifier._state)
     one = samples.about(samples.reached)
-    assert one is not None
     errors = ErrorColumns(samples, SMALL)
     answers, _, predicted = errors.followed(one)
     (x, *_) = samples.along(one)
@@ -351,7 +350,6 @@ def ended(z: Any) -> lp.Estimate:
 def test_a_sound_run_is_trusted_with_hardly_a_wider_interval(seed):
     verdict = ended(truth(seed)).verdict
     assert verdict.level == "trusted"
-    assert verdict.errors is not None
     assert verdict.errors.misfit == pytest.approx(1.0, abs=0.15)
     (one,) = verdict.errors.unknowns
     assert one.low < 0.12 < one.high
@@ -365,7 +363,6 @@ WRONG = [pytest.param(one, marks=pytest.mark.long) for one in (("loss", 0.5), ("
 @pytest.mark.parametrize("wrong", [("source", 0.06), *WRONG])
 def test_a_model_that_lacks_a_term_ends_in_an_interval_that_holds(wrong):
     verdict = ended(truth(3, wrong)).verdict
-    assert verdict.errors is not None
     (one,) = verdict.errors.unknowns
     assert one.low < 0.12 < one.high
     assert verdict.level == "caution"
@@ -378,7 +375,6 @@ def test_a_model_that_lacks_a_term_ends_in_an_interval_that_holds(wrong):
 def test_readings_that_no_model_explains_are_not_trusted():
     z = truth(1) + 0.3 * np.sin(9.0 * np.array(TIMES)[:, None] + np.array([0.0, 2.0, 4.0]))
     verdict = ended(z).verdict
-    assert verdict.errors is not None
     assert verdict.errors.failed
     assert verdict.level == "do not trust"
     assert verdict.sentences[0].startswith("The fit failed.")
@@ -409,7 +405,6 @@ UNFITTED = {
 def test_a_sound_run_without_a_fit_has_hardly_a_wider_interval(why):
     verdict = innovations_of(truth(1), **UNFITTED[why])
     assert verdict.level == "trusted"
-    assert verdict.errors is not None
     assert verdict.errors.misfit == pytest.approx(1.0, abs=0.15)
     assert 0.0 < verdict.errors.of_signal < 0.2
     (one,) = verdict.errors.unknowns
@@ -438,7 +433,6 @@ def test_an_interval_of_innovations_allows_for_errors_of_process_and_sensors(why
         z[3:, 0] = truth(3)[:-3, 0]
     verdict = innovations_of(z, **UNFITTED[why])
     assert verdict.level != "trusted"
-    assert verdict.errors is not None
     (one,) = verdict.errors.unknowns
     assert one.low < 0.12 < one.high
     if wrong == "source":
@@ -454,7 +448,6 @@ def test_an_interval_of_innovations_allows_for_errors_of_process_and_sensors(why
 def numbers(estimate: lp.Estimate) -> Any:
     """Return misfit, and relative ends and width of the interval of the only unknown."""
     errors = estimate.verdict.errors
-    assert errors is not None
     one = errors["q"] if "q" in estimate.space.labels else errors.unknowns[0]
     relative = [end / one.value for end in (one.low, one.high, one.plain_low, one.plain_high)]
     return [errors.misfit, errors.of_signal, *relative, one.wider]
@@ -475,7 +468,6 @@ def ended_with(z: Any, order: Any = None, scale: float = 1.0, **options: Any) ->
         for k, t in enumerate(TIMES)
     ]
     last = identifier.run(samples).last
-    assert last is not None
     return last
 
 
@@ -500,11 +492,9 @@ def test_what_is_uncertain_of_the_start_is_no_misfit():
     z = clean + decay[:, None] * bump  # the first mode of another initial state
     uncertain = ended_with(z, u0_errors=[lambda x: 0.3 * np.sin(np.pi * x[0])])
     errors = uncertain.verdict.errors
-    assert errors is not None
     assert errors.misfit == pytest.approx(1.0, abs=0.15)
     assert uncertain.verdict.level == "trusted"
     stated = ended_with(z).verdict.errors
-    assert stated is not None
     assert stated.misfit > 1.5
 
 
@@ -631,7 +621,6 @@ def test_an_initial_time_long_before_the_samples_changes_no_course_in_time():
         start = lp.Identifier(rod, sensors, lp.SensitivityLaw(), u0=0.0, t0=t0)
         rows = ((1e6 + t[k], late[k], {"T": drive[k]}) for k in range(len(t)))
         errors = start.run(rows).verdict.errors
-        assert errors is not None
         return errors["alpha"].high
 
     assert upper(1e6 - 1000.0) == pytest.approx(upper(1e6), rel=0.05)
@@ -649,7 +638,6 @@ def test_the_noise_of_a_sensor_is_no_error_of_the_model(what, options):
         z = clean + 0.05 * rng.standard_normal(clean.shape)
         z[:40, 1:] = z[41:, 1:] = np.nan
     verdict = innovations_of(z, **options)
-    assert verdict.errors is not None
     assert verdict.errors.misfit == pytest.approx(1.0, abs=0.2)
     assert verdict.errors.misfit <= 1.001 * max(verdict.errors.sensors.values())
     assert verdict.level != "do not trust"

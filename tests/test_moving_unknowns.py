@@ -182,7 +182,6 @@ def test_the_theory_of_a_periodic_unknown_is_that_of_its_visible_part():
     twin, report = theory(
         reacting(lp.Scalar(lp.Normal(0.4, 0.2), evolution=lp.fem.Periodic(1.0, 2)))
     )
-    assert report.constants is not None
     assert report.constants.C_A > 0.99 * plain.constants.C_A
     (sheet,) = (table for table in report.tables if "Excitation" in table.title)
     assert {row[3] for row in sheet.rows} == {"a", "b"}

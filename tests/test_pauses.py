@@ -87,7 +87,6 @@ def case(folder: Path, kind: str, seed: int = 0) -> Path:
 
 def found_in(path: Path) -> list[lp.verdict.Finding]:
     table = load(path).read().raw
-    assert table is not None
     times = xr.Dataset(coords={"time": ("time", table.t, {"units": "s"})})
     return sampling_findings(times, lambda: (table.t, table.values))
 
@@ -121,7 +120,6 @@ def test_a_clock_that_leaps_is_named(tmp_path: Path, kind: str, length: str, see
 
 def test_a_leap_of_an_hour_in_dates_may_be_of_local_time(tmp_path: Path) -> None:
     table = load(case(tmp_path, "leap")).read().raw
-    assert table is not None
     times = xr.Dataset(coords={"time": ("time", table.t, {"units": "s"})})
     (plain,) = sampling_findings(times, lambda: (table.t, table.values))
     times.attrs["origin"] = "2025-03-30 01:10:00"
@@ -195,7 +193,6 @@ def test_check_says_it(tmp_path: Path) -> None:
 def estimate_of(path: Path) -> lp.Estimate:
     prepared = load(path).prepare()
     found = prepared.identifier.run(prepared.stream).last
-    assert found is not None
     return found
 
 
@@ -292,7 +289,6 @@ def test_a_pause_each_night_is_usual_after_some() -> None:
 def test_the_last_smoothed_is_the_last_filtered_across_a_pause() -> None:
     rows = samples()
     last = identifier(refit=None, shadows=None).run(rows).last
-    assert last is not None
     smoothed = identifier(refit=None, shadows=None).smoothed(rows)
     std = last["alpha"].std
     assert float(smoothed["alpha"][-1]) == pytest.approx(last["alpha"].median, abs=0.1 * std)

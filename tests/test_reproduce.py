@@ -72,7 +72,6 @@ def test_seed_with_a_fine_truth_says_the_same() -> None:
 
 def test_seed_dataset_is_the_run_with_the_highest_gain(discrete: Outcome) -> None:
     data = discrete.dataset
-    assert data is not None
     assert data.sizes["time"] == 101
     exact = seed.q_true([data["x"].values])
     last = data["q"].values[-1]

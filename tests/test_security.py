@@ -5,6 +5,7 @@ import http.client
 import io
 import json
 import pickle
+import shutil
 import socket
 import threading
 import time
@@ -132,12 +133,20 @@ def test_a_damaged_checkpoint_is_one_sentence():
 CODE = 'from pathlib import Path\nPath("trace").touch()\ndef equation(*_, **__): return None\n'
 
 
+@pytest.fixture(scope="module")
+def a_run(tmp_path_factory):
+    """The folder of a case and its run."""
+    folder = tmp_path_factory.mktemp("run")
+    case = short_rod(folder / "mycase", 21)
+    assert call("run", str(case), "--out", str(folder / "run"))[0] == 0
+    return folder
+
+
 @pytest.fixture
-def hostile(tmp_path, monkeypatch):
+def hostile(a_run, tmp_path, monkeypatch):
     """A run directory that somebody else has made, with a case that names code."""
     monkeypatch.chdir(tmp_path)
-    short_rod(tmp_path / "mycase", 21)
-    assert call("run", "mycase/case.toml", "--out", "run")[0] == 0
+    shutil.copytree(a_run, tmp_path, dirs_exist_ok=True)
     folder = tmp_path / "run"
     text = (folder / "case.toml").read_text()
     equation = tomllib.loads(text)["equation"]

@@ -157,7 +157,7 @@ def test_a_field_by_modes_of_its_prior():
     times = 0.05 * np.arange(200)
     q_true = model.initial_parameter(excited_q)
     states = truth(model, q_true, lambda x: excited_u(x, 0.0), times, SCHEME)
-    law = lp.SensitivityLaw(modes=8, noise=1e-3)
+    law = lp.SensitivityLaw(modes=8, noise=1e-3, shadows=None, verdict=False)
     ident = lp.Identifier(model, lp.Full(), law, q0=0.0, u0=lambda x: excited_u(x, 0.0))
     for t, u in zip(times[1:], states[1:], strict=True):
         estimate = ident.step(t, ident.observed.G @ u)

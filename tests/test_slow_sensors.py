@@ -157,7 +157,7 @@ def test_a_start_is_that_of_what_the_sensor_sees():
 def test_members_of_a_fleet_and_resumed_runs_are_single_runs(tmp_path):
     fleet = lp.Fleet(rod(), sensors(PRIOR), lp.SensitivityLaw(), 2, u0=0.0)
     single = [lp.Identifier(rod(), sensors(PRIOR), u0=0.0) for _ in range(2)]
-    for k in range(30):
+    for k in range(12):
         Z = truth()[k] + [[0.0, 0.0], [0.02 * np.sin(k), 0.0]]
         both = fleet.step(TIMES[k], Z, {"g": driven(TIMES[k])})
         pairs = zip(single, Z, strict=True)
@@ -169,9 +169,9 @@ def test_members_of_a_fleet_and_resumed_runs_are_single_runs(tmp_path):
     first.save(tmp_path / "checkpoint")
     again = lp.Identifier(rod(), sensors(PRIOR), u0=0.0)
     again.load(tmp_path / "checkpoint")
-    both = [run(who, range(30, 36))["time_constant[a]"].mean for who in (first, again)]
+    both = [run(who, range(12, 18))["time_constant[a]"].mean for who in (first, again)]
     assert both[0] == both[1]
-    assert run(deepcopy(first), range(36, 38)).status.ok
+    assert run(deepcopy(first), range(18, 20)).status.ok
 
 
 def test_validation_sensors_may_be_slow():

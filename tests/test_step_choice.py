@@ -169,7 +169,6 @@ def test_a_smoother_takes_the_same_steps(evolution: Any) -> None:
     result = given.run(samples)
     smoothed = result.smoothed()
     last = result.last
-    assert last is not None
     for name in ("K", "D"):
         # About another trajectory, the unknowns differ by their nonlinearity.
         assert abs(float(smoothed[name][-1]) - last[name].mean) < 0.4 * last[name].std

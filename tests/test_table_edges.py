@@ -52,7 +52,6 @@ def noted(prepared: Prepared) -> list[Finding]:
 def test_a_run_begins_where_all_inputs_have_a_value(tmp_path):
     plain = changed(tmp_path / "plain", lambda table: None)
     found = changed(tmp_path / "late", without("T_left", slice(20)))
-    assert plain.raw is not None
     np.testing.assert_array_equal(found.stream.t, plain.raw.t[20:])
     (note,) = noted(found)
     assert "20 rows at the start, before its first value, were left out" in note.text
@@ -103,7 +102,6 @@ def test_a_replay_of_complete_data_has_the_samples_of_the_batch_run(tmp_path):
     assert isinstance(found.stream, DataTable)
     with LiveCase(found.case) as wiring:
         run = wiring.live()
-        assert run is not None
         run.run()
         taken = [[one.values[name] for name in found.stream.names] for one in run.journal.taken()]
         assert dict(run.journal.counts) == dict(found.stream.remarks)
@@ -123,7 +121,6 @@ def test_the_clock_of_one_of_several_files_is_corrected_before_they_are_joined(t
         table[[time, *others]].to_csv(path.parent / "sensors.csv", index=False)
         settings = {"data.file": ["sensors.csv", "ends.csv"], "channels.T_left.late": f"{shift} s"}
         found = cases.load(path, settings=settings).prepare().raw
-        assert found is not None
         np.testing.assert_allclose(found.t, plain.t)
         columns = [found.names.index(name) for name in plain.names]
         np.testing.assert_allclose(found.values[:, columns], plain.values)
@@ -142,7 +139,6 @@ def test_what_is_late_is_read_until_the_stop(tmp_path, dated):
     found, plain = changed(tmp_path / "late", change, **given), changed(tmp_path, lambda _: None)
     table, raw = found.stream, plain.raw
     assert isinstance(table, DataTable)
-    assert raw is not None
     assert table.t[-1] == 300.0
     assert not table.remarks.keys() & {("missing", "T_left"), ("ended", "T_left")}
     for name in ("T_left", "T_10"):

@@ -282,11 +282,9 @@ def test_every_law_is_among_the_cases():
 
 # One of each law, and those that factorise, solve and inherit most.
 OFTEN = (
-    "gradient",
     "gradient, nonlinear plate",
     "gradient, blocks",
     "auto gain",
-    "sensitivity",
     "sensitivity, large square",
 )
 RARELY = (pytest.param(name, marks=pytest.mark.long) for name in CASES if name not in OFTEN)
@@ -320,9 +318,7 @@ def test_a_search_in_a_large_mesh_leaves_the_tree_of_another_one(monkeypatch):
 # Each law once, with different models; all that a law does is in the test before.
 COPIED = (
     "gradient, missing readings",
-    "gradient, nonlinear plate",
     "auto gain, chosen smoothing",
-    "sensitivity, inputs",
     "sensitivity, square",
     "guards and jumps",
 )

@@ -138,7 +138,7 @@ def test_a_right_model_is_trusted_whatever_noise_is_stated(stated: float, seed: 
 
 
 @pytest.mark.slow
-def test_the_filter_gives_the_same_numbers_to_the_last_bit():
+def test_the_filter_gives_the_same_numbers_however_it_is_judged():
     z = shown() + errors()
     _, judged = run(z)
     _, cheap = run(z, law=lp.SensitivityLaw(verdict="cheap"))
@@ -147,14 +147,22 @@ def test_the_filter_gives_the_same_numbers_to_the_last_bit():
         assert np.array_equal(judged.q, other.q)
         assert np.array_equal(judged.q_std, other.q_std)
         assert np.array_equal(judged.u, other.u)
+    assert any("missing sources" in text for text in cheap.verdict.untested)
+    assert bare.verdict.untested == ("innovations: verdict = False",)
+    assert bare.verdict.level == "not judged"
+    with pytest.raises(LawError, match="verdict must be"):
+        lp.SensitivityLaw(verdict="dear")
 
 
 @pytest.mark.slow
-def test_an_offset_is_named_with_its_size():
+def test_an_offset_is_named_with_its_size_also_in_json_and_in_the_dataset():
     z = shown() + errors()
     z[:, 1] += 0.08
-    found = run(z)[1].verdict
-    assert found.level != "trusted"
+    result = judged().run(samples(z))
+    found, data = result.verdict, result.to_xarray()
+    assert Verdict.from_dict(json.loads(json.dumps(found.to_dict()))).to_dict() == found.to_dict()
+    assert verdict(data).level == found.level != "trusted"
+    assert doubts(data)[0] == found.sentences[0]
     assert named(found)[0] == ("offset", "B")
     text = found.findings[0].causes[0].text
     assert float(text.split("read ")[1].split()[0]) == pytest.approx(0.08, rel=0.15)
@@ -457,31 +465,6 @@ def test_few_samples_are_too_few():
     estimate = identifier.step(0.1, np.zeros(3), {"T_left": 0.0})
     assert estimate.verdict.level == "not judged"
     assert "1 samples, at least 20 required" in estimate.verdict.sentences[0]
-
-
-@pytest.mark.slow
-def test_what_is_left_out_is_said():
-    found = run(shown() + errors(), law=lp.SensitivityLaw(verdict="cheap"))[1].verdict
-    assert any("missing sources" in text for text in found.untested)
-    bare = run(shown() + errors(), law=lp.SensitivityLaw(verdict=False))[1].verdict
-    assert bare.untested == ("innovations: verdict = False",)
-    assert bare.level == "not judged"
-    with pytest.raises(LawError, match="verdict must be"):
-        lp.SensitivityLaw(verdict="dear")
-
-
-@pytest.mark.slow
-def test_a_verdict_survives_json_and_stands_in_the_dataset():
-    z = shown() + errors()
-    z[:, 1] += 0.08
-    identifier = judged()
-    result = identifier.run(samples(z))
-    found = result.verdict
-    stored = json.loads(json.dumps(found.to_dict()))
-    assert Verdict.from_dict(stored).to_dict() == found.to_dict()
-    data = result.to_xarray()
-    assert verdict(data).level == found.level
-    assert doubts(data)[0] == found.sentences[0]
 
 
 def test_the_worst_finding_decides_and_none_is_said_twice():
