@@ -352,23 +352,25 @@ def _format(table: Path, written: Written, time: tuple[str, ...], given: str) ->
     formats = elapsed_formats(cells) or date_formats(cells)
     if len(formats) == 1:
         return formats[0]
-    if formats and formats[0] in ELAPSED:
-        raise SampleError(
-            f"{table}, column '{time[0]}': if '{cells[0]}' is an elapsed time, set --time-format "
+    raise SampleError(f"{table}, column '{time[0]}': {_ask_format(cells[0], formats)}")
+
+
+def _ask_format(cell: str, formats: Sequence[str]) -> str:
+    """Return the message on a time that has no format, or several."""
+    if not formats:
+        return f"got '{cell}'; set --time-format, such as '%d.%m.%Y %H:%M'."
+    if formats[0] in ELAPSED:
+        return (
+            f"if '{cell}' is an elapsed time, set --time-format "
             f"{' or '.join(map(repr, formats))}; if it is a time of day, add a column of days."
         )
-    if not formats:
-        raise SampleError(
-            f"{table}, column '{time[0]}': got '{cells[0]}'; set --time-format, such as "
-            "'%d.%m.%Y %H:%M'."
-        )
     candidates = " or ".join(
-        f"'{form}' ({_moment(Clock('').stamp(cells[0], form) or 0.0, datetime(1970, 1, 1))})"
+        f"'{form}' ({_moment(Clock('').stamp(cell, form) or 0.0, datetime(1970, 1, 1))})"
         for form in formats
     )
-    raise SampleError(
-        f"{table}, column '{time[0]}': the order of day, month and year in '{cells[0]}' is "
-        f"ambiguous: set --time-format, {candidates}."
+    return (
+        f"the order of day, month and year in '{cell}' is ambiguous: set --time-format, "
+        f"{candidates}."
     )
 
 

@@ -69,12 +69,9 @@ def _candidates(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     # An initial state that differs from the first readings resembles many other errors.
     if first_miss(prepared) > _usual_error(base):
         yield Variant(NAMES["initial"], freed(prepared, Cause("initial", "", "")))
-    for name in switching(case, prepared.raw) if isinstance(prepared.raw, DataTable) else ():
-        # Linear interpolation of an input that switches also resembles many other errors.
+    # Linear interpolation of an input that switches also resembles many other errors.
+    for name in _switching(prepared, base):
         yield Variant(f"{name} held", (channel_setting(name, "between", '"hold"'),))
-    for cause in base.causes:
-        if setting := held(prepared, cause):
-            yield Variant(f"{cause.subject} held", (setting,))
     if later := later_start(prepared):
         yield Variant("later start", (later,))
     for cause in base.causes:
@@ -91,6 +88,13 @@ def _candidates(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     yield from _without_worst(base)
     if not case.spec.law.jumps and base.estimates:
         yield Variant("jumps", ("law.jumps=true",))
+
+
+def _switching(prepared: Prepared, base: VariantRun) -> list[str]:
+    """Return the inputs that may switch, by their values or by a lag among the causes."""
+    table = prepared.raw
+    names = switching(prepared.case, table) if isinstance(table, DataTable) else []
+    return names + [cause.subject for cause in base.causes if held(prepared, cause)]
 
 
 def _without_worst(base: VariantRun) -> Iterator[Variant]:

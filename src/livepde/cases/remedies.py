@@ -141,11 +141,7 @@ def _with_remedy(prepared: Prepared, cause: Cause, settings: tuple[str, ...]) ->
     if cause.kind == "jump" and _may_jump(case, cause.subject):
         return replace(cause, remedy=JUMPED)
     if cause.kind == "lag" and settings:
-        check = LIKELY["lag"].remedy.format(name=cause.subject)
-        clock = f"If the clock is wrong, set `{settings[0]}`."
-        if hold := held(prepared, cause):
-            clock = f"If it switches between its rows, set `{hold}`. {clock}"
-        return replace(cause, remedy=f"{check} {clock}")
+        return replace(cause, remedy=_remedy_of_lag(cause, settings[0], held(prepared, cause)))
     if cause.kind not in KEYS or cause.subject not in case.roles("sensor"):
         return cause
     table = case.families.get(cause.subject, cause.subject)  # a family has one table
@@ -155,6 +151,13 @@ def _with_remedy(prepared: Prepared, cause: Cause, settings: tuple[str, ...]) ->
         return replace(cause, remedy=LIKELY[cause.kind].remedy.format(name=cause.subject))
     value = settings[0].partition("=")[2]
     return replace(cause, remedy=estimating(cause.kind, table, value))
+
+
+def _remedy_of_lag(cause: Cause, late: str, hold: str) -> str:
+    """Return the remedy of a lag; `late`, `hold`: the settings that may correct it, or empty."""
+    switch = f"If it switches between its rows, set `{hold}`. " if hold else ""
+    check = LIKELY["lag"].remedy.format(name=cause.subject)
+    return f"{check} {switch}If the clock is wrong, set `{late}`."
 
 
 def _may_jump(case: Case, name: str) -> bool:
@@ -175,9 +178,9 @@ def switching(case: Case, table: DataTable) -> list[str]:
 
 
 def held(prepared: Prepared, cause: Cause) -> str:
-    """Return the setting that holds an input between its rows, if the cause looks like it.
+    """Return the setting that holds an input between its rows, or an empty text.
 
-    On lines between its rows, a switch seems to act half an interval early.
+    An input that switches, but is interpolated linearly, seems half an interval early.
     """
     channel = prepared.case.spec.channels.get(cause.subject)
     if cause.kind != "lag" or channel is None or not channel.drives or channel.between != "line":

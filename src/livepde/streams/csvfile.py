@@ -382,9 +382,13 @@ def _titles(lines: Sequence[str], separator: str) -> int:
     titled = all(found <= 1 for found in widths[:start])
     if not titled or any(number_of(name.strip(), ",") is not None for name in names):
         return 0  # the header itself is short
-    # A comment with as many cells as a row is a title, too, if names follow.
-    names_follow = start + 1 < len(rows) and not any(map(_is_number, rows[start + 1]))
-    return start + (lines[start].startswith("#") and names_follow)
+    return start + _is_comment_above(lines, rows, start)
+
+
+def _is_comment_above(lines: Sequence[str], rows: Sequence[Sequence[str]], start: int) -> bool:
+    """Return whether a line with as many cells as a row is a comment, with names below it."""
+    below = rows[start + 1 : start + 2]
+    return bool(below) and lines[start].startswith("#") and not any(map(_is_number, below[0]))
 
 
 def _is_number(cell: str) -> bool:
