@@ -1,7 +1,7 @@
-"""Both laws on PETSc vectors, for one process on many ranks of MPI.
+"""Both laws on PETSc vectors, for a process that is distributed over MPI ranks.
 
-The process comes from a finite-element package that shares its mesh out, by the protocol
-`PetscModel`; `DolfinxModel` is one from UFL. PETSc and MPI start with the first model.
+The process is defined by a finite-element package with a distributed mesh, which implements the
+protocol `PetscModel`; `DolfinxModel` does so for UFL. PETSc and MPI start with the first model.
 """
 
 from __future__ import annotations

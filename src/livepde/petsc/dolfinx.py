@@ -1,6 +1,6 @@
-"""A `PetscModel` from UFL integrands, by DOLFINx; written for 0.5.2, Debian 12's.
+"""A `PetscModel` from UFL integrands with DOLFINx 0.5.2, the version in Debian 12.
 
-What another version calls differently stands in `Interface`, the only place to change.
+All calls that differ between versions of DOLFINx are in `Interface`.
 """
 
 from __future__ import annotations
@@ -26,21 +26,20 @@ class DolfinxModel:
     V
         Scalar function space of the state u.
     q
-        Function space of a field, or the start values of numbers, shape (m,).
+        Function space of a field, or the initial values of numbers, shape (m,).
     form
         Integrand (u, q, v, x, t) of F over the cells, linear in the test function v: B(u) + A(u) q
-        less the source. For numbers q is a tuple. x are the coordinates and t is the time.
+        minus the source. For numbers, q is a tuple. x are the coordinates and t is the time.
     boundary
-        Integrand of F over the boundary, with the same arguments; it sees the estimate, never data.
+        Integrand of F over the boundary with the same arguments. Its u is the estimate, never data.
     mass, inner
         Integrands (u, v) of M and (p, q) of G_Q; default u v and p q + grad p . grad q.
     dirichlet
         Pairs of a marker, coordinates (3, points) -> booleans, and a value, (x, t) -> numbers.
     sensors
-        Points where u is read, shape (sensors, dimension); None: there are none.
+        Points at which u is observed, shape (sensors, dimension); None: no sensors.
     omega
-        Marker of the observed cells, by their midpoints, coordinates (3, cells) -> booleans; None:
-        all of u is observed.
+        Marker of observed cells, midpoints (3, cells) -> booleans; None: all of u is observed.
     M_op, N_op
         Integrands (u, v) of M_op and N_op of (MN1), (MN2); default u v + grad u . grad v.
     symmetric
@@ -89,7 +88,7 @@ class DolfinxModel:
         self.sensors = self._readings(np.zeros((0, 1)) if sensors is None else sensors)
         self._forms: dict[tuple[str, bool], Any] = {}
         self._matrices: dict[tuple[str, bool], Any] = {}
-        # F is affine in u if its derivative does not contain u any more.
+        # F is affine in u if its derivative does not contain u.
         slope = ufl.algorithms.expand_derivatives(self._form("u", False))
         self.linear = self.u not in slope.coefficients()
 
@@ -98,7 +97,7 @@ class DolfinxModel:
         return standard_vector(self.mesh.comm, self.api.owned(self.V))
 
     def create_q(self) -> Any:
-        """Return a zero vector of Q; numbers lie on rank 0."""
+        """Return a zero vector of Q; numbers are on rank 0."""
         comm, count = self.mesh.comm, len(self.numbers)
         return standard_vector(comm, count * (comm.rank == 0) if count else self.api.owned(self.Q))
 
@@ -159,8 +158,8 @@ class DolfinxModel:
         api = self.api
         self.numbers: list[Any] = []
         self.Q: Any = None
-        # A function space has a dofmap. All else is numbers, wrapped so that UFL can differentiate
-        # in them.
+        # A function space has a dofmap. Anything else is numbers, wrapped so that UFL can
+        # differentiate with respect to them.
         if hasattr(q, "dofmap"):
             self.Q, self.q = q, api.fem.Function(q)
             self.given: Any = self.q
@@ -182,11 +181,11 @@ class DolfinxModel:
         return integrand(u, self.given, self.v, x, self.time)
 
     def _inside(self) -> Any:
-        """Return the part of F over omega, which sees the data w."""
+        """Return the part of F over omega, evaluated at the data w."""
         return self._integrand(self.form, self.w) * self.seen
 
     def _F(self, split: bool) -> Any:
-        """Return F at u; `split`: with the data w over omega."""
+        """Return F at u; `split`: over omega, F is evaluated at the data w."""
         ufl, u = self.api.ufl, self.u
         F = self._inside() if split else self._integrand(self.form, u) * ufl.dx
         if split and self.rest is not None:
@@ -208,7 +207,7 @@ class DolfinxModel:
         return api.matrix(inner(r, p) * ufl.dx), api.matrix(ufl.inner(r, p) * ufl.dx)
 
     def _at(self, u: Any, q: Any, t: float, w: Any) -> None:
-        """Make forms see these values."""
+        """Set the values at which forms are evaluated."""
         self.time.value = t
         for function, values in ((self.u, u), (self.w, w)):
             if values is not None:
@@ -220,7 +219,7 @@ class DolfinxModel:
             constant.value = value
 
     def _form(self, name: str, split: bool) -> Any:
-        """Return F, its derivative in "u", in "q" or in the number of an index, or "A" of w."""
+        """Return "F", its derivative in "u", "q" or a number (by its index), or A(w) for "A"."""
         derivative = self.api.ufl.derivative
         if name == "A":
             return derivative(self._inside(), self.q)
@@ -229,21 +228,21 @@ class DolfinxModel:
             F = derivative(F, self.u if name == "u" else self.q)
         elif name != "F":
             ufl, number = self.api.ufl, self.given[int(name)]
-            # The derivative in a number is that of each integrand: UFL derives forms by functions
-            # only.
+            # UFL differentiates forms with respect to functions only, so that the derivative in a
+            # number is computed for each integrand.
             terms = [one.reconstruct(ufl.diff(one.integrand(), number)) for one in F.integrals()]
             F = ufl.Form(terms)
         return F
 
     def _compiled(self, name: str, split: bool) -> Any:
-        """Return a compiled form; None where it is zero."""
+        """Return a compiled form, or None if it is zero."""
         if (name, split) not in self._forms:
             form = self.api.ufl.algorithms.expand_derivatives(self._form(name, split))
             self._forms[name, split] = None if form.empty() else self.api.fem.form(form)
         return self._forms[name, split]
 
     def _assembled(self, name: str, split: bool) -> Any:
-        """Return a matrix that is assembled in place from the second time on; None: zero."""
+        """Return a matrix, which is assembled in place after the first call; None if it is zero."""
         form, key = self._compiled(name, split), (name, split)
         if form is not None:
             self._matrices[key] = self.api.matrix(form, self._matrices.get(key))
@@ -256,7 +255,7 @@ class DolfinxModel:
         return vector
 
     def _columns(self, split: bool) -> Any:
-        """Return dF/dq for numbers, a dense matrix whose rows are shared out."""
+        """Return dF/dq for numbers, a dense matrix with distributed rows."""
         sizes = self.create_u().getSizes(), self.create_q().getSizes()
         key = ("columns", split)
         if key not in self._matrices:
@@ -269,7 +268,7 @@ class DolfinxModel:
         return matrix
 
     def _readings(self, points: Any) -> Any:
-        """Return G: each point is on the lowest rank that has a cell with it."""
+        """Return G; each point is evaluated on the lowest rank with a cell that contains it."""
         x, comm = np.zeros((len(points), 3)), self.mesh.comm
         x[:, : np.shape(points)[1]] = points
         rows = self.api.readings(self.V, x)
@@ -280,7 +279,7 @@ class DolfinxModel:
             raise ModelError(f"DolfinxModel: sensor {lost} at {x[lost]} lies outside the mesh.")
         G = petsc_module().Mat().createAIJ(((None, len(x)), self.create_u().getSizes()), comm=comm)
         G.setUp()
-        # How many shape functions a row has depends on the element, so none are preallocated.
+        # The number of nonzeros in a row depends on the element, so none are preallocated.
         G.setOption(petsc_module().Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
         for k in np.flatnonzero(first == comm.rank).tolist():
             G.setValues([k], *(rows[k] or ([], [])))
@@ -289,7 +288,7 @@ class DolfinxModel:
 
 
 class Interface:
-    """Every call of DOLFINx whose name or form depends on its version: here those of 0.5.2."""
+    """All calls of DOLFINx that depend on its version, here for 0.5.2."""
 
     def __init__(self) -> None:
         petsc_module()
@@ -297,7 +296,7 @@ class Interface:
         self.fem, self.petsc = self.dolfinx.fem, petsc_module("dolfinx.fem.petsc")
 
     def matrix(self, form: Any, matrix: Any = None) -> Any:
-        """Return the matrix of a form, assembled in place where one is given."""
+        """Return the matrix of a form, assembled in place if a matrix is given."""
         form = self.fem.form(form)
         if matrix is None:
             matrix = self.petsc.assemble_matrix(form)
@@ -311,13 +310,13 @@ class Interface:
         """Assemble a linear form into a vector."""
         PETSc = petsc_module()
         b = self.petsc.assemble_vector(form)
-        # Cells at the border of a rank add to coefficients of its neighbours.
+        # Cells at the border of a rank contribute to coefficients of its neighbours.
         b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
         vector.getArray()[:] = b.getArray()
         b.destroy()
 
     def assign(self, function: Any, vector: Any) -> None:
-        """Set the coefficients of a function, those of its ghosts among them."""
+        """Set the coefficients of a function, including its ghosts."""
         function.x.array[: vector.getLocalSize()] = vector.getArray(readonly=True)
         function.x.scatter_forward()
 
@@ -332,7 +331,7 @@ class Interface:
         return dofs, V.tabulate_dof_coordinates()[dofs].T
 
     def cell_tags(self, mesh: Any, marker: Callable[..., Any]) -> Any:
-        """Return tags of all cells: observed by their midpoints, or hidden."""
+        """Return the tags of all cells: observed, according to the midpoint, or hidden."""
         dim = mesh.topology.dim
         cells = mesh.topology.index_map(dim)
         local = np.arange(cells.size_local + cells.num_ghosts, dtype=np.int32)
@@ -341,9 +340,9 @@ class Interface:
         return self.dolfinx.mesh.meshtags(mesh, dim, local, values)
 
     def readings(self, V: Any, x: Array) -> list[tuple[IntArray, Array] | None]:
-        """Return global coefficients at each point and the values of their shape functions there.
+        """Return the global coefficients at each point and the values of their shape functions.
 
-        None stands for a point without an owned cell.
+        A point without an owned cell has None.
         """
         geometry, dim = self.dolfinx.geometry, V.mesh.topology.dim
         f, owned = self.fem.Function(V), V.mesh.topology.index_map(dim).size_local
@@ -367,7 +366,7 @@ class Interface:
         return found
 
     def numbering(self, V: Any) -> IntArray:
-        """Return the numbers of owned coefficients in the mesh as it was given, for P1 or P0."""
+        """Return the numbers of owned coefficients in the original mesh, for P1 or P0."""
         mesh, owned = V.mesh, self.owned(V)
         count = len(mesh.topology.original_cell_index)
         dofs = V.dofmap.list.array.reshape(count, -1)

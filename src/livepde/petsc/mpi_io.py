@@ -1,8 +1,8 @@
-"""Checkpoints of both laws by MPI-IO, in an order that does not depend on the number of ranks.
+"""Checkpoints of both laws by MPI-IO, in an order that is independent of the number of ranks.
 
-A checkpoint is a small file PATH, JSON with the numbers of the state, and a file beside it with its
-vectors, in PETSc's binary format: each rank writes and reads a contiguous part. PATH is replaced
-when the vectors are complete: a run that is killed meanwhile goes on from the checkpoint before.
+A checkpoint consists of a small JSON file PATH with the numbers of the state, and a file next to it
+with its vectors in PETSc's binary format, of which each rank writes and reads a contiguous part.
+PATH is replaced when the vectors are complete, so that a killed run has its last checkpoint.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from livepde.petsc.observer import ObserverState
 from livepde.petsc.petsc_filter import PetscFilterState
 from livepde.petsc.petsc_model import PetscModel, petsc_module, zeros
 
-OF_Q = ("q", "rate_q", "modes")  # fields of a state with vectors of Q,
-OF_U = ("u", "U", "u_alpha", "rate_u")  # and of X
+OF_Q = ("q", "rate_q", "modes")  # fields of a state with vectors of Q
+OF_U = ("u", "U", "u_alpha", "rate_u")  # fields of a state with vectors of X
 
 
 def save_state(
@@ -46,7 +46,7 @@ def save_state(
         else:
             numbers[name] = _encoded(value)
     viewer.destroy()
-    # One rank replaces the file, and then removes the vectors to which the replaced one referred.
+    # One rank replaces the file, then removes the vectors of the old checkpoint.
     if comm.rank == 0:
         old = path.parent / _read(path)["vectors"] if path.exists() else None
         write_bytes(path, json.dumps(numbers).encode(), sync=True)
@@ -57,9 +57,9 @@ def save_state(
 
 
 def load_state(path: Path | str, model: PetscModel) -> Any:
-    """Return a state that `save_state` wrote, on any number of ranks; all ranks call it.
+    """Load a state written by `save_state`, on any number of ranks; all ranks call it.
 
-    Raises `RunError` without a checkpoint that can be read, and for a model of another size.
+    Raises `RunError` if the checkpoint cannot be read, or if the model has a different size.
     """
     path = Path(path)
     numbers = _read(path)
@@ -88,7 +88,7 @@ def _sizes(model: PetscModel) -> list[int]:
 
 
 def _encoded(value: Any) -> Any:
-    """Return a number, an array or an excitation level as JSON holds it."""
+    """Return the JSON value of a number, an array or an excitation level."""
     if isinstance(value, ExcitationLevel):
         return {key: _encoded(item) for key, item in asdict(value).items()}
     return np.asarray(value).tolist()
@@ -117,7 +117,7 @@ def _scatter(vector: Any, order: IntArray, ordered: Any) -> Any:
 
 
 def _ordered(vector: Any, order: IntArray) -> Any:
-    """Return the values in the order of the numbers, shared out evenly."""
+    """Return the values in the order of the numbers, evenly distributed over the ranks."""
     ordered = petsc_module().Vec().create(vector.comm)
     ordered.setSizes(vector.getSize())
     ordered.setType("standard")
@@ -129,6 +129,6 @@ def _loaded(like: Any, order: IntArray, viewer: Any) -> Any:
     vector = zeros(like)
     ordered = _ordered(vector, order)
     ordered.load(viewer)
-    # In reverse: from the common order to that of the coefficients on these ranks.
+    # In reverse: from the common order to the order of the coefficients on these ranks.
     _scatter(vector, order, ordered).scatter(ordered, vector, mode=True)
     return vector

@@ -1,20 +1,20 @@
 """The paper's law on PETSc vectors: u and q in one coupled implicit step.
 
-Boiger and Kaltenbacher (2016), (est_exact_q) and (est_exact_u), or (noisy_q), (noisy_u) for a
-smoothed u_alpha, where u_alpha is known on omega. With w = u_alpha on omega and u elsewhere, and
-r = u - u_alpha on omega, y = (u, q) solves
+Boiger and Kaltenbacher (2016), (est_exact_q) and (est_exact_u), or (noisy_q) and (noisy_u) for a
+smoothed u_alpha; u_alpha is known on omega. Let w = u_alpha on omega and u elsewhere, and
+r = u - u_alpha on omega. Then y = (u, q) solves the coupled equations
 
     M (u - c_u)/h + F(u, q, t; w) + theta M_op r + nu N_op u    = 0
     G_Q ((q - c_q)/h + sigma q)/gain - A(w)^T r                 = 0
 
-together, so that with full data the terms with A cancel in the energy, as in (align:neplusnr).
-theta = mu/||r||_V~ is that of a damping rule, as Assumption cond:mu02. Newton's linear systems
+For full data, the terms with A cancel in the energy, as in (align:neplusnr). theta = mu/||r||_V~ is
+defined by a damping rule, such as Assumption cond:mu02. Newton's linear systems
 
     K = [[M/h + dF/du + theta M_op + nu N_op + b a^T,  A], [-A(w)^T,  G_Q (1/h + sigma)/gain]]
 
-are solved by GMRES, preconditioned by PETSc's field split: a lower Schur factorisation, algebraic
-multigrid for the first block and for the second one plus A^T D^-1 A, D the row sums of the first
-(`selfp`). b a^T is the derivative of theta, and is left out of the preconditioner.
+are solved by GMRES with PETSc's field split as preconditioner: a lower Schur factorisation, with
+algebraic multigrid for the first block and for the second block plus A^T D^-1 A, where D has the
+row sums of the first (`selfp`). The preconditioner omits b a^T, the derivative of theta.
 """
 
 from __future__ import annotations
@@ -55,19 +55,19 @@ ksp_type fgmres, ksp_gmres_restart 60, pc_type fieldsplit, pc_fieldsplit_type sc
 pc_fieldsplit_schur_fact_type lower, pc_fieldsplit_schur_precondition selfp,
 fieldsplit_0_ksp_type preonly, fieldsplit_1_ksp_type preonly, fieldsplit_0_pc_type {multigrid},
 fieldsplit_1_pc_type {multigrid}, fieldsplit_1_mat_schur_complement_ainv_type lump
-"""  # of PETSc; one that the user has set stays
-ITERATIONS = 120  # of GMRES for one update
-REBUILD = 2.0  # times the iterations with a new preconditioner: then it is built again
-FORCING = 1e-2  # relative accuracy of an update: Newton goes on from there
-HOLD = 1e12  # times the weight of G_Q: then q is held
-SHORTEST = 1e-3  # part of an update that is tried
+"""  # defaults of PETSc's options, which do not replace options of the user
+ITERATIONS = 120  # largest number of GMRES iterations for an update
+REBUILD = 2.0  # growth of the iterations per digit after which the preconditioner is rebuilt
+FORCING = 1e-2  # relative accuracy of an update in inexact Newton iterations
+HOLD = 1e12  # factor of the weight of G_Q that holds q
+SHORTEST = 1e-3  # smallest fraction of an update in the line search
 
 
 @dataclass(frozen=True, eq=False)
 class ObserverState:
-    """Estimates u and q at a time t, and the data u_alpha there, None before the first sample.
+    """Estimates u and q, and data u_alpha, at time t; u_alpha is None before the first sample.
 
-    The next step begins with the last change of u - u_alpha and q per unit of time.
+    `rate_u` and `rate_q`, the last rates of u - u_alpha and q, predict the next step.
     """
 
     t: float
@@ -81,7 +81,7 @@ class ObserverState:
 
 @dataclass(frozen=True, eq=False)
 class ObserverReport:
-    """Status of a sample, whether the gate held q, Newton's updates and iterations of GMRES."""
+    """Status of a sample, whether the gate held q, and numbers of Newton and GMRES iterations."""
 
     status: Status
     held: bool
@@ -96,14 +96,14 @@ class PetscObserver:
     Parameters
     ----------
     model
-        The process; F has to be affine in q.
+        The process; F must be affine in q.
     gain, damping, nu, sigma, gate
-        As for `GradientLaw`.
+        See `GradientLaw`.
     lower, upper
         Bounds of each coefficient of q.
     tolerance, iterations
-        Bound on the residual of both lines, in dual norms weighed by the diagonals of M and G_Q,
-        relative to their terms; maximum number of Newton's updates in a step.
+        Bound on the residuals of both equations relative to their terms, in dual norms with the
+        diagonals of M and G_Q; largest number of Newton updates in a step.
     """
 
     model: PetscModel
@@ -128,7 +128,7 @@ class PetscObserver:
         object.__setattr__(self, "solver", CoupledSolver(self))
 
     def init(self, q0: Any, u0: Any, t0: float = 0.0) -> ObserverState:
-        """Return the state at the start."""
+        """Return the initial state."""
         u = u0.copy()
         self.model.impose(u, t0)
         rates = zeros(u), zeros(q0)
@@ -137,7 +137,7 @@ class PetscObserver:
     def step(
         self, state: ObserverState, t: float, u_alpha: Any
     ) -> tuple[ObserverState, ObserverReport]:
-        """Return the state after a sample: u_alpha at t, its values outside omega unused."""
+        """Return the state after a sample u_alpha at t, whose values outside omega are not used."""
         if not t > state.t:
             raise LawError(f"PetscObserver: t must be later than {state.t}; got {t}.")
         solver, data = self.solver, u_alpha.copy()
@@ -162,7 +162,7 @@ class PetscObserver:
 
 
 class CoupledSolver:
-    """Newton's iteration for coupled steps, and K as a matrix of Python for PETSc's GMRES."""
+    """Newton's method for coupled steps; also K as a Python matrix for PETSc's GMRES."""
 
     def __init__(self, law: PetscObserver) -> None:
         self.law, self.model = law, law.model
@@ -176,17 +176,17 @@ class CoupledSolver:
         self.path: tuple[float, Any, float, Any]
         self.rates: tuple[Any, Any]
         self.held, self.updates, self.iterations = False, 0, 0
-        self._best, self._slow, self._width = 0.0, False, 0.0  # iterations for a digit, and step
+        self._best, self._slow, self._width = 0.0, False, 0.0  # iterations per digit; step size
         self._pairs: list[tuple[Any, Any]] = []
         self._tests: tuple[Any, Any] | None = None
 
     def data(self, t: float) -> Any:
-        """Return u_alpha at a time within the interval, interpolated."""
+        """Return u_alpha at a time in the interval by linear interpolation."""
         t0, old, t1, new = self.path
         return new if t == t1 else old + (new - old) * ((t - t0) / (t1 - t0))
 
     def solve(self, y: tuple[Any, Any], t: float, h: float) -> tuple[Any, Any]:
-        """Return (u, q) at t + h from that at t; raises `StepFailed`."""
+        """Return (u, q) at t + h, given y = (u, q) at t; raises `StepFailed`."""
         stage = Stage(self, y, t + h, h, self.data(t + h))
         u = y[0] + self.data(t + h) - self.data(t) + self.rates[0] * h
         q = y[1] + self.rates[1] * (0.0 if self.held else h)
@@ -195,11 +195,11 @@ class CoupledSolver:
             return self._newton(stage, u.copy(), q.copy())
         except StepFailed:
             return self._by_theta(stage, u, q)
-        finally:  # its norms refer to it: cycles would be collected at other times on other ranks
+        finally:  # breaks reference cycles, which ranks would collect at different times
             vars(stage).clear()
 
     def _newton(self, stage: Stage, u: Any, q: Any) -> tuple[Any, Any]:
-        """Return the solution, from a start that is overwritten; raises `StepFailed`."""
+        """Return the solution; the initial values are overwritten; raises `StepFailed`."""
         found = stage.evaluate(u, q)
         for _ in range(self.law.iterations):
             if found <= self.law.tolerance:
@@ -209,7 +209,7 @@ class CoupledSolver:
             u.axpy(-1.0, du)
             q.axpy(-1.0, dq)
             found = stage.evaluate(u, q)
-            # A sufficient decrease proportional to the step (Armijo), else half of the update.
+            # Armijo's line search: halve the update until the decrease is sufficient.
             while not stage.relative(sizes) <= (1.0 - 0.1 * part) * before and part > SHORTEST:
                 part *= 0.5
                 u.axpy(part, du)
@@ -224,9 +224,9 @@ class CoupledSolver:
         raise StepFailed("not_converged", f"the updates left a relative residual of {found:.1e}")
 
     def _by_theta(self, stage: Stage, u: Any, q: Any) -> tuple[Any, Any]:
-        """Return the solution whose theta is nearest to that of the start; raises `StepFailed`.
+        """Return the solution with theta nearest to its initial value; raises `StepFailed`.
 
-        With theta given the step is all but linear, and theta is the root of a scalar function.
+        For fixed theta the step is almost linear, and theta is the root of a scalar function.
         """
         stage.evaluate(u, q)
 
@@ -244,7 +244,7 @@ class CoupledSolver:
         return u, q
 
     def _update(self, stage: Stage, found: float) -> tuple[Any, Any]:
-        """Return the solution of K x = residual, to the accuracy that Newton makes use of."""
+        """Solve K x = residual, to the accuracy that Newton's method requires."""
         PETSc = petsc_module()
         self.stage = stage
         stage.linearise()
@@ -253,14 +253,14 @@ class CoupledSolver:
             self._best, self._width = 0.0, stage.h
         b = PETSc.Vec().createNest([stage.first, stage.second], comm=self.free.comm)
         x = PETSc.Vec().createNest([zeros(stage.first), zeros(stage.second)], comm=self.free.comm)
-        # Inexact Newton: an update is solved no better than the tolerance can tell.
+        # Inexact Newton: an update is not more accurate than the tolerance requires.
         accuracy = min(max(0.3 * self.law.tolerance / found, FORCING), 0.3)
         self.ksp.setTolerances(rtol=accuracy, atol=0.0, max_it=ITERATIONS)
         self.ksp.solve(b, x)
         reason, count = self.ksp.getConvergedReason(), self.ksp.getIterationNumber()
         if reason < 0 and reason != PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT:
             raise StepFailed("singular", f"PETSc's solver stopped with reason {reason}")
-        # The preconditioner ages as the iterations for one digit grow beyond those when it was new.
+        # The preconditioner is outdated if the number of iterations per digit has grown.
         digits = -math.log10(accuracy)
         self._best = self._best or count / digits
         self._slow = count > REBUILD * self._best * digits + 2
@@ -270,7 +270,7 @@ class CoupledSolver:
         return du, dq
 
     def _build(self, stage: Stage) -> None:
-        """Make the solver, with a preconditioner of the blocks as they are now."""
+        """Create the solver, with a preconditioner from the current blocks."""
         PETSc = petsc_module()
         options = PETSc.Options(PREFIX)
         for name, value in map(str.split, OPTIONS.format(multigrid=multigrid()).split(",")):
@@ -289,14 +289,14 @@ class CoupledSolver:
         self.ksp.getPC().setReusePreconditioner(True)
 
     def mult(self, matrix: Any, x: Any, y: Any) -> None:
-        """Set y = K x; PETSc calls it."""
+        """Set y = K x; called by PETSc."""
         stage, (u, q), (first, second) = self.stage, x.getNestSubVecs(), y.getNestSubVecs()
-        # First line: (S + b a^T) u + A q, with the border (b, a).
+        # First equation: (S + b a^T) u + A q, with the border (b, a).
         stage.S.mult(u, first)
         first.axpy(1.0, (stage.A * q) * self.free)
         if stage.border is not None:
             first.axpy(stage.border[1].dot(u), stage.border[0])
-        # Second line: G_Q (1/h + sigma)/gain q - A(w)^T u.
+        # Second equation: G_Q (1/h + sigma)/gain q - A(w)^T u.
         self.model.gram.mult(q, second)
         second.scale(stage.weight)
         back = zeros(second)
@@ -304,17 +304,17 @@ class CoupledSolver:
         second.axpy(-1.0, back)
 
     def dual(self, functional: Any, line: int) -> float:
-        """Return the dual norm of a functional on u (line 0), or q (line 1), by a diagonal."""
+        """Return the dual norm of a functional on u (line 0) or q (line 1), with a diagonal."""
         return math.sqrt(abs(float(functional.dot(functional * self.weights[line]))))
 
     def riesz(self, functional: Any) -> Any:
-        """Return the Riesz representative in X among the functions that stay within omega."""
+        """Return the Riesz representative in X among the functions with support in omega."""
         if self._tests is None:
             model, inside = self.model, self.free.copy()
             hidden = (model.mass - model.mass_observed).getDiagonal().getArray()
             size = model.mass.getDiagonal().getArray()
-            # A test function may not reach into cells outside of omega, where M - M_omega is
-            # positive.
+            # M - M_omega is positive for test functions with support in cells outside omega, which
+            # are excluded.
             inside.getArray()[np.abs(hidden) > 1e-12 * size] = 0.0
             rows = inside.getOwnershipRange()[0] + np.flatnonzero(inside.getArray() == 0.0)
             matrix = model.mass.copy()
@@ -336,41 +336,41 @@ class CoupledSolver:
 
 
 class Stage:
-    """The equation of one coupled step from y = (u, q): its residual and its Jacobian.
+    """The equations of a coupled step from y = (u, q): residual and Jacobian.
 
-    Blocks of K are S without b a^T, A and A_in, whose rows are to be masked, and G_Q times a
-    weight; the border is (b, a).
+    The blocks of K are S without b a^T, A and A_in, whose rows must be masked, and G_Q times a
+    weight. The border is (b, a).
     """
 
     def __init__(self, solver: CoupledSolver, y: Any, t: float, h: float, w: Any) -> None:
         self.solver, self.law, self.model = solver, solver.law, solver.model
         (self.begin_u, self.begin_q), self.t, self.h, self.w = y, t, h, w
         self.weight = (1.0 / h + self.law.sigma) / self.law.gain * (HOLD if solver.held else 1.0)
-        self.given: float | None = None  # theta, where it is not the rule's
+        self.given: float | None = None  # fixed theta; None: theta of the damping rule
         self.A_in = self.model.coupling(w, y[1], t)
-        # F is then affine in q alone, and evaluated once.
+        # If known, F depends on q only and is affine, so that it is evaluated once.
         self.known = self.model.push is None and self.model.jacobian_u(y[0], y[1], t, w) is None
         self.least = RESTING * solver.dual(self.model.mass * y[0], 0) / h
         self.least_q = RESTING * solver.dual(self.model.gram * y[1], 1) * self.weight
         self._start: tuple[Any, Any] | None = None
 
     def evaluate(self, u: Any, q: Any) -> float:
-        """Evaluate the residual of both lines and return its relative size."""
+        """Evaluate the residuals of both equations, and return the relative size."""
         model, law, dual, free = self.model, self.law, self.solver.dual, self.solver.free
         self.at = u, q
-        petsc_module().garbage_cleanup(u.comm)  # vectors that all ranks have dropped
+        petsc_module().garbage_cleanup(u.comm)  # frees vectors that no rank uses any more
         r = (u - self.w) * free
         self.Mr, self.mass_r = Mr, mass_r = model.pull * r, model.mass_observed * r
         self.norms = Residual(*self.squares(r, mass_r, Mr), lambda: self.seen)
         self.theta = self.rule() if self.given is None else self.given
-        # First line: the mass term, F with nu N_op u, and the pull.
+        # First equation: mass term, F with nu N_op u, and theta M_op r.
         terms = model.mass * ((u - self.begin_u) / self.h), self.force(u, q), Mr * self.theta
         self.first = (terms[0] + terms[1] + terms[2]) * free
         size = max(self.least, TINY, *(dual(term * free, 0) for term in terms))
         back = zeros(q)
         self.A_in.multTranspose(r, back)
-        # Second line: sigma q is sigma (q - c_q), in the weight, and sigma c_q. To hold q is to
-        # make the weight of G_Q huge.
+        # Second equation: sigma q = sigma (q - c_q) + sigma c_q, where the weight contains the
+        # first term. A very large weight of G_Q holds q.
         drift = 0.0 if self.solver.held else law.sigma / law.gain
         change = model.gram * ((q - self.begin_q) * self.weight + self.begin_q * drift)
         self.second = change - back
@@ -378,7 +378,7 @@ class Stage:
         return self.relative(self.sizes)
 
     def relative(self, sizes: tuple[float, float]) -> float:
-        """Return the larger residual of both lines, relative to sizes of their terms."""
+        """Return the larger residual of both equations, relative to the sizes of their terms."""
         pairs = zip((self.first, self.second), (0, 1), sizes, strict=True)
         return max(self.solver.dual(line, k) / size for line, k, size in pairs)
 
@@ -423,7 +423,7 @@ class Stage:
         S.zeroRowsColumns(model.fixed, 1.0)
 
     def _slope(self) -> tuple[Any, Any] | None:
-        """Return b and a of the derivative b a^T of theta M_op r in theta; None if it is zero."""
+        """Return b and a of the derivative b a^T of theta in theta M_op r, or None if zero."""
         if self.given is not None or self.theta >= STIFFEST / self.h:
             return None
         dX, dVX, dV = self.law.damping.slopes(self.norms)
@@ -433,7 +433,7 @@ class Stage:
         return self.Mr * self.solver.free, row * self.solver.free
 
     def nested(self) -> Any:
-        """Return the blocks without the border, copied."""
+        """Return copies of the blocks of K without the border."""
         A, A_in, H = self.A.copy(), self.A_in.copy(), self.model.gram.copy()
         A.diagonalScale(L=self.solver.free)
         A_in.diagonalScale(L=self.solver.free)
@@ -447,7 +447,7 @@ class Stage:
 
 def probes(model: PetscModel, free: Any) -> list[tuple[Any, Any]]:
     """Return pairs (e_k, p_k) for the gate: e_k in the unit ball of Q, p_k smooth on omega."""
-    # M_op is integrated over omega alone: a little mass makes it definite outside, too.
+    # M_op is integrated over omega only. A small multiple of the mass makes it definite elsewhere.
     stiff = model.pull.copy()
     stiff.axpy(1e-6, model.mass, petsc_module().Mat.Structure.UNKNOWN_NONZERO_PATTERN)
     stiff.zeroRowsColumns(model.fixed, 1.0)
@@ -458,7 +458,7 @@ def probes(model: PetscModel, free: Any) -> list[tuple[Any, Any]]:
         e, p = zeros(q), zeros(u)
         of_q.solve(random_vector(q, model.numbers_q, seed), e)
         e.scale(1.0 / math.sqrt(abs(float(e.dot(model.gram * e)))))
-        # No seed is used for both e and p.
+        # e and p have different seeds.
         load = model.mass_observed * random_vector(u, model.numbers_u, PROBES + seed)
         of_u.solve(load * free, p)
         found.append((e, p))

@@ -1,15 +1,15 @@
 """The reduced-order filter on PETSc vectors.
 
-Moireau, Chapelle and Le Tallec (2008), as `livepde.laws.filter` has it for one process. With
+The filter of Moireau, Chapelle and Le Tallec (2008) in `livepde.laws.filter`, for one process. Let
 q = q_prior + Phi a, a ~ N(0, I), S the Jacobian of a step, A = dF/dq and P = [U C]^T [U C] the
-joint covariance of u and a,
+joint covariance of u and a. Then
 
     predict   one implicit step for u;   S U+_i = M U_i/h - A(u+) Phi C_i        for each row i
     update    d = z - G u+,  Y = U G^T,  W W^T = (I + Y N^-1 Y^T)^-1
               [u; a] += [U C]^T W W^T Y N^-1 d,   [U C] <- W^T [U C]
 
-u and the rows of U are PETSc vectors; C, W and Y are small, equal on every rank, and made of sums
-over all ranks alone. A row costs one solve with the operator of the step of u.
+u and the rows of U are PETSc vectors. C, W and Y are small and equal on every rank, since they are
+computed only from sums over all ranks. Each row of U costs one linear solve per step.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ from livepde.petsc.petsc_model import (
     zeros,
 )
 
-ACCURATE = 1e-14  # relative change of the variances of modes
+ACCURATE = 1e-14  # relative change of the variances of modes at which their iteration ends
 
 
 @dataclass(frozen=True, eq=False)
 class PetscFilterState:
-    """Estimate and square root of the joint covariance after a sample; k unknowns a.
+    """Estimate and square root of the joint covariance after a sample, for k unknowns a.
 
-    State u, and k rows U of the square root, vectors of shape (n,); unknowns a in prior standard
-    deviations, (k,), and their square root C, (k, k). `refused` counts the readings of each sensor
-    that the gate has refused in a row; `modes` are the columns of Phi, k vectors of shape (m,).
+    The state u and the k rows U of the square root are vectors of shape (n,). The unknowns a, shape
+    (k,), are in prior standard deviations, and C, shape (k, k), is their square root. `refused` has
+    the number of consecutive refused readings of each sensor. `modes` has the k columns of Phi.
     """
 
     t: float
@@ -61,7 +61,7 @@ class PetscFilterState:
 
 @dataclass(frozen=True, eq=False)
 class FilterReport:
-    """Status of a sample; of shape (sensors,) z - G u, its expected size, and the used readings."""
+    """Status of a sample; innovation z - G u, its expected size and used readings, (sensors,)."""
 
     status: Status
     innovation: Array
@@ -82,13 +82,13 @@ class PetscFilter:
     modes
         The k columns of Phi, vectors of shape (m,): `number_modes` or `leading_modes`.
     noise
-        Standard deviation of a reading, one number or one for each sensor.
+        Standard deviation of a reading: a number, or one for each sensor.
     lower, upper
-        Bounds of each coefficient of q. An estimate beyond them is projected, and the state follows
-        by its sensitivity.
+        Bounds of each coefficient of q. An estimate outside is projected onto them, and the state
+        is corrected by its covariance with the unknowns.
     gate, patience
-        Readings further from their prediction than `gate` expected standard deviations are not
-        used, unless so many in a row were refused: then the process has really changed.
+        Readings with an innovation of more than `gate` expected standard deviations are refused,
+        unless the last `patience` readings were refused: then the process has really changed.
     """
 
     model: PetscModel
@@ -111,7 +111,7 @@ class PetscFilter:
         object.__setattr__(self, "stepper", ImplicitStep(self.model))
 
     def init(self, u0: Any, t0: float = 0.0) -> PetscFilterState:
-        """Return the state at the start: u0 is exact, the unknowns have their prior."""
+        """Return the initial state, in which u0 is exact and the unknowns have their prior."""
         k, u = len(self.modes), u0.copy()
         self.model.impose(u, t0)
         rows = [zeros(u) for _ in range(k)]
@@ -121,9 +121,9 @@ class PetscFilter:
     def step(
         self, state: PetscFilterState, t: float, z: Any
     ) -> tuple[PetscFilterState, FilterReport]:
-        """Return the state after a sample z at t, shape (sensors,), NaN where a reading is missing.
+        """Return the state after a sample z at t, shape (sensors,), NaN for missing readings.
 
-        Raises `LawError` if z has another shape, or t is not later than the sample before.
+        Raises `LawError` if z has a different shape, or t is not later than the last sample.
         """
         z = np.asarray(z, dtype=float)
         if z.shape != state.refused.shape:
@@ -137,11 +137,11 @@ class PetscFilter:
         return self.update(new, z)
 
     def parameter(self, state: PetscFilterState) -> Any:
-        """Return the estimate of q within its bounds, a new vector."""
+        """Return the estimate of q within its bounds as a new vector."""
         return self._bounded(combined(state.a, state.modes, self.prior))
 
     def deviation(self, state: PetscFilterState) -> Any:
-        """Return the standard deviation of each coefficient of q, a new vector."""
+        """Return the standard deviation of each coefficient of q as a new vector."""
         # The diagonal of Phi C^T C Phi^T.
         square = zeros(self.prior)
         for row in state.C:
@@ -151,7 +151,7 @@ class PetscFilter:
         return square
 
     def predict(self, state: PetscFilterState, t: float, h: float) -> PetscFilterState:
-        """Return the state a step later; raises `StepFailed`."""
+        """Return the predicted state after a step h; raises `StepFailed`."""
         q = self.parameter(state)
         u = self.stepper.solve(state.u, q, t, h)
         A, rows = self.model.jacobian_q(u, q, t + h), []
@@ -164,13 +164,13 @@ class PetscFilter:
         return replace(state, t=t + h, u=u, U=tuple(rows))
 
     def update(self, state: PetscFilterState, z: Array) -> tuple[PetscFilterState, FilterReport]:
-        """Return the state after the readings of its time."""
+        """Return the state updated by the readings z, and a report."""
         d = z - self.read(state.u)
         noise = np.broadcast_to(np.asarray(self.noise, dtype=float), z.shape)
         # Y N^(-1/2), shape (k, sensors), and the square root of the diagonal of N + Y^T Y.
         Y = np.array([self.read(row) for row in state.U]) / noise
         expected = noise * np.sqrt(1.0 + (Y**2).sum(axis=0))
-        # A sensor that the gate has refused `patience` times in a row is believed again.
+        # After `patience` consecutive refusals, the readings of a sensor are used again.
         present = np.isfinite(d)
         far = present & (np.abs(np.where(present, d, 0.0)) > self.gate * expected)
         used = present & (~far | (state.refused >= self.patience))
@@ -200,8 +200,8 @@ class PetscFilter:
         excess = self._bounded(q.copy()) - q
         if excess.norm() == 0.0:
             return state
-        # Least squares in the span of the modes: Phi^T Phi shift = Phi^T excess. The state follows
-        # by its covariance with a, U^T C^-T shift.
+        # Least squares in the span of the modes: Phi^T Phi shift = Phi^T excess. The correction of
+        # the state is U^T C^-T shift, by its covariance with a.
         square = np.array([inner(one, state.modes) for one in state.modes])
         shift = np.linalg.solve(square, inner(excess, state.modes))
         weights = np.asarray(np.linalg.solve(state.C.T, shift), dtype=float)
@@ -224,8 +224,8 @@ def leading_modes(model: PetscModel, count: int, *, iterations: int = 60) -> lis
     """Return the leading modes of the prior N(0, G_Q^-1) of a field, as columns of Phi.
 
     Eigenvectors of M_Q x = lambda G_Q x, largest lambda first, x^T G_Q x = 1, by subspace iteration
-    with twice as many vectors. Their start is the same on every number of ranks. Modes of equal
-    variance, as on a square, and signs may differ from run to run: a state carries its own.
+    with twice as many vectors. Their initial values are independent of the number of ranks. Signs
+    and modes of equal variance (on a square) may differ between runs, so a state stores its modes.
     """
     solver = linear_solver(model.gram, 1e-12)
     like = model.gram.createVecRight()

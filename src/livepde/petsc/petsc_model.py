@@ -17,13 +17,13 @@ from livepde.linalg import Array, IntArray
 from livepde.stepping import StepFailed
 
 RIESZ, PREFIX = "livepde_riesz_", "livepde_state_"  # prefixes of PETSc's options
-RESTING = 1e-6  # of u: residuals of smaller changes in a step are relative to it
+RESTING = 1e-6  # relative change of u in a step to which residuals of smaller changes are relative
 TINY = 1e-300
-SAME = 1e-9  # of a step: steps that are the same but for rounding
-REBUILD = 1.5  # times the iterations with a new preconditioner: then it is built again
-SHORTEST = 64  # steps that an interval is divided into at the most
-STEP = 1e-6  # of the differences of a check, relative
-CLOSE = 1e-5  # to a derivative, of a central difference with such a step
+SAME = 1e-9  # relative difference of equal steps, up to rounding
+REBUILD = 1.5  # growth of the iterations after which the preconditioner is rebuilt
+SHORTEST = 64  # largest number of steps in an interval
+STEP = 1e-6  # relative step of central differences in checks
+CLOSE = 1e-5  # relative error of these central differences
 ROUNDING = 1e-10
 MISSING = (
     "livepde.petsc needs petsc4py, mpi4py and, for UFL, DOLFINx; deploy/petsc.sh sets up an "
@@ -32,7 +32,7 @@ MISSING = (
 
 
 def petsc_module(name: str = "petsc4py.PETSc") -> Any:
-    """Return a module, by default that of PETSc, which starts MPI; raises `ConfigurationError`."""
+    """Import a module, by default PETSc, which starts MPI; raises `ConfigurationError`."""
     try:
         return import_module(name)
     except ModuleNotFoundError as error:
@@ -43,35 +43,35 @@ def petsc_module(name: str = "petsc4py.PETSc") -> Any:
 class PetscModel(Protocol):
     """A process M u' + F(u, q, t) = 0 on PETSc vectors and matrices.
 
-    F holds all terms without a time derivative, B(u) + A(u) q - f in the letters of the paper, as a
-    dual vector of X. u in X has n coefficients and q in Q has m; both are vectors of type
-    "standard", of which every rank owns a part. An action is the product with a matrix (`mult`),
-    its transpose `multTranspose`: a matrix may be a shell, except where "assembled" is said. A
-    matrix belongs to the model, and holds until the same method is called again.
+    F contains all terms without a time derivative, B(u) + A(u) q - f in the notation of the paper,
+    as a dual vector of X. u in X has n coefficients and q in Q has m. Both are vectors of type
+    "standard", distributed over the ranks. Matrices may be shells with `mult` and `multTranspose`,
+    unless they must be "assembled". A matrix is owned by the model and valid until the next call of
+    the same method.
 
-    `w` in the methods below is data of the state on the observed subdomain omega, shape (n,): there
-    F sees w, and u elsewhere, as the paper splits its integrals. Without w, F sees u everywhere.
-    Coefficients with Dirichlet values need no treatment in F, its derivatives and the matrices: the
-    laws eliminate the rows and columns `fixed`.
+    `w` in the methods below contains data of the state on the observed subdomain omega, shape (n,):
+    F is evaluated at w on omega and at u elsewhere, as in the paper. Without w, F is evaluated at u
+    everywhere. F, its derivatives and the matrices need not treat Dirichlet values, since the laws
+    eliminate the rows and columns `fixed`.
 
     Attributes
     ----------
     mass
         M, assembled, shape (n, n); symmetric positive definite.
     gram, mass_q
-        G_Q, the inner product of Q, assembled, and that of L2, for modes; shape (m, m).
+        G_Q, the inner product of Q, assembled, and the L2 inner product, for modes; shape (m, m).
     sensors
         G of point sensors or averages, shape (sensors, n).
     mass_observed, pull
-        Integrals over omega: M, and M_op of (MN1), assembled, shape (n, n).
+        M and M_op of (MN1), both integrated over omega, assembled, shape (n, n).
     push
-        N_op of (MN2), integrated over the rest, assembled, shape (n, n); None: omega is everything.
+        N_op of (MN2), integrated outside omega, assembled, shape (n, n); None: omega is the domain.
     fixed
         Global numbers of owned coefficients of u with Dirichlet values.
     linear
-        True if F is affine in u: one Newton update solves an implicit step.
+        Whether F is affine in u, so that one Newton update solves an implicit step.
     symmetric
-        True if M/h + dF/du is symmetric positive definite: conjugate gradients serve.
+        Whether M/h + dF/du is symmetric positive definite, for conjugate gradients.
     """
 
     mass: Any
@@ -87,11 +87,11 @@ class PetscModel(Protocol):
 
     @property
     def numbers_u(self) -> IntArray:
-        """Number of each owned coefficient of u in an order that no number of ranks changes."""
+        """Number of each owned coefficient of u, independent of the number of ranks."""
 
     @property
     def numbers_q(self) -> IntArray:
-        """The same for q."""
+        """Number of each owned coefficient of q, independent of the number of ranks."""
 
     def impose(self, u: Any, t: float) -> None:
         """Set the Dirichlet values of a time in u."""
@@ -100,15 +100,15 @@ class PetscModel(Protocol):
         """Return F(u, q, t), a new dual vector, shape (n,)."""
 
     def jacobian_u(self, u: Any, q: Any, t: float, w: Any = None) -> Any:
-        """Return dF/du, assembled, shape (n, n); None: zero, as for w with all of u observed."""
+        """Return dF/du, assembled, shape (n, n), or None if zero: with w and all of u observed."""
 
     def jacobian_q(self, u: Any, q: Any, t: float, w: Any = None) -> Any:
-        """Return dF/dq, shape (n, m); assembled if a `PetscObserver` uses it."""
+        """Return dF/dq, shape (n, m); a `PetscObserver` requires that it is assembled."""
 
     def coupling(self, w: Any, q: Any, t: float) -> Any:
         """Return A(w), the derivative of F in q integrated over omega, assembled, shape (n, m).
 
-        With all of u observed it is `jacobian_q` at w.
+        If all of u is observed, it equals `jacobian_q` at w.
         """
 
 
@@ -120,7 +120,7 @@ def combined(weights: Array, vectors: Sequence[Any], onto: Any = None) -> Any:
 
 
 def inner(x: Any, vectors: Sequence[Any]) -> Array:
-    """Return the inner products of x with several vectors, by one reduction, on every rank."""
+    """Return the inner products of x with vectors, on every rank, with a single reduction."""
     own = x.getArray(readonly=True)
     local = np.array([one.getArray(readonly=True) @ own for one in vectors])
     total: Array = x.comm.tompi4py().allreduce(local)
@@ -133,7 +133,7 @@ def gathered(small: Any) -> Array:
 
 
 def free_mask(x: Any, fixed: IntArray) -> Any:
-    """Return a vector like x with ones, and zeros at owned global numbers."""
+    """Return a vector like x with zeros at the owned global numbers `fixed`, and ones elsewhere."""
     mask = x.duplicate()
     mask.set(1.0)
     mask.getArray()[fixed - x.getOwnershipRange()[0]] = 0.0
@@ -141,23 +141,23 @@ def free_mask(x: Any, fixed: IntArray) -> Any:
 
 
 def random_vector(like: Any, numbers: IntArray, seed: int) -> Any:
-    """Return a vector of values in (-1, 1) that depend on `numbers` and the seed alone."""
+    """Return a vector of values in (-1, 1) that depend only on `numbers` and the seed."""
     vector = like.duplicate()
-    # The fractional part of a large sine: a hash as shaders use, equal on all ranks.
+    # The fractional part of a large sine is a hash function of shaders, equal on all ranks.
     hashed = 43758.5453 * np.sin(12.9898 * (np.asarray(numbers) + 1.0) + 78.233 * seed)
     vector.getArray()[:] = 2.0 * (hashed - np.floor(hashed)) - 1.0
     return vector
 
 
 def zeros(like: Any) -> Any:
-    """Return a zero vector like another one."""
+    """Return a zero vector with the layout of `like`."""
     vector = like.duplicate()
     vector.set(0.0)
     return vector
 
 
 def linear_solver(matrix: Any, accuracy: float, kind: str = "cg", prefix: str = RIESZ) -> Any:
-    """Return a solver with algebraic multigrid, which PETSc's options with the prefix change."""
+    """Return a solver with algebraic multigrid; PETSc's options with the prefix apply to it."""
     solver = petsc_module().KSP().create(matrix.comm)
     solver.setOptionsPrefix(prefix)
     solver.setOperators(matrix)
@@ -169,12 +169,12 @@ def linear_solver(matrix: Any, accuracy: float, kind: str = "cg", prefix: str = 
 
 
 def multigrid() -> str:
-    """Return the algebraic multigrid of this PETSc: BoomerAMG if it was built with hypre."""
+    """Return the name of the algebraic multigrid: hypre (BoomerAMG) if available, else gamg."""
     return "hypre" if petsc_module().Sys.hasExternalPackage("hypre") else "gamg"
 
 
 def standard_vector(comm: Any, local: int) -> Any:
-    """Return a zero vector of PETSc's standard type with so many owned values."""
+    """Return a zero vector of PETSc's standard type with `local` owned values."""
     vector = petsc_module().Vec().create(comm)
     vector.setSizes((local, None))
     vector.setType("standard")
@@ -183,9 +183,9 @@ def standard_vector(comm: Any, local: int) -> Any:
 
 
 def advance(stage: Callable[..., Any], state: Any, t0: float, t1: float) -> tuple[Any, Status]:
-    """Return the state at t1 by stages over [t, t + h], halved where one fails, and a status.
+    """Return the state at t1 and a status; steps [t, t + h] are halved after a failure.
 
-    With a status other than "ok" the state is that of t0.
+    With a status other than "ok", the state is unchanged.
     """
     count, done, now = 1, 0, state
     while done < count:
@@ -195,7 +195,7 @@ def advance(stage: Callable[..., Any], state: Any, t0: float, t1: float) -> tupl
         except StepFailed as failure:
             if count >= SHORTEST:
                 return state, Status.of(failure)
-            # Steps half as long: those that are done count twice.
+            # With half the step, completed steps count twice.
             count, done = 2 * count, 2 * done
         else:
             done += 1
@@ -203,19 +203,19 @@ def advance(stage: Callable[..., Any], state: Any, t0: float, t1: float) -> tupl
 
 
 def require_order(who: str, lower: float, upper: float) -> None:
-    """Raise `LawError` if bounds are not in order."""
+    """Raise `LawError` unless lower < upper."""
     if not lower < upper:
         raise LawError(f"{who}: lower must be less than upper; got {lower} and {upper}.")
 
 
 @dataclass(eq=False)
 class ImplicitStep:
-    """Newton's iteration for M (u+ - u)/h + F(u+, q, t + h) = 0, and S^{-1}, S = M/h + dF/du.
+    """Newton's method for M (u+ - u)/h + F(u+, q, t + h) = 0, and S^{-1} with S = M/h + dF/du.
 
-    The preconditioner is algebraic multigrid, kept until it needs `REBUILD` times the iterations
-    that it took when new. PETSc's options with the prefix `livepde_state_` replace both.
+    The preconditioner is algebraic multigrid, which is rebuilt if the number of iterations exceeds
+    `REBUILD` times that of a new one. PETSc's options with the prefix `livepde_state_` apply.
 
-    `tolerance` bounds the residual relative to its terms, in the dual norm by the diagonal of M.
+    `tolerance` bounds the residual relative to its terms, in the dual norm with the diagonal of M.
     """
 
     model: PetscModel
@@ -237,7 +237,7 @@ class ImplicitStep:
         u = begin.copy()
         model.impose(u, t + h)
         rate = begin.duplicate()
-        # At rest all terms vanish: then the residual is relative to that of a small change of u.
+        # At rest all terms vanish. The residual is then relative to that of a small change of u.
         least = RESTING * self.dual(model.mass * begin) / h
         stale = True
         for count in range(self.iterations + 1):
@@ -255,7 +255,7 @@ class ImplicitStep:
                 raise StepFailed("not_converged", left)
             if stale:
                 self.linearise(u, q, t + h, h)
-                # One operator serves all updates of a linear process.
+                # All updates of a linear process have the same operator.
                 stale = not model.linear
             u.axpy(-1.0, self.back(force))
         if stale:
@@ -263,12 +263,12 @@ class ImplicitStep:
         return u
 
     def dual(self, functional: Any) -> float:
-        """Return the dual norm of a functional on the free coefficients, by the diagonal of M."""
+        """Return the dual norm of a functional on free coefficients, with the diagonal of M."""
         free = functional * self.free
         return math.sqrt(abs(float(free.dot(free * self.weights))))
 
     def linearise(self, u: Any, q: Any, t: float, h: float) -> None:
-        """Assemble S = M/h + dF/du at a point, fixed coefficients eliminated."""
+        """Assemble S = M/h + dF/du at a point, with fixed coefficients eliminated."""
         model, S = self.model, self.model.mass.copy()
         S.scale(1.0 / h)
         slope = model.jacobian_u(u, q, t)
@@ -286,7 +286,7 @@ class ImplicitStep:
 
     def back(self, b: Any) -> Any:
         """Return S^{-1} b, zero at fixed coefficients; raises `StepFailed`."""
-        petsc_module().garbage_cleanup(b.comm)  # vectors that all ranks have dropped
+        petsc_module().garbage_cleanup(b.comm)  # frees vectors that no rank uses any more
         x = b.duplicate()
         self.ksp.solve(b * self.free, x)
         reason, self._last = self.ksp.getConvergedReason(), self.ksp.getIterationNumber()
@@ -299,9 +299,9 @@ class ImplicitStep:
 def check_petsc_model(
     model: PetscModel, u: Any, q: Any, t: float = 0.0, w: Any = None, *, seed: int = 1
 ) -> CheckReport:
-    """Check the assumptions of the laws at a point u, q, t, in random directions.
+    """Check the assumptions of the laws at a point (u, q, t) in random directions.
 
-    With data w on omega it is what `PetscObserver` relies on, without what `PetscFilter` does.
+    With data w on omega, the assumptions are those of `PetscObserver`, else of `PetscFilter`.
     """
     du = random_vector(u, model.numbers_u, seed) * free_mask(u, model.fixed)
     dq = random_vector(q, model.numbers_q, seed + 1)
