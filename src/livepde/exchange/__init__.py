@@ -1,4 +1,4 @@
-"""Embedding in other programs: co-simulation units (FMI) and online learners."""
+"""Integration into other programs: co-simulation units (FMI) and online learners."""
 
 from livepde.exchange.fmu_export import export_fmu
 from livepde.exchange.regressor import OnlineRegressor, river_regressor

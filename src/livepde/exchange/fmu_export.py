@@ -70,7 +70,7 @@ ctypes.pythonapi.Py_IncRef(ctypes.py_object(globals()))
 class Recipe:
     """Instructions and files to rebuild a process elsewhere."""
 
-    process: UnitProcess  # unitProcess as built here
+    process: UnitProcess  # process of the unit, built during the export
     files: Mapping[str, bytes]  # mapping from file name to content
 
 
@@ -120,7 +120,7 @@ def _dated(case: Case) -> tuple[datetime | None, DataTimes | None]:
     if case.live or (data.file is None and data.reader is None):
         return None, None
     prepared = case.read()
-    case.begin(prepared.first, prepared.origin)  # what does not fit together raises here
+    case.begin(prepared.first, prepared.origin)  # raises an error if data and case do not fit
     if not isinstance(prepared.stream, DataTable):
         return prepared.origin, None
     t = prepared.stream.t / case.clock.second
@@ -130,7 +130,7 @@ def _dated(case: Case) -> tuple[datetime | None, DataTimes | None]:
 
 def _moved(name: str, folder: Path, files: dict[str, bytes]) -> str:
     """Return the name of user code within the unit, and add its file to `files`."""
-    # A file comes with the unit; a module has to be installed where the unit runs.
+    # The unit contains files; modules must be installed where the unit runs.
     source, _, attribute = name.rpartition(":")
     return f"{_taken(folder / source, files)}:{attribute}" if source.endswith(".py") else name
 
@@ -225,7 +225,7 @@ def write_unit(
 
 
 def _built(builder: Any, recipe: Recipe, name: str, fmi: int, folder: Path) -> Path:
-    # The name becomes that of a class of the script.
+    # The name becomes a class name in the script.
     if not name[0].isalpha():
         name = f"unit_{name}"
     script = SCRIPT.format(exporter=EXPORTERS[fmi], fmi=fmi, name=name)
@@ -247,7 +247,7 @@ def _built(builder: Any, recipe: Recipe, name: str, fmi: int, folder: Path) -> P
             project_files=[inside],
             **dict.fromkeys(ABLE, True),
         )
-    finally:  # the builder leaves behind where it looked
+    finally:  # the builder does not restore the search path
         sys.path[:] = path
         sys.modules.pop(module, None)
     return found

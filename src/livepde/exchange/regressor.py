@@ -12,7 +12,7 @@ from livepde.identifier import Identifier
 
 
 class OnlineRegressor:
-    """Online regressor with the verbs of river, learning and predicting one sample at a time.
+    """Online regressor with the methods of river, which learns and predicts single samples.
 
     A sample has features x, a mapping with the time and the inputs by their names, and a target y:
     the sensor reading, or a mapping from sensor to reading if there are several. Missing features
@@ -88,7 +88,7 @@ def river_regressor(identifier: Identifier, time: str = "t") -> Any:
         raise ConfigurationError("A regressor of river needs it: pip install river.") from None
     several = len(identifier.observed.names) > 1
     kind = base.MultiTargetRegressor if several else base.Regressor
-    # The class is made here: this module is imported without river, too.
+    # The class is defined here, since this module can be imported without river.
     return type("RiverRegressor", (OnlineRegressor, kind), {"__doc__": OnlineRegressor.__doc__})(
         identifier, time
     )

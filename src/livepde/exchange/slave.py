@@ -19,9 +19,9 @@ from livepde.exchange.unit_process import PERIOD, STATUS, Component, ScalarVaria
 from livepde.units import in_si
 
 if not sys.orig_argv:
-    # In a host program other than Python the exporters finalise the interpreter from a thread of
-    # their own. Its final garbage collection has crashed there, depending on the memory layout.
-    # Without that collection nothing is lost, since the memory is released anyway.
+    # If the host program is not Python, the exporters finalise the interpreter from their own
+    # thread. Its final garbage collection has crashed there, depending on the memory layout. The
+    # collection is not needed, since the memory is released anyway.
     atexit.register(gc.freeze)
 
 
@@ -32,7 +32,7 @@ class IdentifierSlave:
     """
 
     fmi: int
-    log: Callable[..., None]  # of the second base, as the next
+    log: Callable[..., None]  # method of the second base, like the next
     register_variable: Callable[..., None]
 
     def __init__(self, **options: Any) -> None:
@@ -47,7 +47,7 @@ class IdentifierSlave:
         self._register(process)
 
     def _kit(self, name: str) -> Any:
-        """Return a class of the exporter: DefaultExperiment, or {}Status as Fmi2Status."""
+        """Return a class of the exporter: DefaultExperiment, or {}Status such as Fmi2Status."""
         exporter = "pythonfmu" if self.fmi == 2 else "pythonfmu3"
         module = f"{exporter}.enums" if name == "{}Status" else exporter
         return getattr(importlib.import_module(module), name.format(f"Fmi{self.fmi}"))
@@ -66,7 +66,7 @@ class IdentifierSlave:
             self.register_variable(self._kit(kind)(item.name, **about), nested=False)
             self._units[item.name] = item.unit
 
-        # FMI 3.0 wants the independent variable as a variable; FMI 2.0 leaves it out.
+        # FMI 3.0 requires the independent variable as a variable; FMI 2.0 omits it.
         if self.fmi == 3:
             time = ScalarVariable("time", "s", "Time.")
             add(real, time, causality.independent, float, variability=variability.continuous)
@@ -86,7 +86,7 @@ class IdentifierSlave:
         root.set("variableNamingConvention", "flat")
         root.set("generationTool", f"livepde {__version__} by {root.get('generationTool')}")
         if any(self._units.values()):
-            # The schema of FMI wants the units directly after the kind of the interface.
+            # The schema of FMI requires the units directly after the kind of the interface.
             root.insert(1, _definitions(set(self._units.values()) - {""}))
         for variable in root.findall("ModelVariables/*"):
             real = variable.find("Real") if self.fmi == 2 else variable
@@ -95,7 +95,7 @@ class IdentifierSlave:
             if unit := self._units[variable.attrib["name"]]:
                 real.set("unit", unit)
             if real.get("start") == "nan":
-                real.set("start", "NaN")  # as XML writes it
+                real.set("start", "NaN")  # notation of XML
         outputs = root.find("ModelStructure/Outputs")
         if self.fmi == 2 and outputs is not None:
             # FMI 2.0 lists outputs a second time: those that have a value after initialisation.
@@ -105,7 +105,7 @@ class IdentifierSlave:
         return root
 
     def do_step(self, current_time: float, step_size: float) -> bool:
-        """Take the inputs as the sample of the current time; errors set the status output."""
+        """Use the inputs as the sample of the current time; errors set the status output."""
         told = self.component.take(current_time)
         if told:
             self.log(told, self._kit("{}Status").warning)

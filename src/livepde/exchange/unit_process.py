@@ -30,7 +30,7 @@ from livepde.units import conversion
 
 # Name of the parameter of a unit.
 PERIOD = "sample_period"
-REFUSED, WAITING = -2, -1  # beside the indices of `STATUS_CODES`
+REFUSED, WAITING = -2, -1  # statuses in addition to the indices of `STATUS_CODES`
 # Largest number of vertices of a field that become outputs, one for each vertex.
 LARGEST = 1000
 # Units of differences on temperature scales with an offset.
@@ -38,7 +38,7 @@ STEPS = {"degC": "K", "degF": "degR"}
 STATUS = "How the last step went: {}, {} waits for a first sample, {} sample refused.".format(
     ", ".join(f"{k} {code}" for k, code in enumerate(STATUS_CODES)), WAITING, REFUSED
 )
-# Difference of times that is attributed to rounding, relative to the period.
+# Largest difference of equal times due to rounding, relative to the period.
 SAME = 1e-9
 
 
@@ -83,7 +83,7 @@ class UnitProcess:
     """An identifier with the inputs and outputs of a co-simulation unit."""
 
     name: str
-    title: str  # one line about it
+    title: str  # one-line description
     model: Model
     inputs: tuple[Port, ...]  # input channels, read at each communication point
     # Sensor channels whose model values are outputs, including those for validation
@@ -91,13 +91,13 @@ class UnitProcess:
     # Function that returns the identifier started by a first sample; it may raise `LivepdeError`
     begin: Callable[[Sample], Identifier]
     second: float = 1.0  # one second in the model's unit of time
-    missing: Missing = frozenset()  # numbers that mean a missing sample, besides NaN
+    missing: Missing = frozenset()  # numbers for missing values, in addition to NaN
     covariance: bool = True  # true if the law provides standard deviations
     experiment: DataTimes | None = None  # times of the case's own data, if it has any
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Unknown fields that are outputs: those that are not too large."""
+        """Unknown fields that are outputs, since they are not too large."""
         small = len(self.model.mesh.p[0]) <= LARGEST
         return tuple(self.model.parameter_space.fields) if small else ()
 
@@ -168,7 +168,7 @@ class UnitProcess:
                 deviations = profiles.get(f"{name}_std", np.full_like(values, math.nan))
                 for pair in zip(values.tolist(), deviations.tolist(), strict=True):
                     found += self._pair(*pair)
-        # A forecast for the present has the model's values of all sensors, validation ones too.
+        # A forecast for the current time has the model's values of all sensors and validation.
         now = identifier.forecast(identifier.t)
         return [*found, *(port.given(float(now[port.name][0])) for port in self.sensors)]
 
@@ -190,7 +190,7 @@ def of_case(case: Case, origin: datetime | None = None) -> UnitProcess:
         if channel.noise_column is not None:
             text = "an exported unit has no input for the noise of each reading: leave it out."
             raise case.error(f"channels.{name}.noise_column", text)
-        # With a factor, values of the data are in no unit that the case states.
+        # With a factor, the unit of the data is not known.
         unit = "" if channel.factor is not None else channel.unit or case.unit(name)
         column = replace(case.columns[name], names=(name,))
         columns = " and ".join(channel.sources)
@@ -237,7 +237,7 @@ def of_code(name: str, build: Callable[[], Identifier]) -> UnitProcess:
         identifier.model,
         (*sensors, *inputs),
         (*sensors, *unseen),
-        # Each instance of the unit starts from a copy: `identifier` stays as it was built.
+        # Each instance of the unit starts from a copy, so that `identifier` is not changed.
         lambda first: copy.deepcopy(identifier),
         second,
         covariance=not isinstance(identifier.law, GradientLaw),
@@ -273,7 +273,7 @@ class Component:
         self._identifier: Identifier | None = None
 
     def take(self, seconds: float) -> str:
-        """Take the present inputs as the sample of a time; return a message for the user, or ''."""
+        """Use the present inputs as the sample at a time; return a message for the user, or ''."""
         if self.period > 0.0 and seconds < self._next:
             return ""
         process, t = self.process, seconds * self.process.second
@@ -289,7 +289,7 @@ class Component:
                 # communication times must neither skip nor repeat a sample.
                 self._next = self.period * (math.floor(seconds / self.period + SAME) + 1.0 - SAME)
         except LivepdeError as error:
-            if math.isnan(self.outputs[0]):  # the first one: the next may begin
+            if math.isnan(self.outputs[0]):  # first sample failed: the next one may begin
                 self._identifier = None
             self.status = WAITING if self._identifier is None else REFUSED
             return f"t = {seconds:g} s: {error}"
@@ -307,7 +307,7 @@ class Component:
         return checkpoint.packed({}, leaves)
 
     def restore(self, content: bytes) -> None:
-        """Restore a state returned by `dump`; raise `RunError` if it is of another unit."""
+        """Restore a state returned by `dump`; raise `RunError` if it is from a different unit."""
         where = "the state of the unit"
         _, leaves = checkpoint.unpacked(content, where)
         self.inputs, self.outputs = leaves["inputs"].tolist(), leaves["outputs"].tolist()
@@ -323,16 +323,16 @@ class Component:
         self._identifier.restore(leaves["identifier"].tobytes(), where)
 
     def _sample(self) -> dict[str, float] | None:
-        """Return the inputs in the model's units, NaN if missing; None without a needed one."""
+        """Return the inputs in the model's units, NaN if missing; None if a needed one is."""
         ports, missing = self.process.inputs, self.process.missing
         given = zip(ports, self.inputs, strict=True)
         z = {port.name: port.taken(value, missing) for port, value in given}
-        # A case leaves out rows of its data without a needed channel, too.
+        # Rows of a case's data without a needed channel are also left out.
         lost = any(math.isnan(z[port.name]) for port in ports if port.column.needed)
         return None if lost else z
 
     def _begun(self, first: Array) -> Identifier:
-        """Return the identifier started by a first sample: its time, then the inputs."""
+        """Return the identifier started by a first sample of a time and the inputs."""
         self._first = first
         names = [port.name for port in self.process.inputs]
         z = dict(zip(names, first[1:].tolist(), strict=True))
