@@ -22,22 +22,22 @@ from livepde.plots import PALETTE, labelled, time_scale
 from livepde.plots.style import shown_unit, unit_of
 from livepde.runs import jumps
 
-FAR = 1e11  # seconds from the origin beyond which times are numbers
-DECADES = 100.0  # from which ratio on a scale is logarithmic
+FAR = 1e11  # seconds from the origin beyond which times are shown as numbers
+DECADES = 100.0  # ratio of values from which a scale is logarithmic
 INK, GRID = "#1f2933", "#e4e7eb"
 HEIGHT = 320
-# A second axis, for marks at a time that have no value.
+# A second axis for marks at times without a value.
 MARKS: Any = {"overlaying": "y", "range": [0, 1], "visible": False, "fixedrange": True}
-CONFIG: Any = {"displayModeBar": False, "responsive": True}  # for Plotly
+CONFIG: Any = {"displayModeBar": False, "responsive": True}  # of Plotly
 
 
 def text(value: object) -> str:
-    """Return text from a file, escaped so that Plotly shows it unchanged."""
+    """Escape text from a file, so that Plotly shows it unchanged."""
     return html.escape(str(value), quote=False)
 
 
 def unit_label(data: xr.Dataset, name: str) -> str:
-    """Return the unit of a variable for an axis."""
+    """Return the unit of a variable in the notation of axes."""
     return shown_unit(unit_of(data, name))
 
 
@@ -55,7 +55,7 @@ def empty(xlabel: str = "", ylabel: str = "", height: int = HEIGHT) -> go.Figure
         hovermode="x unified",
         hoverlabel={"namelength": 24},
         legend={"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"},
-        uirevision="kept",  # zoom, camera and hidden lines survive an update
+        uirevision="kept",  # preserves zoom, camera and hidden lines in an update
     )
     figure.update_xaxes(**axis, title={"text": text(xlabel), "standoff": 6})
     figure.update_yaxes(**axis, title={"text": text(ylabel), "standoff": 8}, exponentformat="power")
@@ -90,7 +90,7 @@ def line(
     dash: str | None = None,
     **more: Any,
 ) -> None:
-    """Draw a line; `more` goes to Plotly's scatter."""
+    """Draw a line; `more` contains arguments of Plotly's scatter."""
     style = {"color": colour, "width": width, "dash": dash}
     figure.add_scatter(x=x, y=y, line=style, **{"mode": "lines", **more})
 
@@ -107,7 +107,7 @@ def band(
 
 
 def show(figure: go.Figure, parts: Sequence[Array]) -> None:
-    """Let the axis show all finite values; positive ones over decades on a logarithmic scale."""
+    """Fit the axis to all finite values, with a logarithmic scale for positive ones over decades."""
     values = np.concatenate([np.ravel(part) for part in parts])
     values = values[np.isfinite(values)]
     if not len(values):
@@ -122,9 +122,9 @@ def show(figure: go.Figure, parts: Sequence[Array]) -> None:
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """Axis of model times: dates, or numbers in a unit that suits the span."""
+    """Axis of model times: dates, or numbers in a unit that fits the span."""
 
-    # The coordinate is start + t * scale: of dates in milliseconds since 1970, as Plotly has them
+    # Coordinates are start + t * scale, for dates in milliseconds since 1970, as in Plotly.
     scale: float
     start: float = 0.0
     unit: str = ""  # unit of numbers
@@ -135,7 +135,7 @@ class TimeAxis:
         return self.start + np.asarray(t, dtype=float) * self.scale
 
     def text(self, t: float) -> str:
-        """Return one time as text."""
+        """Return a time as text."""
         value = self.values(t)
         if self.dates and np.isfinite(value):
             return str(np.datetime64(int(value), "ms").astype("datetime64[s]")).replace("T", " ")
@@ -154,7 +154,7 @@ def when_axis(data: xr.Dataset) -> TimeAxis:
 
 
 def at_time(data: xr.Dataset, dimension: str, at: float | None) -> int:
-    """Return the index of the last entry up to a time; -1 of an empty dataset."""
+    """Return the index of the last entry up to a time; -1 for an empty dataset."""
     times = data[dimension].values
     if at is None or not len(times):
         return len(times) - 1

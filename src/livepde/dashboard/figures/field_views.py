@@ -22,8 +22,8 @@ from livepde.plots import GREY, PALETTE, interval_95, sensor_places
 from livepde.plots.style import axis_label
 from livepde.runs.exported import kinds_of
 
-MOST_LINES = 120  # of a map in each direction
-OUTSIDE = 1e-9  # barycentric coordinates may be negative by so much
+MOST_LINES = 120  # largest number of lines of a map in each direction
+OUTSIDE = 1e-9  # tolerance of negative barycentric coordinates
 # A hexahedron as six tetrahedra around its diagonal from corner 0 to corner 6.
 TETRAHEDRA = ((0, 1, 2, 6), (0, 2, 3, 6), (0, 3, 7, 6), (0, 7, 4, 6), (0, 4, 5, 6), (0, 5, 1, 6))
 FACES = {
@@ -37,19 +37,19 @@ FACES = {
         (3, 0, 4, 7),
     ),
 }
-FINE = 0.2  # share of a mesh's lines on each side that may lie far out
-OUT = 4.0  # how many times larger a domain is than where its mesh is fine, to begin there
+FINE = 0.2  # share of a mesh's lines on each side that may be far outside
+OUT = 4.0  # size of a domain over its finely meshed part from which a map begins with this part
 
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """A plane domain on a grid that is as fine as its mesh."""
+    """A grid on a plane domain that is as fine as its mesh."""
 
-    x: Array  # lines of the grid
+    x: Array  # coordinates of the grid lines
     y: Array
-    # From vertices to the points of the grid, row by row; shape (len(y) * len(x), vertices)
+    # Interpolation from vertices to grid points, row by row; shape (len(y) * len(x), vertices)
     weights: sp.csr_array
-    inside: Any  # points that lie in the domain
+    inside: Any  # points inside the domain
 
     def of(self, values: Array) -> Array:
         """Return a field on the grid, shape (len(y), len(x)); NaN outside the domain."""
@@ -63,17 +63,17 @@ class Surface:
 
     points: Array  # shape (points, 3)
     triangles: Any  # shape (triangles, 3)
-    weights: sp.csr_array  # from the vertices of the mesh to the points
+    weights: sp.csr_array  # interpolation from the vertices of the mesh to the points
 
     def of(self, values: Array) -> Array:
-        """Return a field at the points."""
+        """Return the values of a field at the points."""
         found: Array = self.weights @ values
         return found
 
 
 @dataclass(frozen=True)
 class _Mesh:
-    """Vertices and cells, equal by their content: a key for cached cuts."""
+    """Vertices and cells, compared by their content: a key of cached cuts."""
 
     content: tuple[bytes, bytes]
     points: Array = field(compare=False)
@@ -81,7 +81,7 @@ class _Mesh:
 
     @classmethod
     def of(cls, data: xr.Dataset) -> _Mesh:
-        """Return the mesh of a dataset; without cells those of Delaunay."""
+        """Return the mesh of a dataset; default cells: a Delaunay triangulation."""
         points = np.column_stack([data[axis].values for axis in "xyz" if axis in data.coords])
         kinds = kinds_of(data)
         cells = data[kinds[0]].values if kinds else Delaunay(points).simplices
@@ -90,7 +90,7 @@ class _Mesh:
 
 
 def plane_map(data: xr.Dataset) -> Map:
-    """Return the map of a run in two space dimensions."""
+    """Return the grid of a run in two space dimensions."""
     return _plane_map(_Mesh.of(data))
 
 
@@ -108,9 +108,9 @@ def slices(data: xr.Dataset, share: float = 0.5) -> list[Surface]:
 
 
 def _lines(values: Array) -> Array:
-    """Return the lines of a grid: through vertices, and between them while there are few."""
+    """Return the lines of a grid: through vertices, and between these if there are few."""
     lines = np.unique(values.round(12))
-    # Every other line while there are too many, but always the last; then halve the distances.
+    # Every other line and the last one while there are too many; then halve the distances.
     while len(lines) > MOST_LINES:
         lines = np.unique(np.append(lines[::2], lines[-1]))
     while 2 * len(lines) - 1 <= MOST_LINES:
@@ -139,7 +139,7 @@ def _plane_map(mesh: _Mesh) -> Map:
         i, j = np.meshgrid(
             np.arange(columns[0][k], columns[1][k]), np.arange(rows[0][k], rows[1][k])
         )
-        # Barycentric coordinates of the grid points in the box of a triangle, by Cramer's rule.
+        # Barycentric coordinates of grid points in a triangle's bounding box, by Cramer's rule.
         to_b, to_c = b - a, c - a
         area = to_b[0] * to_c[1] - to_b[1] * to_c[0]
         if not i.size or not area:
@@ -165,7 +165,7 @@ def _boundary(mesh: _Mesh) -> Surface:
     _, first, count = np.unique(
         np.sort(every, axis=1), axis=0, return_index=True, return_counts=True
     )
-    outer = every[first[count == 1]]  # a face between two cells is there twice
+    outer = every[first[count == 1]]  # faces between two cells occur twice
     if outer.shape[1] == 4:
         outer = np.vstack([outer[:, [0, 1, 2]], outer[:, [0, 2, 3]]])
     used, triangles = np.unique(outer, return_inverse=True)
@@ -188,8 +188,8 @@ def _slice(points: Array, cells: Any, axis: int, at: float) -> Surface:
     above = (height >= 0.0)[cells]
     order = np.argsort(~above, axis=1, kind="stable")  # corners above the plane come first
     cells, count = np.take_along_axis(cells, order, axis=1), above.sum(axis=1)
-    # The plane cuts off one corner or three (a triangle), or two (a quadrilateral: two triangles).
-    edges = []  # of three edges that are cut each makes a triangle
+    # A cut that separates one or three corners is a triangle, else it is two triangles.
+    edges = []  # three cut edges of each triangle
     for number, triangles in (
         (1, (((0, 1), (0, 2), (0, 3)),)),
         (2, (((0, 2), (0, 3), (1, 3)), ((0, 2), (1, 3), (1, 2)))),
@@ -200,8 +200,8 @@ def _slice(points: Array, cells: Any, axis: int, at: float) -> Surface:
     every = np.concatenate(edges).reshape(-1, 2)
     ends, triangles_of = np.unique(np.sort(every, axis=1), axis=0, return_inverse=True)
     first, second = height[ends[:, 0]], height[ends[:, 1]]
-    # The height is linear along an edge, and zero where the plane cuts it.
-    share = first / (first - second)  # one is above the plane, the other one below it
+    # The height above the plane is linear along an edge, and zero at the cut.
+    share = first / (first - second)  # both have opposite signs
     rows = np.arange(len(ends))
     weights = sp.csr_array(
         (np.append(1.0 - share, share), (np.append(rows, rows), ends.T.ravel())),
@@ -224,7 +224,7 @@ def drawn_by(data: xr.Dataset, cut: float) -> tuple[Callable[..., go.Figure], st
 
 
 def field_profile(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure:
-    """Draw a field along an interval: with its 95 % band, and as it was at the start."""
+    """Draw a field along an interval, with its 95 % band and its initial values."""
     k = canvas.at_time(data, "snapshot", at)
     figure = canvas.empty(axis_label(data, "x"), canvas.unit_label(data, name))
     x, values = data["x"].values, data[name].values
@@ -233,7 +233,7 @@ def field_profile(data: xr.Dataset, name: str, at: float | None = None) -> go.Fi
         canvas.line(figure, x, values[0], GREY, 1.2, "dot", name="start", hovertemplate="%{y:.4g}")
     if f"{name}_std" in data:
         low, high = interval_95(data, name)
-        # The wide band of the prior would determine the scale and hide all later values.
+        # The wide band of the prior would hide all later values, so it does not set the scale.
         late = slice(len(values) // 10, None)
         reach += [low[late], high[late]]
         canvas.band(figure, x, low[k], high[k], PALETTE[0], name)
@@ -244,7 +244,7 @@ def field_profile(data: xr.Dataset, name: str, at: float | None = None) -> go.Fi
 
 
 def field_map(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure:
-    """Draw a field on a plane domain, on lines as dense as its mesh."""
+    """Draw a field on a plane domain, on a grid as fine as its mesh."""
     drawn = plane_map(data)
     values = data[name].values[canvas.at_time(data, "snapshot", at)]
     figure = canvas.empty(axis_label(data, "x"), axis_label(data, "x", "y"), height=380)
@@ -275,7 +275,7 @@ def field_map(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure
 
 
 def _fine(lines: Array) -> list[float] | None:
-    """Return where a mesh is fine, if its domain extends far beyond."""
+    """Return the finely meshed part of a domain if the domain is much larger."""
     low, high = np.quantile(lines, [FINE, 1.0 - FINE]).tolist()
     return [low, high] if np.ptp(lines) > OUT * (high - low) else None
 
@@ -283,7 +283,7 @@ def _fine(lines: Array) -> list[float] | None:
 def field_solid(
     data: xr.Dataset, name: str, at: float | None = None, cut: float = 0.5
 ) -> go.Figure:
-    """Draw a field in a solid: its surface, seen through, and cuts across x, y and z."""
+    """Draw a field in a solid: a transparent surface, and cuts across x, y and z."""
     values = data[name].values[canvas.at_time(data, "snapshot", at)]
     figure = canvas.empty(height=440)
     parts = [(boundary(data), 0.15), *((found, 1.0) for found in slices(data, cut))]
@@ -323,7 +323,7 @@ def field_solid(
 
 
 def _colours(data: xr.Dataset, name: str) -> dict[str, Any]:
-    """Return the colours of a field and their bar."""
+    """Return the colours of a field and their colour bar."""
     title = {"text": canvas.text(canvas.unit_label(data, name)), "side": "right"}
     bar = {"title": title, "thickness": 14, "outlinewidth": 0, "exponentformat": "power"}
     return {"colorscale": "Cividis" if name.endswith("_std") else "Viridis", "colorbar": bar}

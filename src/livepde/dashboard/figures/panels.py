@@ -30,7 +30,7 @@ SECTIONS = {
     "sensors": "Residuals",
     "told": "Identifiability",
 }
-MOST_POINTS = 2000  # of a line
+MOST_POINTS = 2000  # largest number of points of a line
 SURE, FLAT = 0.1, 0.9  # shares of the prior standard deviation: determined, not identifiable
 
 
@@ -64,7 +64,7 @@ def panels(data: xr.Dataset, at: float | None = None, cut: float = 0.5) -> list[
 
 
 def _measured_panels(data: xr.Dataset, at: float | None) -> Iterator[Panel]:
-    """Yield a panel for the sensors of each unit, where the readings are known."""
+    """Yield a panel for the sensors of each unit if readings are known."""
     if not any(name in data for name in READINGS.values()):
         return
     units = style.sensors_by_unit(data)
@@ -80,7 +80,7 @@ def _measured_panels(data: xr.Dataset, at: float | None) -> Iterator[Panel]:
 
 
 def measured(data: xr.Dataset, sensors: Sequence[str], unit: str, at: float | None) -> go.Figure:
-    """Draw readings and predictions of sensors of one unit."""
+    """Draw readings and predictions of sensors with one unit."""
     data = _bounded(data)
     figure, axis = canvas.over_time(data, style.shown_unit(unit), at)
     t = axis.values(data["time"].values)
@@ -114,7 +114,7 @@ def measured(data: xr.Dataset, sensors: Sequence[str], unit: str, at: float | No
 
 
 def _line_mode(t: Array) -> str:
-    """Return the mode of a line, of which a single point would not be seen."""
+    """Return the mode of a line, with markers if it would be invisible as a single point."""
     return "lines+markers" if len(t) == 1 else "lines"
 
 
@@ -217,7 +217,7 @@ def unknowns(data: xr.Dataset, labels: Sequence[str], at: float | None = None) -
     data = _bounded(data)
     figure, axis = canvas.over_time(data, canvas.unit_label(data, labels[0]), at)
     t = axis.values(data["time"].values)
-    # The prior's band would flatten everything that follows.
+    # The wide band of the prior would hide all later values.
     late = slice(max(len(t) // 2, style.scored_from(data) + len(t) // 20), None)
     reach: list[Array] = []
     opacity = 0.2 if len(labels) <= 2 else 0.1
@@ -247,7 +247,7 @@ def unknowns(data: xr.Dataset, labels: Sequence[str], at: float | None = None) -
 
 
 def _short(label: str) -> str:
-    """Return the region of a label that has one."""
+    """Return the region in a label."""
     return label.partition("[")[2].removesuffix("]") or label
 
 
@@ -270,7 +270,7 @@ def _mark_failures(figure: go.Figure, data: xr.Dataset, axis: canvas.TimeAxis) -
 def residuals(
     data: xr.Dataset, variable: str, dimension: str, at: float | None = None
 ) -> go.Figure:
-    """Draw errors of sensors over time: each, or of many their range.
+    """Draw errors of sensors over time: each one, or their range if there are many.
 
     `variable`, `dimension`: "innovation" over "sensor", or "validation_error" over "validation".
     """
@@ -313,7 +313,7 @@ def ratio(data: xr.Dataset, at: float | None) -> go.Figure:
 
 
 def open_shares(data: xr.Dataset, at: float | None) -> dict[str, float]:
-    """Return unknown -> remaining share of its prior standard deviation; of fields over modes."""
+    """Return unknown -> posterior over prior standard deviation, for fields over all modes."""
     found: dict[str, float] = {}
     k = canvas.at_time(data, "time", at)
     for label in scalars(data):
@@ -328,7 +328,7 @@ def open_shares(data: xr.Dataset, at: float | None) -> dict[str, float]:
 
 
 def told(left: dict[str, float]) -> go.Figure:
-    """Draw the remaining share of the prior standard deviation of each unknown."""
+    """Draw the posterior over prior standard deviation of each unknown."""
     known = dict(reversed(left.items()))
     figure = canvas.empty(
         "share of the prior standard deviation [%]", height=max(170, 90 + 26 * len(known))
@@ -355,7 +355,7 @@ def told(left: dict[str, float]) -> go.Figure:
 
 
 def correlation(data: xr.Dataset) -> go.Figure:
-    """Draw how the newest estimates of numbers are correlated."""
+    """Draw the correlations of the newest estimates of numbers."""
     names = [canvas.text(name) for name in data["unknown"].values]
     values = data["correlation"].values
     figure = canvas.empty(height=max(260, 120 + 30 * len(names)))
