@@ -1,7 +1,7 @@
 """Published experiments, each with its expected numbers.
 
-There is one file for each experiment, with its expected numbers at the end. The command `livepde
-reproduce NAME` and the tests run them.
+Each experiment is a file with its expected numbers at the end. The command `livepde reproduce NAME`
+and the tests run the experiments.
 """
 
 from __future__ import annotations

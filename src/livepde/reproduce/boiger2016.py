@@ -1,7 +1,7 @@
 """Boiger and Kaltenbacher (2016): both figures of section 4, the second also for the excited twin.
 
-First figure: partial exact data, t = 0, 6, 15, 30, 45, 60; q left, u right. Second figure: 1, 5 and
-10 % noise to t = 75; above q at several times, below ||e||_Q^2 + ||r||_X^2 over time.
+First figure: partial exact data at t = 0, 6, 15, 30, 45, 60, with q on the left and u on the right.
+Second figure: 1, 5 and 10 % noise to t = 75, with q above and ||e||_Q^2 + ||r||_X^2 below.
 
 The paper states "Gaussian noise with different noise levels" and constant mu and nu found by
 hindsight. It states neither how the noise enters, nor the scale of the inner product of Q (our
@@ -111,7 +111,7 @@ class NoisyTwin:
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
-    """Runs of one law on the same exact data with several noise realisations.
+    """Runs of a law on the same exact data with several noise realisations.
 
     `times`: shape (samples,).
     `energy`, `error`, `size`: energy ||e||_Q^2 + ||r||_X^2 with r = R(u^ - u*), not divided by the
@@ -196,7 +196,7 @@ def paper_case(q_true: Any = seed.q_true) -> NoisyTwin:
 
 
 def excited_case() -> NoisyTwin:
-    """Return the excited twin, all of the state observed, to t = 75."""
+    """Return the excited twin with a fully observed state, to t = 75."""
     times = 0.1 * np.arange(round(END / 0.1) + 1)
     return NoisyTwin(seed_excited.twin_of(times=times), seed_excited.start)
 
@@ -205,7 +205,7 @@ def excited_case() -> NoisyTwin:
 
 
 def first(progress: bool = False) -> tuple[dict[float, Track], Table]:
-    """Run the first figure, without nu and with two of them."""
+    """Run the first figure, without nu and with two values of nu."""
     twin = seed.twin_of(clamped=True)
     runs = {}
     for nu in NUS:
@@ -231,7 +231,7 @@ COLUMNS = [
 
 
 def row(kind: str, level: float, runs: Ensemble) -> list[Any]:
-    """Return one row of a table of noisy runs: means over the seeds +- standard deviations."""
+    """Return a row of a table of noisy runs: means over the seeds +- standard deviations."""
     error, ends, energy, turning = (
         runs.error.mean(axis=0),
         runs.error[:, -1],
@@ -249,7 +249,7 @@ def row(kind: str, level: float, runs: Ensemble) -> list[Any]:
 def paper_noise(
     seeds: Sequence[int] = SEEDS, progress: bool = False
 ) -> tuple[Runs, Table, dict[float, Ensemble]]:
-    """Run the second figure on the paper's example; `alone` are the same runs where q* = 0."""
+    """Run the second figure on the paper's example; `alone` contains the same runs with q* = 0."""
     case, nothing = paper_case(), paper_case(0.0)
     runs: Runs = {
         (name, level * v.share): ensemble(case, v.law, v.noise, level * v.share, seeds, progress)
@@ -262,7 +262,7 @@ def paper_noise(
 
 
 def made(alone: Ensemble) -> float:
-    """Return the final size of q^ that noise alone makes, over that of the paper's q*."""
+    """Return the final size of q^ due to noise alone, relative to the size of the paper's q*."""
     twin = paper_case().twin
     norm = float(np.sqrt(_squares(twin.q[None], twin.model.parameter_mass)[0]))
     return float(alone.size[:, -1].mean()) / norm
@@ -271,7 +271,7 @@ def made(alone: Ensemble) -> float:
 def excited_noise(
     seeds: Sequence[int] = SEEDS, progress: bool = False, kinds: Sequence[Kind] = ("nodal", "band")
 ) -> tuple[Runs, Table]:
-    """Run the second figure on the excited twin; nodal noise with the first seed only."""
+    """Run the second figure on the excited twin, with nodal noise for the first seed only."""
     case = excited_case()
     runs: Runs = {}
     for kind in kinds:
@@ -289,8 +289,8 @@ def _table(title: str, runs: Runs) -> Table:
 def semiconvergence(runs: Runs, levels: Sequence[float]) -> list[Check]:
     """Return the checks of the excited twin's second figure, for three levels.
 
-    A run that fluctuates about a floor has a least value, too. So semiconvergence is measured by
-    the mean over the last third of the time relative to the least mean, for the highest level only.
+    A run that fluctuates about a constant also has a minimum. Semiconvergence is therefore measured
+    by the mean over the last third of the time relative to the least mean, for the highest level.
     """
     band = [runs["band, mu = 1", level] for level in levels]
     turning = [float(found.turning.mean()) for found in band]
@@ -316,7 +316,7 @@ def semiconvergence(runs: Runs, levels: Sequence[float]) -> list[Check]:
 
 
 def run(truth: str = "discrete", progress: bool = False) -> Outcome:
-    """Run both figures and the second one for the excited twin."""
+    """Run both figures, and the second figure for the excited twin."""
     runs, table = first(progress)
     plain = runs[0.0]
     paper, paper_table, alone = paper_noise(progress=progress)
@@ -368,7 +368,7 @@ def first_checks(runs: dict[float, Track]) -> list[Check]:
 
 
 def _hidden(runs: Runs, alone: dict[float, Ensemble]) -> list[Check]:
-    """Return the checks of the paper's example: the noise hides q*, 1 % of it does not."""
+    """Return the checks of the paper's example: noise hides q*, 1 % of this noise does not."""
     worst, low = LEVELS[-1], LEVELS[0]
     least = low * PAPER["band, c1 = 1"].share
 
@@ -390,7 +390,7 @@ def _hidden(runs: Runs, alone: dict[float, Ensemble]) -> list[Check]:
 def _failures(
     first: dict[float, Track], paper: Runs, excited: Runs, alone: dict[float, Ensemble]
 ) -> list[Check]:
-    """Return the checks of the number of failed steps: none but with the wildest noise."""
+    """Return the checks of the number of failed steps: zero except for the largest noise."""
     wild, noisy = paper[WILD], [*paper.values(), *excited.values(), *alone.values()]
     name, level = WILD
     return [
@@ -456,7 +456,7 @@ def _first(found: Track) -> Any:
 
 
 def _second(runs: Runs, variant: str, source: Any, omega: Any) -> Any:
-    """Draw the paper's second figure: q at several times above, the energy below."""
+    """Draw the paper's second figure: q at several times above, and the energy below."""
     shown = {level: found for (name, level), found in runs.items() if name == variant}
     title = f"Noisy data ({variant}): one seed above, all of them below"
     drawn, axes = plots.figure(2, len(shown), title)
@@ -492,12 +492,12 @@ BOIGER2016 = Experiment(
 # With nu = 0.1 the error of q is 3.6, 3.1, 12.6 and 13.0 on 16, 31, 46 and 61 nodes.
 FIGURE1 = {0.0: (0.1333, 2.45e-4), 0.01: (0.534, 6.54e-3)}
 LOST = 1.0  # error of q: that of q = 0
-# With 10 % nodal noise q^ is 4000 times q*. The stages of 7 steps have no solution next to the step
-# before: with theta given, that branch of solutions ends before theta is as small as its rule.
+# With 10 % nodal noise, q^ is 4000 times q*. The stages of 7 steps have no solution close to the
+# step before: this branch of solutions ends before theta is as small as its rule.
 WILD, NO_SOLUTION = ("nodal, mu = 1", LEVELS[-1]), 7
-EARLIER = 5.0  # how much earlier the least error comes at the next noise level, mean of five seeds
-FALLEN = 0.3  # 1 %: the error at the end over that at the start
-LEAST = 0.8  # 10 %: it falls to less than this share,
-RISEN = 2.0  # and rises by this factor for good; the late error of one level over the next lower
+EARLIER = 5.0  # time by which the least energy is earlier at the next level, mean of five seeds
+FALLEN = 0.3  # 1 %: final over initial mean energy
+LEAST = 0.8  # 10 %: least over initial mean energy
+RISEN = 2.0  # 10 %: late over least mean energy; and ratio of late energies at consecutive levels
 LEARNED = 0.4  # error of q with noise below the effect of q*
 SWAMPED = 10.0  # error of q, and size of q^ where q* = 0, with noise above it

@@ -1,4 +1,4 @@
-"""Experiments of the command line, and their common run loop."""
+"""Experiments of the command line and their common run loop."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ class Experiment:
     conduct: Callable[[str, bool], Outcome]
 
     def run(self, truth: str | None = None, progress: bool = False) -> Outcome:
-        """Run it and return tables, checks and figures.
+        """Run the experiment and return tables, checks and figures.
 
-        The data have the origin `truth`, default the first of `truths`. With `progress` every run
+        `truth`: origin of the data, by default the first of `truths`. `progress`: whether each run
         shows a progress bar.
 
         Raises
         ------
         ConfigurationError
-            The experiment has no such truth.
+            The experiment does not support this truth.
         """
         truth = self.truths[0] if truth is None else truth
         if truth not in self.truths:
@@ -59,8 +59,8 @@ class Track:
 
     `times`, `errors`: relative L2 error of q after each sample, both of shape (samples,).
     `u_error`: relative error of the state in X at the end.
-    `divided`: number of samples with a divided step. A divided step has another truncation error
-    than the truth, which is enough to hide a parameter as small as the paper's.
+    `divided`: number of samples with a divided step. Its truncation error differs from that in the
+    truth, which is sufficient to hide a parameter as small as the paper's.
     """
 
     result: Result
@@ -81,7 +81,7 @@ class Track:
 
 
 def failures(runs: Iterable[Any], where: str = "", most: int = 0) -> Check:
-    """Return the check that at most so many steps `failed`, in all runs together."""
+    """Return the check of the number of failed steps in all runs."""
     return Check(f"failed steps{where}", float(sum(run.failed for run in runs)), float(most), "<=")
 
 

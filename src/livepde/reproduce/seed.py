@@ -6,9 +6,9 @@ with D = 1, q* = 0.025 x^2 - 0.025 x, u* = sin(pi x)/(1 + t), N = 31 cubic Hermi
 Euler with h = 0.6 to t = 60, omega = (0.3, 0.87), exact data, q^(0) = 0: their first figure. The
 paper does not state the scale of the inner product (`gain`); the table shows its effect.
 
-All settings are the paper's (`livepde.paper`). Its space has no slope functions at the ends, where
-u* and q* have slopes; a second table keeps them, as `Field` does by default, and adds the
-self-tuning law. omega is the union of the elements within (0.3, 0.87), up to 26/30: the uniform
+All settings are those of the paper (`livepde.paper`). Its space has no slope functions at the ends,
+where u* and q* have slopes. A second table includes them, as `Field` does by default, and the
+self-tuning law. omega is the union of the elements in (0.3, 0.87), up to 26/30, because the uniform
 mesh has no node at 0.87.
 """
 
@@ -56,9 +56,9 @@ def f(x: Any, t: float) -> Any:
 
 
 def build(std: float = 1.0, nodes: int = N, *, clamped: bool = False) -> tuple[Model, Subdomain]:
-    """Return the paper's model, with a prior standard deviation of q, and observation.
+    """Return the paper's model, with a prior standard deviation of q, and its observation.
 
-    If `clamped`, the space is the paper's, which has no slope functions at the ends.
+    `clamped`: whether the space has no slope functions at the ends, as in the paper.
     """
     mesh = interval(0, 1, nodes - 1)
     element = hermite(mesh)
@@ -97,9 +97,9 @@ def start(x: Any) -> Any:
 
 
 def run(truth: str = "discrete", progress: bool = False) -> Outcome:
-    """Run the whole table and return it with checks and figures."""
+    """Run the complete table and return it with checks and figures."""
     discrete = truth == "discrete"
-    twin = twin_of(clamped=discrete, truth=truth, fine_dt=0.03)  # else its slopes are an error, too
+    twin = twin_of(clamped=discrete, truth=truth, fine_dt=0.03)  # else its slopes add an error
     tracks = {case: identify(twin, *case, progress) for case in EXPECTED}
     known = EXPECTED if discrete else {}
     tables = [_table(f"relative L2 error of q, truth = {truth}", twin, tracks, known)]
@@ -154,7 +154,7 @@ def _row(twin: Twin, gain: Any, c1: Any, found: Track, expected: float | None) -
 
 
 def shift(x: Array, q: Array) -> float:
-    """Return the first moment of q about the middle, over the integral of q*."""
+    """Return the first moment of q about the centre, divided by the integral of q*."""
     moment, whole = trapezoid((x - 0.5) * q, x), trapezoid(q_true([x]), x)
     return float(moment / whole)
 
@@ -174,7 +174,7 @@ def _distance(one: Twin, other: Twin) -> float:
 def _learned(
     tracks: dict[tuple[float, float], Track], kept: dict[tuple[float, float], Track], effect: float
 ) -> tuple[Any, Any]:
-    """Return checks and sentences for data of the same scheme: q is found."""
+    """Return checks and sentences for data of the same scheme, which determine q."""
     checks = [
         Check(
             f"error of q at t = 60, {_label(gain, c1)}{where}",
@@ -213,7 +213,7 @@ def _learned(
 
 
 def _hidden(twin: Twin, tracks: dict[tuple[float, float], Track], effect: float) -> tuple[Any, Any]:
-    """Return checks and sentences for data of the exact solution: the scheme's error hides q."""
+    """Return checks and sentences for exact data, with which the scheme's error hides q."""
     early, late = ([found.error(t) for found in tracks.values()] for t in (6.0, 60.0))
     truncation = _distance(twin_of(clamped=False), twin)
     source = "the exact u*" if twin.truth == "analytic" else "a run with 20 times smaller steps"
@@ -244,7 +244,7 @@ def _figure(tracks: dict[tuple[float, float], Track], twin: Twin, name: str) -> 
 
 
 def draw_profiles(found: Track, name: str, **options: Any) -> None:
-    """Draw q or u of a run, and the exact one; `options` are those of `profiles`."""
+    """Draw q or u of a run with its exact values; `options`: options of `profiles`."""
     data = found.result.to_xarray()
     x = [data["x"].values]
     exact = q_true(x) if name == "q" else np.array([u_true(x, t) for t in SHOWN])
@@ -262,9 +262,9 @@ SEED = Experiment(
 # Expected results: for each (gain, c1) the relative L2 error of q at t = 60 with discrete truth,
 # measured with the dense implementation in experiments/reference.py: `run(Setting(...,
 # state_ends="clamped", parameter_ends="clamped", omega=(0.3, 0.87)))`, and the same with "zero".
-# The laws agree with it in all these digits. They are those of the paper's splitting, by integrals
-# over omega; with R and P that select coefficients the second table is 0.80, 0.06, 0.12, 0.04,
-# 0.04, which is no method of the paper.
+# The laws agree with it in all these digits, which are for the paper's splitting by integrals over
+# omega. With R and P that select coefficients, which is not a method of the paper, the second table
+# is 0.80, 0.06, 0.12, 0.04, 0.04.
 EXPECTED = {
     (1.0, 0.1): 0.8424,
     (100.0, 0.1): 0.1239,
@@ -288,4 +288,4 @@ SETTLED = ((1e4, 0.1), (1e4, 1.0))
 SETTLED_FROM = 6.0
 SMALL = 0.071
 SHIFTED = (0.012, 0.02)  # the paper's figure; 0.0149, 0.0162, 0.0149 on 31, 46, 61 nodes
-HIDDEN = 2.0  # with another truth the error of q at t = 6 is above this for every gain
+HIDDEN = 2.0  # lower bound on the error of q at t = 6 for other truths, with any gain

@@ -93,7 +93,7 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
         "sensitivity": Identifier(
             model,
             full,
-            # The data have the error of the same steps, which need no division.
+            # The data have the discretisation error of the same steps, so none is divided.
             SensitivityLaw(modes=12, noise=NOISE_LEVEL, shadows=Shadows(parts=1)),
             q0=0.0,
             u0=start,
