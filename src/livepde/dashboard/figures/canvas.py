@@ -107,7 +107,7 @@ def band(
 
 
 def show(figure: go.Figure, parts: Sequence[Array]) -> None:
-    """Fit the axis to all finite values, with a logarithmic scale for positive ones over decades."""
+    """Fit the axis to all finite values, with a logarithmic scale for positive decades."""
     values = np.concatenate([np.ravel(part) for part in parts])
     values = values[np.isfinite(values)]
     if not len(values):
