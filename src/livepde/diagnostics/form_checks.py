@@ -410,7 +410,6 @@ def _taylor(
     if name.startswith("d("):
         remedy = remedy.replace("dd=", "dA=")
     rows, columns = parts
-    rows, columns = parts
     start, found = function(at), dict[str, Check]()
     for column, part in columns.items():
         step = np.zeros_like(along)
