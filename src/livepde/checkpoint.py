@@ -258,7 +258,7 @@ class Fingerprint:
 
         `errors`: errors of each initial state, shape (errors, n) each.
         """
-        stacked = [np.concatenate([np.ravel(array) for array in each]) for each in (q0, u0, errors)]
+        stacked = [np.concatenate([np.ravel(array) for array in part]) for part in (q0, u0, errors)]
         start = np.concatenate(_start_sums(*stacked))
         return replace(self, numbers={**self.numbers, "start": start})
 

@@ -202,12 +202,12 @@ def prior_draws(space: FunctionSpace, n: int, seed: int | np.random.Generator | 
     """Return draws of the scalar unknowns from their priors."""
     import xarray as xr
 
-    rng, found = np.random.default_rng(seed), {}
+    rng, data = np.random.default_rng(seed), {}
     for label in space.labels:
         prior = space.unknown_of(label).prior
         latent = prior.latent_mean + prior.latent_std * rng.standard_normal(n)
-        found[label] = ("draw", np.clip(prior.transform.value(latent), *prior.bounds))
-    return xr.Dataset(found)
+        data[label] = ("draw", np.clip(prior.transform.value(latent), *prior.bounds))
+    return xr.Dataset(data)
 
 
 def predictive(

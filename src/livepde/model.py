@@ -372,9 +372,9 @@ class Model(Shown):
 
         free = {name: unit for name, unit in self._input_units.items() if name not in values}
         # These parts never read channels.
-        kept = {name: self._parts[name] for name in ("coefficients", "sensors")} | {"inputs": free}
-        parts = {name: bound(part) for name, part in self._parts.items() if name not in kept}
-        return Model(self.state, self.parameter, **parts, **kept, **self._about)
+        same = {name: self._parts[name] for name in ("coefficients", "sensors")} | {"inputs": free}
+        parts = {name: bound(part) for name, part in self._parts.items() if name not in same}
+        return Model(self.state, self.parameter, **parts, **same, **self._about)
 
     def refined(self) -> Model:
         """Return a copy of the model on a mesh whose elements are halved in every direction.

@@ -372,23 +372,23 @@ class Layout:
         places = {f"{prefix}{axis}" for axis in axes for prefix in ("", "sensor_", "validation_")}
         return {*OWN_NAMES, *places, *cells}
 
-    def _snapshots(self, kept: Sequence[Snapshot]) -> dict[str, Any]:
+    def _snapshots(self, snapshots: Sequence[Snapshot]) -> dict[str, Any]:
         data: dict[str, Any] = {}
-        if not kept:
+        if not snapshots:
             return data
-        for name in kept[0].profiles:
-            values = np.array([snapshot.profiles[name] for snapshot in kept])
+        for name in snapshots[0].profiles:
+            values = np.array([snapshot.profiles[name] for snapshot in snapshots])
             attrs = {"units": self.units.get(name, self.units.get(bare(name), ""))}
             attrs |= {"comment": self.comments[name]} if name in self.comments else {}
             data[name] = (("snapshot", "vertex"), values, attrs)
-        for name, (_, count) in kept[-1].told.items():
-            determined = np.array([snapshot.told[name][0] for snapshot in kept])
+        for name, (_, count) in snapshots[-1].told.items():
+            determined = np.array([snapshot.told[name][0] for snapshot in snapshots])
             attributes = {"long_name": "modes that the data determine", "of": count}
             data[f"{name}_modes"] = ("snapshot", determined, attributes)
-            left_out = np.array([snapshot.left_out.get(name, np.nan) for snapshot in kept])
+            left_out = np.array([snapshot.left_out.get(name, np.nan) for snapshot in snapshots])
             attributes = {"long_name": "share of modes that the law leaves out in the variance of"}
             data[f"{name}_left_out"] = ("snapshot", left_out, attributes)
-        last = kept[-1].correlation
+        last = snapshots[-1].correlation
         if last is not None and len(self.scalars) > 1:
             data["correlation"] = (("unknown", "other"), last.copy())
         return data

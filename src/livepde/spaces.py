@@ -451,12 +451,12 @@ class BorderedSpace(HilbertSpace):
 
     def restricted(self, part: slice, fixed: IntArray) -> HilbertSpace:
         n = self.dim
-        kept = np.arange(n)[part]
-        F = sp.csr_array(self.border[kept][:, n:])
+        inner = np.arange(n)[part]
+        F = sp.csr_array(self.border[inner][:, n:])
         if not F.nnz:
-            return HilbertSpace(sp.csr_array(self.border[kept][:, kept]), self.name, fixed)
-        both = np.concatenate([kept, np.arange(n, self.border.shape[0])])
-        return BorderedSpace(sp.csr_array(self.border[both][:, both]), len(kept), self.name, fixed)
+            return HilbertSpace(sp.csr_array(self.border[inner][:, inner]), self.name, fixed)
+        both = np.concatenate([inner, np.arange(n, self.border.shape[0])])
+        return BorderedSpace(sp.csr_array(self.border[both][:, both]), len(inner), self.name, fixed)
 
     def _form(self, free: IntArray) -> Any:
         from scipy.sparse.linalg import LinearOperator

@@ -361,13 +361,13 @@ class LQ:
         # Steady states x = A x + B v + B_d d + f: a particular one, and the null space along which
         # the tracked outputs are fitted.
         steady = np.hstack([np.eye(r) - step.A, -step.B[:, controls]])
-        one = np.linalg.lstsq(steady, step.B[:, others] @ disturbances + step.f, rcond=None)[0]
+        base = np.linalg.lstsq(steady, step.B[:, others] @ disturbances + step.f, rcond=None)[0]
         null = null_space(steady)
         C = np.hstack([model.outputs.C[rows], model.outputs.D[np.ix_(rows, controls)]])
         offset = model.outputs.D[np.ix_(rows, others)] @ disturbances + model.outputs.d[rows]
         root = np.sqrt(weights)
-        misfit = root * (reference - offset - C @ one)
-        pair = one + null @ np.linalg.lstsq(root[:, None] * (C @ null), misfit, rcond=None)[0]
+        misfit = root * (reference - offset - C @ base)
+        pair = base + null @ np.linalg.lstsq(root[:, None] * (C @ null), misfit, rcond=None)[0]
         v = np.clip(pair[r:], low, high)
         if not np.array_equal(v, pair[r:]):
             if len(v) > 1:  # if one control is at its bound, the others may compensate for it
@@ -375,7 +375,7 @@ class LQ:
 
                 move = null @ np.linalg.pinv(null[r:])  # derivative of (x, v) in v
                 effect = root[:, None] * (C @ move)
-                right_side = misfit + effect @ one[r:]
+                right_side = misfit + effect @ base[r:]
                 v = np.clip(lsq_linear(effect, right_side, (low, high), method="bvls").x, low, high)
             pair = pair + null @ np.linalg.lstsq(null[r:], v - pair[r:], rcond=None)[0]
         return np.asarray(pair[:r]), v

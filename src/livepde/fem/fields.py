@@ -495,9 +495,9 @@ class Piecewise(_Declared):
         pieces = {}
         for region, where in self.regions.items():
             stated = self.own.get(region, self)
-            one = Scalar(stated) if isinstance(stated, Prior) else stated
+            part = Scalar(stated) if isinstance(stated, Prior) else stated
             pieces[f"{name}[{region}]"] = Piecewise(
-                {region: where}, one.prior, one.unit or self.unit, one.evolution, one.within
+                {region: where}, part.prior, part.unit or self.unit, part.evolution, part.within
             )
         return pieces
 

@@ -215,9 +215,9 @@ def read_mesh(path: str | Path, scale: float = 1.0) -> Mesh:
     return replace(mesh, _boundaries=boundaries, _subdomains=subdomains)
 
 
-def _groups(found: Mapping[str, Any] | None) -> dict[str, Any] | None:
+def _groups(groups: Mapping[str, Any] | None) -> dict[str, Any] | None:
     """Return named groups with members, without the internal groups "gmsh:..." of the format."""
-    named = {k: v for k, v in (found or {}).items() if k and not str(k).startswith("gmsh:")}
+    named = {k: v for k, v in (groups or {}).items() if k and not str(k).startswith("gmsh:")}
     return {name: members for name, members in named.items() if len(members)} or None
 
 
@@ -346,12 +346,12 @@ def tied(field: Field, block: Any) -> IntArray | None:
     return rank[renumbered]
 
 
-def _matched(field: Field, block: Any, one: str, other: str) -> tuple[IntArray, IntArray]:
+def _matched(field: Field, block: Any, first: str, second: str) -> tuple[IntArray, IntArray]:
     names = dict.fromkeys(field.element.dofnames or [])
-    sides = f"periodic: '{one}' and '{other}'"
+    sides = f"periodic: '{first}' and '{second}'"
     i, j = [], []
     for name in names:
-        left, right = (block.at(side, [name]) for side in (one, other))
+        left, right = (block.at(side, [name]) for side in (first, second))
         if len(left) != len(right):
             raise SpaceError(
                 f"{sides} have {len(left)} and {len(right)} coefficients '{name}': their meshes "

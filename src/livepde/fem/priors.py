@@ -253,9 +253,9 @@ class Log(Transform):
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             variance = (std / above) ** 2  # variance of the logarithm
             factor = np.exp(0.5 * variance)
-            mean, found = self.lower + above * factor, above * factor * np.sqrt(np.expm1(variance))
+            mean, spread = self.lower + above * factor, above * factor * np.sqrt(np.expm1(variance))
         inside = above > 0.0
-        return np.where(inside, mean, q), np.where(inside, found, std)
+        return np.where(inside, mean, q), np.where(inside, spread, std)
 
 
 @dataclass(frozen=True)

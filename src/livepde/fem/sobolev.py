@@ -329,10 +329,10 @@ def _straight(nodes: Array, values: Array, x: Any) -> Array:
     return np.asarray(np.interp(x[0], nodes, values))
 
 
-def _with_pivots(kernel: _Kernel, points: Array, variance: Array, most: int) -> _Kernel:
+def _with_pivots(kernel: _Kernel, points: Array, variance: Array, largest: int) -> _Kernel:
     """Return the kernel with added positions, each at the largest remaining variance."""
     first = float(variance.max())
-    while len(kernel.places) - kernel.known < most and variance.max() > 1e-3 * first:
+    while len(kernel.places) - kernel.known < largest and variance.max() > 1e-3 * first:
         places = np.vstack([kernel.places, points[int(variance.argmax())]])
         kernel = _Kernel(places, kernel.length, kernel.known)
         variance = 1.0 - _explained(kernel, points)

@@ -151,7 +151,7 @@ class SeparateEngine(FleetEngine):
         self, state: tuple[Any, ...], span: Span
     ) -> tuple[tuple[Any, ...], laws.MemberReports]:
         context = self.law, self.work, self.problem
-        results = [laws.stepped(*context, one, span.member(k)) for k, one in enumerate(state)]
+        results = [laws.stepped(*context, old, span.member(k)) for k, old in enumerate(state)]
         members, sensors = len(results), len(results[0][1].predicted)
         zeros = np.zeros((members, sensors)), np.zeros(members, dtype=int)
         reports = laws.MemberReports((laws.Status(),) * members, *zeros)

@@ -186,7 +186,7 @@ class Equation:
     def about(self, unknowns: Collection[str] = ()) -> dict[str, Any]:
         """Return units and formula of a model, without the terms of optional unknowns it lacks."""
         omitted = [
-            name for name, one in self.unknowns.items() if one.optional and name not in unknowns
+            name for name, item in self.unknowns.items() if item.optional and name not in unknowns
         ]
         main, comma, conditions = self.formula.partition(",  ")
         # Omit only terms outside brackets, because a sum in brackets has other terms.

@@ -69,7 +69,7 @@ class FunctionalsObserved(Observed):
         # State and parameter form one nonlinear argument, so that one complex step differentiates
         # with respect to both.
         unknowns = {STATE + name: unknown for name, unknown in self.state.unknowns.items()}
-        unknowns |= {PARAMETER + name: one for name, one in self.parameter.unknowns.items()}
+        unknowns |= {PARAMETER + name: item for name, item in self.parameter.unknowns.items()}
         spaces = {"w": FunctionSpace.of(Normal(), "w"), "uq": FunctionSpace(unknowns, False)}
         self.forms = [self._form(name, spaces) for name in self.observation.integrands]
 

@@ -139,7 +139,7 @@ class SeparateStages(MemberStage):
         return KeptFactors.none(members, self.model.latent.dim, self.model.X.dim)
 
     def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
-        new, left, kept = np.empty_like(columns), [], stage.kept
+        new, new_kept, previous = np.empty_like(columns), [], stage.kept
         for k, member in enumerate(stage.members.tolist()):
             y, warm_start = self._stage(member).advance(
                 columns[:, k].T,
@@ -147,15 +147,15 @@ class SeparateStages(MemberStage):
                 stage.directions[k].T,
                 stage.h,
                 stage.at.member(k),
-                kept.member(k),
+                previous.member(k),
                 ESTIMATE if stage.off_centre[k] else GAIN,
                 stage.apart,
             )
             new[:, k] = y.T
-            left.append(warm_start)
-        if not kept.q.shape[1]:
-            return new, kept
-        rows = (np.array([getattr(item, name) for item in left]) for name in vars(left[0]))
+            new_kept.append(warm_start)
+        if not previous.q.shape[1]:
+            return new, previous
+        rows = (np.array([getattr(item, name) for item in new_kept]) for name in vars(new_kept[0]))
         return new, KeptFactors(*rows)
 
 

@@ -143,40 +143,40 @@ class Sweep:
         steps, r = self.steps, len(columns) - 1
         for first in range(0, max(len(steps.of), 1), BLOCK):
             safe_point()
-            some, factors = np.arange(first, min(first + BLOCK, len(steps.of))), dict[float, Any]()
-            zero = np.zeros((1, len(some), *columns.shape[1:]))
-            states = self._recursion(columns[:1], some, self._advanced(zero, some, factors))
+            rows, factors = np.arange(first, min(first + BLOCK, len(steps.of))), dict[float, Any]()
+            zero = np.zeros((1, len(rows), *columns.shape[1:]))
+            states = self._recursion(columns[:1], rows, self._advanced(zero, rows, factors))
             at_steps = states
             if r:
                 zero = np.broadcast_to(zero, (r, *zero.shape[1:]))
-                driven = self._advanced(np.concatenate([states[:, :-1], zero]), some, factors)[1:]
-                at_steps = np.concatenate([states, self._recursion(columns[1:], some, driven)])
+                driven = self._advanced(np.concatenate([states[:, :-1], zero]), rows, factors)[1:]
+                at_steps = np.concatenate([states, self._recursion(columns[1:], rows, driven)])
             columns = at_steps[:, -1]
-            low, high = np.searchsorted(steps.after, [first, first + len(some)], side="right")
+            low, high = np.searchsorted(steps.after, [first, first + len(rows)], side="right")
             part = slice(int(low) if first else 0, int(high))
             if part.start < part.stop:
                 yield part, at_steps[:, steps.after[part] - first].swapaxes(0, 1)
 
-    def _recursion(self, columns: Array, some: IntArray, driven: Array) -> Array:
-        """Return columns before the steps `some` and after the last, (c, steps + 1, members, n)."""
+    def _recursion(self, columns: Array, rows: IntArray, driven: Array) -> Array:
+        """Return columns before the steps `rows` and after the last, (c, steps + 1, members, n)."""
         c, count, members, n = driven.shape
         states = np.empty((count + 1, members, c, n))
         states[0], driven = columns.swapaxes(0, 1), driven.transpose(1, 2, 0, 3)
-        for k, h in enumerate(self.steps.lengths[some].tolist()):
+        for k, h in enumerate(self.steps.lengths[rows].tolist()):
             np.matmul(states[k], self.matrices[h], out=states[k + 1])
             states[k + 1] += driven[k]
         return states.transpose(2, 0, 1, 3)
 
-    def _advanced(self, columns: Array, some: IntArray, factors: dict[float, Any]) -> Array:
-        """Return columns, (1 + r, steps, members, n), each advanced by one of the steps `some`."""
-        advanced, lengths = np.empty(columns.shape), self.steps.lengths[some]
+    def _advanced(self, columns: Array, rows: IntArray, factors: dict[float, Any]) -> Array:
+        """Return columns, (1 + r, steps, members, n), each advanced by one of the steps `rows`."""
+        advanced, lengths = np.empty(columns.shape), self.steps.lengths[rows]
         for h in np.unique(lengths).tolist():
             equal = np.flatnonzero(lengths == h)
-            advanced[:, equal] = self._advance_equal(columns[:, equal], some[equal], h, factors)
+            advanced[:, equal] = self._advance_equal(columns[:, equal], rows[equal], h, factors)
         return advanced
 
     def _advance_equal(
-        self, columns: Array, chosen: IntArray, h: float, factors: dict[float, Any]
+        self, columns: Array, rows: IntArray, h: float, factors: dict[float, Any]
     ) -> Array:
         """Return columns advanced by steps of equal length, which are members of one stage."""
         c, steps, members, n = columns.shape
@@ -185,7 +185,7 @@ class Sweep:
         zero, kept = np.zeros(len(q), dtype=np.int64), self.stage.kept(len(q))
 
         def stage(columns: Array, t: float, length: float) -> Array:
-            at = self.steps.moments(chosen, t, members)
+            at = self.steps.moments(rows, t, members)
             work = StageOfMembers(zero, q, directions, length, at, kept, zero > 0, factors)
             return self.stage.advance(columns, work)[0]
 

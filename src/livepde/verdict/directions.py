@@ -436,9 +436,9 @@ def _bounded_positions(
         if np.isnan(at[sensor, k]):
             bounded.append(direction)
             continue
-        least = max(float(low[k] - at[sensor, k]), -float(reach[sensor]))
-        most = min(float(high[k] - at[sensor, k]), float(reach[sensor]))
-        bounded.append(replace(direction, least=least, most=most, at=float(at[sensor, k])))
+        lower = max(float(low[k] - at[sensor, k]), -float(reach[sensor]))
+        upper = min(float(high[k] - at[sensor, k]), float(reach[sensor]))
+        bounded.append(replace(direction, least=lower, most=upper, at=float(at[sensor, k])))
     return bounded
 
 
@@ -448,8 +448,8 @@ def _inside(model: Model, observed: Observed, items: list[ScoreDirection]) -> li
     if at is None:
         return items
     low, high = float(vertices.min()), float(vertices.max())
-    most = np.minimum(2.0 * np.minimum(at - low, high - at), LONGEST_AVERAGE * (high - low))
-    bounds = zip(items, at[:, 0].tolist(), most[:, 0].tolist(), strict=True)
+    longest = np.minimum(2.0 * np.minimum(at - low, high - at), LONGEST_AVERAGE * (high - low))
+    bounds = zip(items, at[:, 0].tolist(), longest[:, 0].tolist(), strict=True)
     return [replace(direction, least=0.0, most=bound, at=x) for direction, x, bound in bounds]
 
 

@@ -162,13 +162,13 @@ class Finding:
         """Return sentences on the likely causes; candidates if none explains half of the misfit."""
         first, *others = self.causes
         if first.share < HALF:
-            candidates = [f"{one.text}{_share(one.share)}" for one in self.causes[:CANDIDATES]]
+            candidates = [f"{item.text}{_share(item.share)}" for item in self.causes[:CANDIDATES]]
             return [f"No single cause explains this. Candidates: {'; '.join(candidates)}."]
         text = first.text
         if not text.startswith(first.subject or " "):
             text = text[:1].upper() + text[1:]
         sentences = [f"{text}{_share(first.share, 'explains {}')}."]
-        sentences += [f"Alternatively, {one.text}{_share(one.share)}." for one in others[:1]]
+        sentences += [f"Alternatively, {item.text}{_share(item.share)}." for item in others[:1]]
         return sentences
 
     @classmethod
@@ -335,9 +335,9 @@ class Verdict:
             return LEVELS.index(WORST[finding.severity])
 
         ordered = sorted(findings, key=rank, reverse=True)
-        least = LEVELS.index("trusted" if judged else NOT_JUDGED)
+        lowest = LEVELS.index("trusted" if judged else NOT_JUDGED)
         return cls(
-            level=LEVELS[max([least, *map(rank, ordered)])],
+            level=LEVELS[max([lowest, *map(rank, ordered)])],
             findings=tuple(ordered),
             untested=tuple(dict.fromkeys(untested)),
             unseen=tuple(unseen),
@@ -365,8 +365,8 @@ class Verdict:
         texts = {finding.text for finding in self.findings}
         new = [finding for finding in more if finding.text not in texts]
         replaced = {(item.what, item.subject) for item in new if item.subject or item.what in ONCE}
-        kept = [item for item in self.findings if (item.what, item.subject) not in replaced]
-        return self._with(findings=[*kept, *new])
+        others = [item for item in self.findings if (item.what, item.subject) not in replaced]
+        return self._with(findings=[*others, *new])
 
     def with_errors(self, errors: ModelErrors) -> Verdict:
         """Return the verdict with model errors: its level follows from misfit and effect."""

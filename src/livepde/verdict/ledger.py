@@ -180,10 +180,10 @@ def summed(old: Ledger, due: Mask, whitened: Array, used: Array) -> dict[str, Ar
     members, _, sensors, _ = whitened.shape
     windows, directions = old.sums.shape[2:4]
     # Sums of restarting windows are reset to zero.
-    kept = ~(due & (old.age > 0))
+    continued = ~(due & (old.age > 0))
     # Prepend the last value before the batch, for products of successive values.
     before = old.before.copy()
-    before[:, 1:].reshape(members, windows, -1)[~kept] = 0.0
+    before[:, 1:].reshape(members, windows, -1)[~continued] = 0.0
     row = np.concatenate([before.swapaxes(1, 2)[:, None], whitened], axis=1)
     present = np.concatenate([old.present[:, None], used], axis=1)
     # Row of the latest value of each sensor: sensors may have values in different samples.
@@ -206,8 +206,8 @@ def summed(old: Ledger, due: Mask, whitened: Array, used: Array) -> dict[str, Ar
     r = now[..., 0].sum(axis=1)
     counts = [used.sum(axis=1), r, squares[..., 0], lagged[..., 0], pair.sum(axis=1)]
     return {
-        "sums": old.sums * kept[:, None, :, None, None] + sums.transpose(0, 1, 3, 4, 2),
-        "noise": old.noise * kept[:, None, :, None] + np.stack(counts, axis=1)[:, :, None],
+        "sums": old.sums * continued[:, None, :, None, None] + sums.transpose(0, 1, 3, 4, 2),
+        "noise": old.noise * continued[:, None, :, None] + np.stack(counts, axis=1)[:, :, None],
         "before": np.take_along_axis(row, newest[:, -1:, :, None], axis=1)[:, 0].swapaxes(1, 2),
         "present": np.maximum(old.present, used.max(axis=1)),
     }
