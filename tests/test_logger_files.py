@@ -445,9 +445,9 @@ def test_a_column_in_the_unit_of_a_flux_is_a_flux(tmp_path):
      ("in/out", None), ("T_K", None)],
 )  # fmt: skip
 def test_the_unit_in_a_name_is_found(tmp_path, name, unit):
-    case = channels_of(tmp_path, "heat", name, time="time/h")
+    case = channels_of(tmp_path, "heat", name, "T_2 [°C]", time="time/h")
     assert case["data"]["time_unit"] == "h"
-    (channel,) = case["channels"].values()
+    channel, _ = case["channels"].values()
     assert channel.get("unit") == unit
 
 
