@@ -94,7 +94,7 @@ class MeshSpec(Spec):
 
 
 class EvolutionSpec(Spec):
-    """How an unknown moves by itself."""
+    """How an unknown changes over time."""
 
     kind: Literal["random-walk", "mean-reverting", "periodic"]
     rate: Quantity | None = None
@@ -157,7 +157,7 @@ class UnknownSpec(PriorSpec):
 
 
 class CorrelatedSpec(Spec):
-    """An error of a sensor that fades within `time`, with the standard deviation `std`."""
+    """Error of a sensor with correlation time `time` and standard deviation `std`."""
 
     time: Quantity
     std: Quantity
@@ -486,7 +486,7 @@ class SourceSpec(Spec):
 
 
 class InitialSpec(Spec):
-    """The initial state: where it comes from, and how far off it may be."""
+    """Initial state: its source, and its standard deviation."""
 
     start: Quantity = Field(alias="from")
     std: Quantity | None = None

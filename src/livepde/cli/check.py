@@ -158,7 +158,7 @@ def _show_predicted(console: Console, prepared: Prepared) -> list[str]:
         return []
     return [
         f"{', '.join(against)}: the readings fall where the prior predicts a rise, or the reverse. "
-        "Check the sign of these columns and of the inputs: `factor = -1` turns it."
+        "Check the sign of these columns and of the inputs: `factor = -1` changes it."
     ]
 
 

@@ -103,9 +103,9 @@ def fleet(
 ) -> None:
     """Run a case for each row of a table, with its own data, settings and run directory.
 
-    Members that differ in nothing but data and initial state are stepped together, many times
-    faster, where there are blocks for their case; the summary says why others are not. A run that
-    fails does not end the others; its sentence stands in the summary, fleet.csv.
+    If members differ only in data and initial state, they are stepped together, which is much
+    faster. For other cases the summary, fleet.csv, gives the reason. If a run fails, the others
+    go on, and the summary contains its message.
 
     Example:  livepde fleet rod/case.toml --members rods.csv --out rods --jobs 4
     """

@@ -65,7 +65,7 @@ SAME_ERROR = 1e-3  # relative difference below which two errors of a sensor are 
 NEAR = 0.03  # distance of a trajectory from the best fit that is negligible, in posterior std
 QUANTILE = 1.96  # half width of a 95 % interval in standard deviations
 SHRINK = 10.0  # weight of the configured noise variance, as a number of pairs of readings
-OVERFLOW = "the answers of the process to errors overflow"
+OVERFLOW = "the responses of the process to errors overflow"
 LEAST_LEVEL = 0.01  # lower bound of an estimated noise variance over the configured variance
 
 
