@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import scipy
-from factories import ROD_CASE
+from factories import ROD_CASE, filter_alone
 
 import livepde as lp
 from livepde import cases
@@ -107,6 +107,20 @@ def test_gaps_and_irregular_intervals():
         found = who.step(TIMES[k], {"a": a, "b": b}, {"g": driven(TIMES[k])})
     for label, value in {"alpha": ALPHA, "time_constant[a]": TAU}.items():
         assert abs(found[label].mean - value) < 3.0 * found[label].std
+
+
+def test_time_constants_do_not_jump():
+    """If they did, an onset that was a sample off moved them by 2.5 standard deviations."""
+    runs = []
+    for names in (None, ("alpha",)):
+        law = filter_alone(jumps=lp.Jumps(settle=10, unknowns=names))
+        who = lp.Identifier(rod(), sensors(PRIOR), law, u0=0.0)
+        for k in range(60):  # the readings jump
+            a, b = truth()[k] * (1.0 if k < 40 else 1.3)
+            estimate = who.step(TIMES[k], {"a": a, "b": b}, {"g": driven(TIMES[k])})
+            runs.append((estimate.diagnostics.jump, *estimate.q))
+    assert runs[:60] == runs[60:]
+    assert any(jump > 0.0 for jump, *_ in runs)
 
 
 @pytest.mark.parametrize("unknown", [False, True])

@@ -224,8 +224,8 @@ class Jumps:
     settle
         Number of samples without a test after the start and after an alarm.
     unknowns
-        Names of the unknowns that may jump; default all. Other unknowns, such as material
-        constants, keep their estimate and covariance.
+        Names of the unknowns that may jump; default all but the time constants of slow sensors.
+        Other unknowns, such as material constants, keep their estimate and covariance.
 
     Examples
     --------

@@ -13,6 +13,7 @@ from livepde.errors import LawError
 from livepde.fem import Evolution, FieldBlock, base_name
 from livepde.laws.law import Problem
 from livepde.linalg import Array, Mask
+from livepde.observation.slow import TIME_CONSTANT
 
 LEFT_OUT = 1e-4  # share of the prior variance of a field that modes="auto" omits
 MOST_MODES = 60  # largest number of modes of a field with modes="auto"
@@ -133,7 +134,10 @@ class Reduction:
         return numbers + modes
 
     def named(self, names: Sequence[str] | None, who: str) -> Mask:
-        """Return the mask of coordinates of named unknowns, (k,); None: all. Raises `LawError`."""
+        """Return the mask of coordinates of named unknowns, (k,). Raises `LawError`.
+
+        None: all but the time constants of slow sensors, which no change of the process changes.
+        """
         parts, space = list(self.problem.model.latent.parts), self.problem.model.parameter_space
         missing = [name for name in names or () if name not in space.parts]
         if missing:
@@ -141,7 +145,10 @@ class Reduction:
             raise LawError(f"{who}: there is no unknown '{missing[0]}'; there are {known}.")
         chosen = np.zeros(self.size, dtype=bool)
         for name, evolution in zip(parts, self.evolutions, strict=True):
-            chosen[evolution.part] = names is None or bool({name, base_name(name)} & set(names))
+            both = {name, base_name(name)}
+            chosen[evolution.part] = (
+                TIME_CONSTANT not in both if names is None else bool(both & set(names))
+            )
         return chosen
 
     def moving(self, drift: float) -> int:
