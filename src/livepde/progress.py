@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from time import monotonic
 from typing import Any
 
 from rich.console import Console
@@ -42,11 +43,15 @@ def timed(
 ) -> Iterator[Callable[[int], AbstractContextManager[None]]]:
     """Show a line with a clock for each name; yield a function: index -> context that runs it.
 
-    Several clocks may run at once, each in its own thread. With `quiet` nothing is shown.
+    Several clocks may run at once, each in its own thread. If standard error is no terminal, as in
+    a batch job, a line is written for each name that has ended. With `quiet` nothing is shown.
     """
     console = Console(stderr=True)
-    if quiet or not console.is_terminal:
+    if quiet:
         yield lambda _: nullcontext()
+        return
+    if not console.is_terminal:
+        yield lambda index: _logged(console, names[index])
         return
     from rich import progress  # not before somebody looks
 
@@ -67,3 +72,12 @@ def timed(
                 shown.advance(tasks[index])
 
         yield running
+
+
+@contextmanager
+def _logged(console: Console, name: str) -> Iterator[None]:
+    """Write a line with a name and the time that the context took."""
+    begun = monotonic()
+    yield
+    text = f"{name}: {monotonic() - begun:.0f} s"
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
