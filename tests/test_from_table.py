@@ -686,3 +686,6 @@ def test_a_power_is_not_read_as_power_per_volume(here):
     with pytest.raises(CaseError, match=r"channels.P: .* 'W', and the model is in W/m.3: set fact"):
         cases.load(case).prepare()
     assert cases.load(case, settings={"channels.P.factor": 2e3}).prepare()
+    Path("t.csv").write_text(f"time_s,T_room (in),T_1cm,P\n{rows}")  # an inlet, no inches
+    case.write_text(case.read_text().replace("(C)", "(in)").replace("P(W)", "P"))
+    assert cases.load(case).prepare()

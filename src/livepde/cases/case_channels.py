@@ -90,11 +90,12 @@ def _check_stated(case: CaseContent, name: str, unit: str) -> None:
 
 
 def _is_of_another_kind(given: str, unit: str, whole: bool) -> bool:
-    """Return whether a name states a unit that does not convert; `whole`: also one as short as W.
+    """Return whether a name states a unit that cannot be converted; `whole`: also one without '/'.
 
-    A word in the name of a sensor, such as T (min), is rather its place or a mean.
+    A short text in the name of a sensor is probably its position, as in T (in), or a minimum.
     """
-    if not (whole or "/" in given) or converts(with_powers(given), unit):
+    short = "/" not in given and (not whole or given in ("in", "min"))
+    if short or converts(with_powers(given), unit):
         return False
     known = in_si(given)
     return known is not None and bool(known.exponents)
