@@ -253,6 +253,18 @@ def other_unit(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
     return given if given and conversion(given, unit, name) != Affine() else ""
 
 
+def is_other_kind(given: str, unit: str) -> bool:
+    """Return whether `given` is a unit with a dimension that cannot be converted to `unit`.
+
+    >>> is_other_kind("W", "W/m^3"), is_other_kind("kW/m3", "W/m^3"), is_other_kind("left", "K")
+    (True, False, False)
+    """
+    if not (given and unit) or converts(with_powers(given), unit):
+        return False
+    known = in_si(given)
+    return known is not None and bool(known.exponents)
+
+
 def in_si(unit: str) -> SI | None:
     """Return the conversion from a unit to SI base units; None if there is none.
 

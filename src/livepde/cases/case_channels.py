@@ -27,10 +27,8 @@ from livepde.units import (
     AFTER_SLASH,
     IN_BRACKETS,
     conversion,
-    converts,
-    in_si,
+    is_other_kind,
     other_unit,
-    with_powers,
 )
 
 # Key of an initial state that is interpolated from the first sample, without any uncertainty.
@@ -80,25 +78,19 @@ def _check_stated(case: CaseContent, name: str, unit: str) -> None:
                 f"of the model: set unit = '{given}', or unit = '{unit}' if the name is wrong.",
             )
         stated = IN_BRACKETS.search(column)
-        if stated and unit and _is_of_another_kind(stated[1], unit, channel.role == "input"):
+        text = stated[1] if stated and not _may_be_place(stated[1], channel) else ""
+        if is_other_kind(text, unit):
             raise case.error(
                 f"channels.{name}",
-                f"the name of the column '{column}' states the unit '{stated[1]}', and the model "
+                f"the name of the column '{column}' states the unit '{text}', and the model "
                 f"is in {unit}: set factor, by which its numbers are multiplied, or "
                 f"unit = '{unit}' if the name is wrong.",
             )
 
 
-def _is_of_another_kind(given: str, unit: str, whole: bool) -> bool:
-    """Return whether a name states a unit that cannot be converted; `whole`: also one without '/'.
-
-    A short text in the name of a sensor is probably its position, as in T (in), or a minimum.
-    """
-    short = "/" not in given and (not whole or given in ("in", "min"))
-    if short or converts(with_powers(given), unit):
-        return False
-    known = in_si(given)
-    return known is not None and bool(known.exponents)
+def _may_be_place(text: str, channel: schema.ChannelSpec) -> bool:
+    """Return whether a text in brackets may be a position or a word, as in T (in) or T (min)."""
+    return "/" not in text and (channel.role != "input" or text in ("in", "min"))
 
 
 def observation_of(case: CaseContent, *roles: str) -> observation.Observation | None:

@@ -33,6 +33,7 @@ KEYS = {kind: key for kind, (_, key) in ESTIMATED.items()}
 # Kinds of causes whose size a fit can estimate.
 SIZED = ("averaging", "boundary", "channel", "drift", "flux", "lag", "loss", "source", "transfer")
 STATED = {"factor", "late"}  # keys of a channel that a setting must not override
+EARLY = (0.4, 0.6)  # range of intervals by which a switch seems early
 MISSED = 5.0  # largest difference of first readings from a stated initial state, over the noise
 DOUBTED = ("caution", "do not trust")  # levels of a verdict with doubts
 JUMPED = "Jumps are allowed already: check the model and the data for another cause."
@@ -188,8 +189,9 @@ def held(prepared: Prepared, cause: Cause) -> str:
     if not (isinstance(table := prepared.raw, DataTable) and cause.subject in table.names):
         return ""
     known = table.t[np.isfinite(table.values[:, table.names.index(cause.subject)])]
+    low, high = EARLY
     early = -cause.size / float(np.median(np.diff(known))) if len(known) > 1 else 0.0
-    return channel_setting(cause.subject, "between", '"hold"') if 0.4 < early < 0.6 else ""
+    return channel_setting(cause.subject, "between", '"hold"') if low < early < high else ""
 
 
 def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:

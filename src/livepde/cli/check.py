@@ -225,7 +225,7 @@ def _show_wiring(console: Console, case: Case) -> None:
                 f"{policy.longest(habit):g} {unit}".rstrip(),
                 policy.keeps(name),
                 "skip" if column.needed else spec.gaps if spec.drives else "continue",
-                spec.between if spec.drives else "",  # a noise column belongs to a sensor
+                spec.between if spec.drives else "",  # only sensors have a noise column
             )
         )
     columns = ("channel", "role", "column", "valid", "wait", "repeated", "missing", "between")

@@ -105,7 +105,7 @@ def fleet(
 
     If members differ only in data and initial state, they are stepped together, which is much
     faster. For other cases the summary, fleet.csv, gives the reason. If a run fails, the others
-    go on, and the summary contains its message.
+    continue, and the summary contains its message.
 
     Example:  livepde fleet rod/case.toml --members rods.csv --out rods --jobs 4
     """

@@ -89,7 +89,7 @@ class RunView:
     reading: bool = False  # whether there are more records to read
     events: Sequence[Event] = ()  # events and counts of the journal
     counts: Mapping[tuple[str, str], int] = field(default_factory=dict)
-    unwell: str = ""  # reason why the run is unhealthy, as in /health; empty if it is healthy
+    unwell: str = ""  # reason of an unhealthy run, as in /health; empty for a healthy one
     doubts: Sequence[str] = ()  # findings against the estimates
     notes: Sequence[str] = ()  # further notes of the run
     checks: Sequence[Check] = ()

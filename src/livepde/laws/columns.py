@@ -412,7 +412,7 @@ class _Trials:
             change = (factor * middle + constant) - middle
             g = -change * slopes["offset"]
             if "gain" in slopes:
-                # slopes["gain"] belongs to a change by -values: subtract its value at the middle.
+                # slopes["gain"] is the effect of -values: subtract its value at the middle.
                 about_middle = slopes["gain"] - middle * slopes["offset"]
                 g = g - (factor - 1.0) * about_middle
             r = (base.passed.residuals + np.where(np.isfinite(g), g, 0.0))[there]

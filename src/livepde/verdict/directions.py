@@ -410,7 +410,7 @@ class Dictionary:
         by_kind = {"lag": LAG * late, "gain": GAIN * change}
         by_kind |= {"position": moved[..., : self.shifted], "averaging": moved[..., self.shifted :]}
         if self._varying.size:
-            own = self.own[self._varying]  # each affects only the readings of its own sensor
+            own = self.own[self._varying]  # each affects the readings of one sensor
             signals = [by_kind[kind] for kind in self.kinds if kind in by_kind]
             scaled = np.concatenate(signals, axis=2) / noise[:, :, own]
             effects[:, :, own, self._varying] = scaled
