@@ -302,10 +302,8 @@ def _near(values: Array, limit: float, centre: Callable[[Array], Array]) -> Mask
 
 def _of_neighbours(values: Array) -> Array:
     """Return the median of the neighbours of each value, without the value, shape (count,)."""
-    count, reach = len(values), NEIGHBOURS
-    windows = np.lib.stride_tricks.sliding_window_view(values, 2 * reach + 1)
-    inner = np.median(np.delete(windows, reach, axis=1), axis=1)
-    edges = {k: np.r_[0:k, k + 1 : 2 * reach + 1] for k in range(reach)}
-    first = [np.median(values[which]) for which in edges.values()]
-    last = [np.median(values[count - 1 - which]) for which in edges.values()]
-    return np.concatenate([first, inner, last[::-1]])
+    places = np.arange(len(values))
+    first = np.clip(places - NEIGHBOURS, 0, len(values) - 1 - 2 * NEIGHBOURS)
+    which = first[:, None] + np.arange(2 * NEIGHBOURS)
+    which += which >= places[:, None]
+    return np.asarray(np.median(values[which], axis=1))

@@ -89,7 +89,7 @@ class MemberSensors:
         `columns`: states followed by rows U, (moments, 1 + r, members, n); `x.du` and `x.da` must
         be zero. Shapes: (moments, members, sensors) and (moments, members, r, sensors).
         """
-        D = self._direct(end(0)) if len(columns) else None
+        D = None if self.fixed or not len(columns) else self._direct(end(0))
         if self.fixed or D is not None:
             seen = self._observed(columns)
             predicted, Y = seen[:, 0], seen[:, 1:].swapaxes(1, 2)

@@ -464,14 +464,17 @@ def _misfit(residuals: Array, readings: Array, used: Mask) -> float:
     The unit is the stated noise variance, or its estimate from second differences if larger.
     """
     shown = np.where(used, readings, np.nan)
-    squares = []
+    squares = list[Array]()
     for k in range(readings.shape[1]):
         differences = np.diff(shown[np.isfinite(shown[:, k]), k], n=2)
         noise = max(1.0, float((differences**2).mean()) / 6.0) if len(differences) else 1.0
-        for block in np.array_split(residuals[used[:, k], k], BLOCKS):
-            if len(block):
-                squares.append(float((block**2).mean()) / noise)
-    return float(np.quantile(squares, QUANTILE)) if squares else 0.0
+        square = residuals[used[:, k], k] ** 2
+        if len(square):
+            parts = min(BLOCKS, len(square))
+            edges = np.arange(parts) * len(square) // parts
+            sizes = np.diff(edges, append=len(square))
+            squares.append(np.add.reduceat(square, edges) / (sizes * noise))
+    return float(np.quantile(np.concatenate(squares), QUANTILE)) if squares else 0.0
 
 
 def refit_due(
