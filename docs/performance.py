@@ -1,9 +1,9 @@
-"""Write docs/performance/costs.md, with: python docs/performance.py [step scale ...].
+"""Write docs/performance/costs.md, with: python docs/performance.py [jobs step ...].
 
-Runs benchmarks of livepde, keeps what they print as JSON in docs/performance/, and makes page and
-figures of all that is there. `--draw` measures nothing: so files of longer runs can be added by
-hand, as `python -m benchmarks step --size 1000000 --json > docs/performance/step-1e6.json`. If a
-row is in several files, the last one by name is shown.
+This runs benchmarks, stores their JSON output in docs/performance/, and writes the page and its
+figures from all files there. `--draw` runs no benchmark, so that files of longer runs can be added
+by hand: `python -m benchmarks step --size 1000000 --json > docs/performance/step-1e6.json`. If
+several files contain the same row, the page shows that of the last file by name.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ DOCS = Path(__file__).resolve().parent
 MEASURED = DOCS / "performance"
 PROJECT = DOCS.parent
 SUITE = "benchmarks.suite.costs"
-BENCHES = ("step", "memory", "scale", "petsc", "fleet", "import")
-SIZED = ("step", "scale")  # take --size
+BENCHES = ("jobs", "step", "memory", "scale", "petsc", "fleet", "import")
+SIZED = ("step", "scale")  # benchmarks with the option --size
 MEMORY_SIZES = (10_000, 40_000)
 LAWS = ("gradient", "sensitivity")
 KEYS = (
@@ -39,8 +39,8 @@ KEYS = (
     "law",
     "c1",
     "gain",
-)  # first columns of a table: what a row is of
-PER_UNKNOWN = "kB per unknown"  # columns whose name has this are drawn as memory
+)  # leading columns that identify a row of a table
+PER_UNKNOWN = "kB per unknown"  # columns whose name contains this are drawn as memory
 MARKERS = "osD^vP*X"
 
 Row = Mapping[str, Any]
@@ -51,7 +51,8 @@ PAGE = """\
 Written by `python docs/performance.py` from `docs/performance/*.json`; each section names its
 command and the commit that was measured. [Performance and comparison](../performance.md) explains
 the columns. A check that fails is marked `FAILED`.
-
+"""
+STEP = """\
 ![One step over one forward step](step.png)
 
 *Solid: median. Dashed, in the same colour: bound.*
@@ -65,7 +66,7 @@ included, per state unknown.*
 
 
 def measure(names: Iterable[str], sizes: Sequence[int]) -> None:
-    """Run benchmarks, and keep what they print."""
+    """Run benchmarks, and store their output."""
     MEASURED.mkdir(exist_ok=True)
     for name in names:
         sys.stderr.write(f"measures: {name}\n")
@@ -79,7 +80,7 @@ def measure(names: Iterable[str], sizes: Sequence[int]) -> None:
 
 
 def keep(path: Path, content: Mapping[str, Any]) -> None:
-    """Write what was measured, with the commit."""
+    """Write the output of a benchmark, with the commit."""
     path.write_text(json.dumps({"commit": commit(), **content}, indent=1) + "\n")
 
 
@@ -91,14 +92,14 @@ def commit() -> str:
 
 
 def measured(content: Mapping[str, Any]) -> str:
-    """Return the command and the commit of what was measured, as a part of a page."""
+    """Return the commands and commits of an output as Markdown."""
     commands = content.get("commands") or [content["command"]]
     commits = content.get("commits") or [content["commit"]]
     return "\n".join(["```sh", *commands, "```", "", f"Recorded at commit {', '.join(commits)}."])
 
 
 def printed(command: Sequence[str]) -> dict[str, Any]:
-    """Return what a benchmark prints; a check that fails is none of our business."""
+    """Return the output of a benchmark, whether its checks pass or not."""
     words = [sys.executable, "-m", "benchmarks", *command]
     done = subprocess.run(words, cwd=PROJECT, stdout=subprocess.PIPE, text=True, check=False)
     try:
@@ -123,7 +124,7 @@ def _memory(sizes: Sequence[int]) -> dict[str, Any]:
 
 
 def merged(contents: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return several outputs of one benchmark as one: rows and checks by their first cells."""
+    """Merge outputs of one benchmark; later rows replace earlier rows with the same keys."""
     commands: list[str] = []
     commits: list[str] = []
     tables: dict[str, dict[str, Any]] = {}
@@ -150,7 +151,7 @@ def merged(contents: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def rows_of(content: Mapping[str, Any]) -> list[Row]:
-    """Return all rows with the names of their columns, by size."""
+    """Return the rows that have a number of nodes, as dictionaries, sorted by it."""
     rows = [
         dict(zip(table["columns"], row, strict=True))
         for table in content["tables"]
@@ -160,7 +161,7 @@ def rows_of(content: Mapping[str, Any]) -> list[Row]:
 
 
 def costs(rows: Sequence[Row]) -> Figure:
-    """Draw ratios against nodes: a panel for each law, a line for each of its settings."""
+    """Draw ratios against nodes, with a panel for each law and a line for each setting."""
     drawn, panels = figure(1, len(LAWS))
     for ax, law in zip(panels, LAWS, strict=True):
         settings = dict.fromkeys(row["law"] for row in rows if row["law"].startswith(law))
@@ -187,8 +188,8 @@ def memory(lines: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
     return drawn
 
 
-def remembered(contents: Mapping[str, Mapping[str, Any]]) -> dict[str, list[tuple[float, float]]]:
-    """Return label -> (nodes, memory per unknown), of all benchmarks that tell it."""
+def memory_lines(contents: Mapping[str, Mapping[str, Any]]) -> dict[str, list[tuple[float, float]]]:
+    """Return label -> (nodes, memory per unknown) from all benchmarks that measure memory."""
     lines: dict[str, list[tuple[float, float]]] = {}
     for name, content in contents.items():
         for row in rows_of(content):
@@ -209,7 +210,7 @@ def _finished(ax: Axes, title: str, what: str) -> None:
 
 
 def report(title: str, content: Mapping[str, Any]) -> str:
-    """Return what a command has printed as JSON as a report in Markdown."""
+    """Return the JSON output of a command as a report in Markdown."""
     shown = [Table(item["title"], item["columns"], item["rows"]) for item in content["tables"]]
     checks = [
         Check(
@@ -224,7 +225,7 @@ def report(title: str, content: Mapping[str, Any]) -> str:
 
 
 def section(name: str, content: Mapping[str, Any]) -> str:
-    """Return what a benchmark has printed as a part of the page."""
+    """Return the section of the page for a benchmark."""
     title = f"python -m benchmarks {name}" if name != "memory" else "Memory"
     text = report(title, content)
     lines = [f"#{line}" if line.startswith("#") else line for line in text.splitlines()]
@@ -232,7 +233,7 @@ def section(name: str, content: Mapping[str, Any]) -> str:
 
 
 def write(folder: Path = DOCS) -> None:
-    """Make page and figures of what was measured."""
+    """Write the page and its figures from the stored outputs."""
     contents: dict[str, dict[str, Any]] = {}
     for name in BENCHES:
         files = [folder / "performance" / f"{name}.json"]
@@ -240,23 +241,26 @@ def write(folder: Path = DOCS) -> None:
         found = [json.loads(path.read_text()) for path in files if path.exists()]
         if found:
             contents[name] = merged(found)
-    parts = [PAGE]
+    figures = []
     if "step" in contents:
         costs(rows_of(contents["step"])).savefig(folder / "performance" / "step.png", dpi=120)
-    lines = remembered(contents)
+        figures.append(STEP)
+    lines = memory_lines(contents)
     if lines:
         memory(lines).savefig(folder / "performance" / "memory.png", dpi=120)
-        parts.append(MEMORY)
-    parts += [section(name, content) for name, content in contents.items()]
+        figures.append(MEMORY)
+    sections = {name: section(name, content) for name, content in contents.items()}
+    jobs = [sections.pop("jobs")] if "jobs" in sections else []
+    parts = [PAGE, *jobs, *figures, *sections.values()]
     (folder / "performance" / "costs.md").write_text("\n".join(parts))
 
 
 def main() -> None:
-    """Measure, and write the page."""
+    """Run benchmarks, and write the page."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("names", nargs="*", help=f"of {', '.join(BENCHES)}; default all")
     options.add_argument("--size", type=int, action="append", default=[], help="nodes; repeat it")
-    options.add_argument("--draw", action="store_true", help="measure nothing")
+    options.add_argument("--draw", action="store_true", help="run no benchmark")
     given = options.parse_args()
     unknown = [name for name in given.names if name not in BENCHES]
     if unknown:

@@ -84,7 +84,7 @@ def output(ratio: float, *, nodes: int, ok: bool = True) -> str:
     return json.dumps(content)
 
 
-def test_the_page_of_costs_shows_all_that_was_measured(page, tmp_path):
+def test_the_page_of_costs_shows_all_stored_outputs(page, tmp_path):
     folder = tmp_path / "performance"
     folder.mkdir()
     (folder / "step.json").write_text(output(4.25, nodes=31))
@@ -102,4 +102,4 @@ def test_the_page_of_costs_shows_all_that_was_measured(page, tmp_path):
     assert text.count("python -m benchmarks step\n") == 2  # title and command
     assert text.count("Recorded at commit 0123abcd.\n") == 1
     assert {"step.png", "memory.png"} <= {file.name for file in folder.iterdir()}
-    assert page.remembered({"scale": found}) == {"scale": [(1_000, 1.5)]}
+    assert page.memory_lines({"scale": found}) == {"scale": [(1_000, 1.5)]}
