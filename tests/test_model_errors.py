@@ -150,7 +150,7 @@ def test_hypotheses_without_weight_are_left_out():
     assert found.weights.sum() == pytest.approx(1.0, abs=1e-12)
 
 
-# --- the answers of the process ------------------------------------------------------------------
+# --- the responses of the process ------------------------------------------------------------------
 
 
 LENGTH, STEP, COUNT = 1.0, 0.02, 120
@@ -222,22 +222,22 @@ def identified(z: Any) -> lp.Identifier:
         ("conductivity", 1, {"bent": 1e-6}),
     ],
 )
-def test_an_answer_is_the_change_of_the_readings_by_that_error(kind, mode, size):
+def test_a_response_is_the_change_of_the_readings_by_that_error(kind, mode, size):
     identifier = identified(readings(rod()))
     samples = StoredSamples.of(identifier._work, identifier._state)
     one = samples.about(samples.reached)
     errors = ErrorColumns(samples, SMALL)
-    answers, _, predicted = errors.followed(one)
+    responses, _, predicted = errors.followed(one)
     (x, *_) = samples.along(one)
     q = float(identifier.model.latent.value(x.q[0])[0])
     # The first steps of the law are shorter than those of `readings`.
     assert predicted == pytest.approx(readings(rod(), q)[1:], abs=0.01)
     # The hat functions of a family add up to one.
     found = 0.0
-    for first, (answer, course) in zip(errors.first, errors.answers, strict=True):
-        if (answer.kind, answer.mode) == (kind, mode):
+    for first, (shape, course) in zip(errors.first, errors.shapes, strict=True):
+        if (shape.kind, shape.mode) == (kind, mode):
             columns = range(first, first + course.size)
-            found = found + sum(answers[:, :, k] for k in columns)
+            found = found + sum(responses[:, :, k] for k in columns)
     ((_, amplitude),) = size.items()
     change = (readings(rod(**size), q) - readings(rod(), q)) / amplitude
     scale = np.abs(change).max()
@@ -268,19 +268,19 @@ def test_what_an_unknown_does_is_no_error_of_the_model(what):
     )
     samples, one = best_fit(model, lp.Points(SENSORS, noise=0.01), truth(1)[:40])
     errors = ErrorColumns(samples, SMALL)
-    answers, *_ = errors.followed(one)
+    responses, *_ = errors.followed(one)
     constant = {"flow": {"steady flow"}, "source": {"switched"}, "loss": {"loss"}}[what]
     varies = {"flow": {"flow"}, "source": {"source", "switched"}, "loss": {"loss"}}[what]
-    for first, (answer, course) in zip(errors.first, errors.answers, strict=True):
-        own = answers[:, :, first : first + course.size]
-        if answer.kind in constant:
+    for first, (shape, course) in zip(errors.first, errors.shapes, strict=True):
+        own = responses[:, :, first : first + course.size]
+        if shape.kind in constant:
             assert not own[:, :, 0].any()
-        elif answer.kind in ("steady flow", "switched", "loss"):
+        elif shape.kind in ("steady flow", "switched", "loss"):
             assert own[:, :, 0].any()
-        if answer.kind in varies and answer.mode == 0:
+        if shape.kind in varies and shape.mode == 0:
             assert own.any()
-        if answer.kind in ("flow", "source"):  # hat functions that add up to one
-            same = answer.kind == what and answer.mode == 0
+        if shape.kind in ("flow", "source"):  # hat functions that add up to one
+            same = shape.kind == what and shape.mode == 0
             size = np.abs(own).max()
             assert (np.abs(own.sum(axis=2)).max() < 1e-9 * size) == same
 

@@ -78,6 +78,6 @@ def same(one: Record, other: Record) -> bool:
     mine, yours = one.snapshot, other.snapshot
     if mine is None or yours is None:
         return mine is yours
-    return mine.told == yours.told and all(
+    return mine.determined == yours.determined and all(
         values.tobytes() == yours.profiles[name].tobytes() for name, values in mine.profiles.items()
     )

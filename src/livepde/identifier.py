@@ -55,7 +55,7 @@ from livepde.stream_runs import StreamRuns
 from livepde.taken import TakenSamples
 from livepde.verdict import Verdict
 
-FORMAT = 13  # version of the checkpoint format
+FORMAT = 14  # version of the checkpoint format
 
 
 class Identifier(StreamRuns):

@@ -64,7 +64,7 @@ class Snapshot:
     # Variable -> values at the vertices, in the order of `Layout.coordinates`
     profiles: Mapping[str, Array]
     # Field -> number of modes that the data have determined, and number of all modes
-    told: Mapping[str, tuple[float, int]]
+    determined: Mapping[str, tuple[float, int]]
     # Correlation of the scalar unknowns, shape (unknowns, unknowns); None without covariance
     correlation: Array | None = None
     # Field -> share of its mean variance in modes that the law omits
@@ -72,7 +72,7 @@ class Snapshot:
 
     def to_bytes(self) -> bytes:
         """Return names and sizes as JSON, a zero byte, and the numbers."""
-        header: dict[str, Any] = {"told": self.told, "left_out": self.left_out}
+        header: dict[str, Any] = {"told": self.determined, "left_out": self.left_out}
         header["profiles"] = {name: len(values) for name, values in self.profiles.items()}
         body = [values.tobytes() for values in self.profiles.values()]
         if self.correlation is not None:
@@ -94,7 +94,7 @@ class Snapshot:
         *parts, correlations = np.split(numbers, np.cumsum(sizes))
         return cls(
             dict(zip(header["profiles"], parts, strict=True)),
-            {name: (float(told), int(count)) for name, (told, count) in header["told"].items()},
+            {name: (float(known), int(count)) for name, (known, count) in header["told"].items()},
             None if size is None else correlations.reshape(size, size),
             {str(name): float(share) for name, share in header.get("left_out", {}).items()},
         )
@@ -381,8 +381,8 @@ class Layout:
             attrs = {"units": self.units.get(name, self.units.get(bare(name), ""))}
             attrs |= {"comment": self.comments[name]} if name in self.comments else {}
             data[name] = (("snapshot", "vertex"), values, attrs)
-        for name, (_, count) in snapshots[-1].told.items():
-            determined = np.array([snapshot.told[name][0] for snapshot in snapshots])
+        for name, (_, count) in snapshots[-1].determined.items():
+            determined = np.array([snapshot.determined[name][0] for snapshot in snapshots])
             attributes = {"long_name": "modes that the data determine", "of": count}
             data[f"{name}_modes"] = ("snapshot", determined, attributes)
             left_out = np.array([snapshot.left_out.get(name, np.nan) for snapshot in snapshots])

@@ -458,7 +458,7 @@ class Case(CaseContent):
         """Whether the source in the case file is live: a growing file, a broker or a server."""
         return self.spec.data.live
 
-    def goes_on(self, data: str | None) -> bool:
+    def is_live(self, data: str | None) -> bool:
         """Return whether the source is live; `data` is a file that replaces the case's source."""
         if data is None:
             return self.live

@@ -110,7 +110,7 @@ class FoundChannel:
     name: str
     given: Mapping[str, Any]  # keys and values of the channel
     columns: tuple[str, ...]  # columns of the table; empty if the table lacks the input
-    told: str  # comment in the case file
+    comment: str  # comment in the case file
 
     @property
     def is_sensor(self) -> bool:
@@ -186,10 +186,10 @@ def _inline(key: str, given: Mapping[str, Any], comment: str = "") -> Iterator[s
     """Yield the line of an inline table with a comment; no line if the table is empty."""
     if given:
         shown = toml_line("x", given).partition(" = ")[2]
-        yield _told(f"{key} = {shown}", comment)
+        yield _commented(f"{key} = {shown}", comment)
 
 
-def _told(line: str, text: str) -> str:
+def _commented(line: str, text: str) -> str:
     """Return a line with a comment."""
     return f"{line:<29}  # {text}" if text else line
 
@@ -197,24 +197,24 @@ def _told(line: str, text: str) -> str:
 def _top(table: Measured, equation: Equation, inputs: set[str]) -> Iterator[str]:
     """Yield the lines of title, equation, required options, and initial state."""
     yield toml_line("title", table.path.stem)
-    yield _told(toml_line("equation", equation.name), equation.formula)
+    yield _commented(toml_line("equation", equation.name), equation.formula)
     yield f"# 'livepde equations {equation.name}' lists its keys, 'livepde equations' all equations"
     asked = equation.alternatives.get(_alternative(equation, inputs), ())
     for name, option in equation.options.items():
         if option.default is None or name in asked:
-            yield _told(f'options.{name} = "{_open(option.unit)}"', option.text)
+            yield _commented(f'options.{name} = "{_open(option.unit)}"', option.text)
     unit = equation.state.unit
     if unit != EQUATIONS[equation.name].state.unit:
-        yield _told(f"options.{toml_line('unit', unit)}", "of the state, and of its sensors")
+        yield _commented(f"options.{toml_line('unit', unit)}", "of the state, and of its sensors")
     if equation.components:
         parts = dict.fromkeys(equation.components, _open(unit))
         yield from _inline("initial", parts, equation.state.text)
     elif equation.spacing == "geometric":  # around a well, where a line between sensors is no state
-        yield _told(toml_line("initial", _open(unit)), f"{equation.state.text} at rest")
+        yield _commented(toml_line("initial", _open(unit)), f"{equation.state.text} at rest")
     elif equation.dimension > 1:
-        yield _told(toml_line("initial", _open(unit)), f"{equation.state.text} at the start")
+        yield _commented(toml_line("initial", _open(unit)), f"{equation.state.text} at the start")
     else:
-        yield _told('initial = "interpolate"', "from the first sample; or a number")
+        yield _commented('initial = "interpolate"', "from the first sample; or a number")
 
 
 def _mesh(equation: Equation) -> dict[str, Any]:
@@ -328,8 +328,9 @@ def _constants(found: list[FoundChannel]) -> Iterator[str]:
     """Yield the lines of the inputs without a column."""
     for item in found:
         if not item.columns:
+            line = f'inputs.{item.name} = "{item.given["value"]}"'
             more = f'or [channels] {item.name} = {{ role = "input", column = ... }}'
-            yield _told(f'inputs.{item.name} = "{item.given["value"]}"', f"{item.told}; {more}")
+            yield _commented(line, f"{item.comment}; {more}")
 
 
 def _channels(equation: Equation, found: list[FoundChannel]) -> Iterator[str]:
@@ -344,7 +345,7 @@ def _channels(equation: Equation, found: list[FoundChannel]) -> Iterator[str]:
         yield VALUES.format(flux=units.flux) if units else ENDS[equation.dimension]
     for item in found:
         if item.columns:
-            yield _told(toml_line(item.name, item.given), item.told)
+            yield _commented(toml_line(item.name, item.given), item.comment)
 
 
 def in_unit_of(table: Measured, equation: Equation, stated: str = "") -> Equation:
@@ -398,7 +399,7 @@ def _by_unit(
     if len(names) != 1 or sum(fits(other, needed[names[0]]) for other in others) != 1:
         return item
     found = _input(table, names[0], item.columns[0], needed[names[0]].unit)
-    return replace(found, told=f"{found.told}, by its unit")
+    return replace(found, comment=f"{found.comment}, by its unit")
 
 
 def _labels(columns: Iterable[str]) -> list[str]:

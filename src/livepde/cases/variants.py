@@ -22,7 +22,7 @@ from livepde.dates import since_1970
 from livepde.errors import CaseError
 from livepde.laws import SensitivityLaw
 from livepde.laws.assimilation import HALF_LOG
-from livepde.plots.style import modes_told
+from livepde.plots.style import modes_determined
 from livepde.records import interval_95, scalars, used_errors
 from livepde.result import Result
 from livepde.runs import sampling_findings, verdict
@@ -286,7 +286,7 @@ def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun
     found = with_errors_of_set_aside(prepared, data, verdict(data).with_findings(sampled))
     found = with_settings(prepared, found)
     errors = found.errors
-    modes = [modes_told(data, name)[1] for name in fields if f"{name}_modes" in data]
+    modes = [modes_determined(data, name)[1] for name in fields if f"{name}_modes" in data]
     used = data["time"].values >= prepared.assimilate_from
     seen = np.isfinite(data["innovation"].transpose("time", "sensor").values[used]).sum(axis=0)
     readings = dict(zip(map(str, data["sensor"].values), seen.tolist(), strict=True))

@@ -92,7 +92,7 @@ def compare(
     named = case
     case, settings, data = _case_of(named, settings or [], data)
     loaded = load_case(case, allow_code, settings)
-    if loaded.goes_on(data) or data == "-":
+    if loaded.is_live(data) or data == "-":
         raise ConfigurationError(
             "compare requires complete data. Add --data FILE with recorded rows."
         )

@@ -426,7 +426,7 @@ def in_parts(
     rows: Sequence[Row],
     jobs: int,
     backend: Backend | None,
-    told: list[str],
+    messages: list[str],
 ) -> Iterator[Found]:
     """Run rows in parts of bounded size, and iterate over their results in any order.
 
@@ -462,7 +462,7 @@ def in_parts(
                 what += f", {members} members unfinished"
                 if lost == ATTEMPTS:
                     raise RunError(f"{what}, {lost} times in a row without progress.") from error
-                told.append(f"{what}. They were resumed from their run directories.")
+                messages.append(f"{what}. They were resumed from their run directories.")
 
 
 def _attempt(

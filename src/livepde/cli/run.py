@@ -126,7 +126,7 @@ def run(
     Service:  livepde run mycase/case.toml --realtime --out runs/mycase --resume --listen 9100
     """
     loaded = options.load_case(case, allow_code, settings)
-    own = loaded.goes_on(data)
+    own = loaded.is_live(data)
     how = LiveOptions(
         data, own, realtime, resume, speed, listen, watch, token, estimates, allow_env
     )
@@ -192,7 +192,7 @@ def _refuse(how: LiveOptions, as_json: bool) -> None:
             raise ConfigurationError(f"{name} requires --realtime.")
     if as_json and how.estimates:
         raise ConfigurationError("--json and --estimates both print to standard output. Keep one.")
-    if how.goes_on and how.speed is not None:
+    if how.continuous and how.speed is not None:
         raise ConfigurationError(
             "--speed is only valid for the replay of a complete file. This source is live."
         )
@@ -356,7 +356,7 @@ class LiveOptions:
         return sys.stdin if self.data == "-" else self.data
 
     @property
-    def goes_on(self) -> bool:
+    def continuous(self) -> bool:
         """Whether the source continues at its own pace."""
         return self.own or self.data == "-"
 
@@ -369,7 +369,7 @@ class LiveOptions:
     @property
     def pace(self) -> float:
         """Speed of the samples relative to real time; inf: samples are processed immediately."""
-        if self.goes_on:
+        if self.continuous:
             return math.inf
         return 1.0 if self.speed is None else self.speed
 

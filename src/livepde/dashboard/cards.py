@@ -18,7 +18,7 @@ from dash import html
 from livepde.dashboard.figures.canvas import at_time, unit_label, when_axis
 from livepde.dashboard.view import RunView
 from livepde.frames import ERRORS
-from livepde.plots.style import axis_label, groups, modes_told, prior_left
+from livepde.plots.style import axis_label, groups, modes_determined, prior_left
 from livepde.records import STATUS_CODES, field_names, interval_95, scalars
 from livepde.runs import Check, severities
 from livepde.runs.summary import STATES, channel_errors, determination, digits
@@ -245,7 +245,7 @@ def _field_card(data: xr.Dataset, name: str, at: float | None) -> Any:
         deviation = pretty(f"{float(np.mean(data[f'{name}_std'].values[k])):.2g}")
         lines.append(html.P(f"mean standard deviation {deviation}", className="interval"))
     if f"{name}_modes" in data:
-        some, count, _ = modes_told(data, name, k)
+        some, count, _ = modes_determined(data, name, k)
         level: Level = "good" if some > 0.9 * count else "info" if some >= 1.0 else "warn"
         text = f"{some:.1f} of {count} modes determined"
         lines.append(html.P([sign(level), text], className="known"))

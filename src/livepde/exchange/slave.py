@@ -106,9 +106,9 @@ class IdentifierSlave:
 
     def do_step(self, current_time: float, step_size: float) -> bool:
         """Use the inputs as the sample of the current time; errors set the status output."""
-        told = self.component.take(current_time)
-        if told:
-            self.log(told, self._kit("{}Status").warning)
+        warning_text = self.component.take(current_time)
+        if warning_text:
+            self.log(warning_text, self._kit("{}Status").warning)
         return True
 
     def _get_fmu_state(self) -> bytes:

@@ -44,7 +44,7 @@ from livepde.start import assumes_zero, initial_errors, initial_readings
 from livepde.stepping import Advance, Between, Scheme, Span, own_noise
 from livepde.verdict import Verdict
 
-FORMAT = 12  # version of the checkpoint format
+FORMAT = 13  # version of the checkpoint format
 
 Values = ArrayLike | Mapping[str, ArrayLike]
 

@@ -52,7 +52,7 @@ CLOSE, SLIGHT = 0.05, 0.2
 # If unknowns move: maximum number of samples in a filter pass, and of steps in all passes; least
 # share of the misfit of a reported error, and maximum number of reported errors.
 MOST_FOLLOWED, MOST_STEPS = 300, 20_000
-SOME, NAMED = 0.1, 3
+LEAST_SHARE, NAMED = 0.1, 3
 LAGS = 16  # maximum number of passes in a search for a longer lag
 SLIGHT_LAG = 0.02  # least share explained by a lag of one sample before longer lags are tried
 
@@ -535,7 +535,8 @@ def _likely_filtered(columns: Columns, least: float) -> list[Cause]:
     lags = [_Lag(name, columns.interval, longest, share) for name in columns.places]
     lags = sorted(lags, key=lambda lag: -lag.of(lag.first))[: TRIED["lag"]]
     kept += [lag.best for lag in lags if lag.of(lag.first) > SLIGHT_LAG]
-    kept = sorted((item for item in kept if item[0] > SOME), key=lambda item: -item[0])[:NAMED]
+    notable = (item for item in kept if item[0] > LEAST_SHARE)
+    kept = sorted(notable, key=lambda item: -item[0])[:NAMED]
     return [columns.cause(error, explained) for explained, error in kept]
 
 

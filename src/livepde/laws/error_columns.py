@@ -47,8 +47,8 @@ ALIKE = 1e-3  # relative difference below which two loads are equal
 ROUNDING = 1e-11  # size of an effect, relative to its terms, below which it counts as zero
 
 
-class Answer(NamedTuple):
-    """Spatial shape of an error of the process; each column has a different course in time."""
+class ErrorShape(NamedTuple):
+    """Spatial shape of an error of the process; its columns differ in their course in time."""
 
     # "source", "switched", "conductivity", "state", "layer", "contact", "flow", "steady flow",
     # "loss", "boundary", "late boundary", "channel", "flux", "transfer", "initial" or "unknown"
@@ -111,13 +111,13 @@ class ErrorColumns:
         problem = samples.filter.problem
         self.model, self.observed = problem.model, problem.observed
         self.span = np.ptp(self.model.mesh.p, axis=1)
-        self.answers: list[tuple[Answer, Course]] = [*self._sources(), *self._initial()]
-        self.answers += [*self._boundaries(), *self._unknowns()]
+        self.shapes: list[tuple[ErrorShape, Course]] = [*self._sources(), *self._initial()]
+        self.shapes += [*self._boundaries(), *self._unknowns()]
         single = self.model.state_space.single and not len(self.model.algebraic)
         if single and not next(iter(self.model.state_space.fields.values())).vector:
-            self.answers += [*self._operators(), *self._fluxes()]
+            self.shapes += [*self._operators(), *self._fluxes()]
         # Number of the first column of each response, and number of all columns.
-        sizes = (course.size for _, course in self.answers)
+        sizes = (course.size for _, course in self.shapes)
         *self.first, self.count = itertools.accumulate(sizes, initial=0)
 
     @cached_property
@@ -151,7 +151,7 @@ class ErrorColumns:
 
         return shape
 
-    def _sources(self) -> Iterator[tuple[Answer, Course]]:
+    def _sources(self) -> Iterator[tuple[ErrorShape, Course]]:
         """Iterate over sources: the modes of a family, and uniform sources that switch on."""
         model, (modes, times) = self.model, self.numbers.source
         for name, block in model.state_space.fields.items():
@@ -160,41 +160,41 @@ class ErrorColumns:
             for k in range(modes):
                 u = model.state_space.interpolate({name: self._mode(k)})
                 load = np.asarray(model.mass @ (u - model.state_space.prior))
-                yield Answer("source", name, self._powers[k][0], load), hats(times)
+                yield ErrorShape("source", name, self._powers[k][0], load), hats(times)
                 if k == 0:
-                    yield Answer("switched", name, load=load), SWITCHED
+                    yield ErrorShape("switched", name, load=load), SWITCHED
 
-    def _initial(self) -> Iterator[tuple[Answer, Course]]:
+    def _initial(self) -> Iterator[tuple[ErrorShape, Course]]:
         free = self.model.X.free
         for name, block in self.model.state_space.fields.items():
             if block.vector:
                 continue
             for k in range(2):
                 u = self.model.state_space.interpolate({name: self._mode(k)})
-                yield Answer("initial", name, start=u * free), ALWAYS
+                yield ErrorShape("initial", name, start=u * free), ALWAYS
 
-    def _boundaries(self) -> Iterator[tuple[Answer, Course]]:
+    def _boundaries(self) -> Iterator[tuple[ErrorShape, Course]]:
         model, lifts = self.model, boundary_lifts(self.model)
         for name, lift in lifts.items():
-            yield Answer("boundary", name, lift=lift), ALWAYS
+            yield ErrorShape("boundary", name, lift=lift), ALWAYS
             if name in model.channels:
-                yield Answer("late boundary", name, lift=_late(lift, name)), ALWAYS
+                yield ErrorShape("late boundary", name, lift=_late(lift, name)), ALWAYS
         for name in model.channels:
             if name not in lifts:
-                yield Answer("channel", name, load=_scaled(model, name)), ALWAYS
+                yield ErrorShape("channel", name, load=_scaled(model, name)), ALWAYS
 
-    def _fluxes(self) -> Iterator[tuple[Answer, Course]]:
+    def _fluxes(self) -> Iterator[tuple[ErrorShape, Course]]:
         for name, load in flux_loads(self.model).items():
-            yield Answer("flux", name, load=load), ALWAYS
-            yield Answer("transfer", name, load=_exchanged(load, self._rest)), ALWAYS
+            yield ErrorShape("flux", name, load=load), ALWAYS
+            yield ErrorShape("transfer", name, load=_exchanged(load, self._rest)), ALWAYS
 
-    def _unknowns(self) -> Iterator[tuple[Answer, Course]]:
+    def _unknowns(self) -> Iterator[tuple[ErrorShape, Course]]:
         reduction = self.samples.filter.reduction
         for label, place in reduction.stay[:MOST_UNKNOWNS]:
             load = _changed(self.model, reduction.Phi[:, place])
-            yield Answer("unknown", label, load=load), CHANGES
+            yield ErrorShape("unknown", label, load=load), CHANGES
 
-    def _operators(self) -> Iterator[tuple[Answer, Course]]:
+    def _operators(self) -> Iterator[tuple[ErrorShape, Course]]:
         """Iterate over flows, losses, contacts, and conductivities that vary in space or state."""
         model, (modes, times) = self.model, self.numbers.conductivity
         # A contact resists conduction, not advection. Equations that are linear but not symmetric
@@ -207,26 +207,26 @@ class ErrorColumns:
 
         for k in range(1, 1 + modes):
             load = _minus(stiffness(self._mode(k)))
-            yield Answer("conductivity", "", self._powers[k][0], load), hats(times)
+            yield ErrorShape("conductivity", "", self._powers[k][0], load), hats(times)
         plain = stiffness(self._mode(0))
-        yield Answer("state", load=_by_state(plain)), ALWAYS
+        yield ErrorShape("state", load=_by_state(plain)), ALWAYS
         for axis, span in enumerate(self.span):
             halves = stiffness(self._halves(axis))
-            yield Answer("layer", "xyz"[axis], load=_minus(halves)), ALWAYS
+            yield ErrorShape("layer", "xyz"[axis], load=_minus(halves)), ALWAYS
             in_line = len(self.span) == 1
             cell = 1.0 / model.mesh.nelements if in_line else float(model.mesh.param()) / span
             for place in places:
                 matrix = stiffness(self._band(axis, place, max(NARROW, 1.5 * cell)))
-                yield Answer("contact", "xyz"[axis], load=_minus(matrix)), ALWAYS
+                yield ErrorShape("contact", "xyz"[axis], load=_minus(matrix)), ALWAYS
         modes, times = self.numbers.flow
         axes = len(self.span)
         for k in range(axes * math.ceil(modes / axes)):  # equally many along each axis
             axis, number = k % axes, k // axes
             load = _minus(self._flow(axis, self._mode(number)))
-            yield Answer("flow", "", axes * self._powers[number][0], load), hats(times)
+            yield ErrorShape("flow", "", axes * self._powers[number][0], load), hats(times)
             if number == 0:
-                yield Answer("steady flow", "xyz"[axis], load=load), ALWAYS
-        yield Answer("loss", load=_lost(model.mass, self._rest)), SWITCHED
+                yield ErrorShape("steady flow", "xyz"[axis], load=load), ALWAYS
+        yield ErrorShape("loss", load=_lost(model.mass, self._rest)), SWITCHED
 
     @cached_property
     def _rest(self) -> float:
@@ -291,16 +291,16 @@ class ErrorColumns:
     def _initial_values(self) -> Array:
         """Return the initial responses, shape (columns, n)."""
         p = np.zeros((self.count, self.model.X.dim))
-        for column, (answer, _) in zip(self.first, self.answers, strict=True):
-            if answer.start is not None:
-                p[column] = answer.start
+        for column, (shape, _) in zip(self.first, self.shapes, strict=True):
+            if shape.start is not None:
+                p[column] = shape.start
         return p
 
     def _without_unknowns(self, readings: Array, nows: Sequence[Now]) -> Array:
         """Return readings of responses without effects of unknowns, which are not model errors."""
         compared = np.linspace(0, len(nows) - 1, min(COMPARED, len(nows))).astype(int)
         for number in self._of_unknowns([nows[k] for k in compared]):
-            first, (_, course) = self.first[number], self.answers[number]
+            first, (_, course) = self.first[number], self.shapes[number]
             own = slice(first, first + course.size)
             readings[:, :, own] = course.varying(readings[:, :, own])
         return readings
@@ -324,10 +324,10 @@ class ErrorColumns:
             return []
         known = np.array(changes)[sizes > 0.0] / sizes[sizes > 0.0, None]
         basis, numbers = scipy.linalg.orth(known.T), list[int]()
-        for number, (answer, _) in enumerate(self.answers):
-            if answer.load is None or answer.kind == "unknown":
+        for number, (shape, _) in enumerate(self.shapes):
+            if shape.load is None or shape.kind == "unknown":
                 continue
-            own = at_all(answer.load)
+            own = at_all(shape.load)
             size = float(np.linalg.norm(own))
             rest = float(np.linalg.norm(own - basis @ (basis.T @ own)))
             if size > 0.0 and rest <= ALIKE * size:
@@ -337,13 +337,13 @@ class ErrorColumns:
     def _advanced(self, stage: ForwardStage, p: Array, now: Now, h: float, share: float) -> Array:
         """Return the responses after a time h, shape (columns, n); `share`: fraction of the run."""
         loads, lifts = np.zeros_like(p), np.zeros_like(p)
-        for first, (answer, course) in zip(self.first, self.answers, strict=True):
+        for first, (shape, course) in zip(self.first, self.shapes, strict=True):
             own, weights = slice(first, first + course.size), course.at(share)[:, None]
-            if answer.load is not None:
-                load = answer.load(now) if callable(answer.load) else answer.load
+            if shape.load is not None:
+                load = shape.load(now) if callable(shape.load) else shape.load
                 loads[own] = weights * load
-            if answer.lift is not None:
-                lift = answer.lift(now) if callable(answer.lift) else answer.lift
+            if shape.lift is not None:
+                lift = shape.lift(now) if callable(shape.lift) else shape.lift
                 lifts[own] = weights * lift
         return later(stage, p, now, h, loads, lifts)
 

@@ -37,13 +37,13 @@ class Screened:
     # Misfitting readings in a row, and how many of them differed from the reading before.
     refused: IntArray
     changes: IntArray
-    fits: IntArray  # fitting readings in a row of a sensor that is `aside` or `apart`
+    fits: IntArray  # fitting readings in a row of a sensor that is `excluded` or `state_only`
     taken: IntArray  # number of readings used, at most `SETTLED`
-    aside: Mask  # excluded sensors
-    apart: Mask  # sensors that correct the state but not the unknowns
+    excluded: Mask  # excluded sensors
+    state_only: Mask  # sensors that correct the state but not the unknowns
     # Time of the first misfit in a row, and last misfitting innovation; NaN without a misfit.
     since: Array
-    off: Array
+    deviation: Array
     # Range of the readings used; NaN before the first.
     low: Array
     high: Array
@@ -51,8 +51,8 @@ class Screened:
     last: Array
     run: IntArray
     longest: IntArray
-    strain: IntArray  # misfitting readings of sensors `apart` since the start of a disturbance
-    # Samples of a disturbance since a sensor was last `apart`, at most `CALM`, shape (members,).
+    strain: IntArray  # misfitting readings of `state_only` sensors since a disturbance began
+    # Samples of a disturbance without a `state_only` sensor, at most `CALM`, shape (members,).
     calm: IntArray
 
     @classmethod
@@ -60,8 +60,8 @@ class Screened:
         none = np.zeros((members, sensors), np.int64)
         counts = ("refused", "changes", "fits", "taken", "run", "longest", "strain")
         same: dict[str, Any] = dict.fromkeys(counts, none)
-        same |= dict.fromkeys(("since", "off", "low", "high", "last"), none + np.nan)
-        same |= dict.fromkeys(("aside", "apart"), none > 0)
+        same |= dict.fromkeys(("since", "deviation", "low", "high", "last"), none + np.nan)
+        same |= dict.fromkeys(("excluded", "state_only"), none > 0)
         return cls(calm=np.full(members, CALM), **same)
 
     def fitted(self, z: Array, present: Mask) -> Screened:
@@ -93,7 +93,7 @@ class Screened:
         if self.taken.min() < SETTLED:
             parts["taken"] = np.minimum(self.taken + learned, SETTLED)
         if np.count_nonzero(self.strain):
-            calm = np.where(self.apart.any(axis=1), 0, np.minimum(self.calm + 1, CALM))
+            calm = np.where(self.state_only.any(axis=1), 0, np.minimum(self.calm + 1, CALM))
             parts |= {"calm": calm, "strain": np.where(calm[:, None] < CALM, self.strain, 0)}
         return parts
 
@@ -152,7 +152,7 @@ class Gate:
         implausible = absurd | (outside & (run > 0)) | stuck
         # A stuck sensor fits by chance while the prediction crosses its value.
         misfit = far | (used & same & stuck & (x.refused > 0))
-        waiting = x.aside | x.apart
+        waiting = x.excluded | x.state_only
         over = used & ~misfit & ~waiting
         refused = np.where(misfit, x.refused + 1, np.where(over, 0, x.refused))
         changes = np.where(misfit & ~same, x.changes + 1, np.where(over, 0, x.changes))
@@ -165,16 +165,17 @@ class Gate:
         refused = np.where(sudden, np.maximum(refused, self.patience + 1), refused)
         late, first = misfit & (refused > self.patience), x.refused == self.patience
         believed = late & together & (sudden | (2 * changes >= self.patience))
-        aside = np.where(late & ~believed, x.aside | first | implausible, x.aside & ~believed)
+        excluded = x.excluded & ~believed
+        excluded = np.where(late & ~believed, x.excluded | first | implausible, excluded)
         back = waiting & used & ~misfit & (fits >= self.patience)
-        aside = aside & ~back
+        excluded = excluded & ~back
         refused, changes = np.where(back, 0, refused), np.where(back, 0, changes)
-        kept = used & ~aside & (~misfit | late)
-        repeated = misfit & (refused > 1) & ~aside & ~implausible & (~outside | together)
-        apart = (refused > self.patience) & ~aside & (x.taken >= SETTLED) & self.anchors
-        strain = x.strain + (apart & misfit)
+        kept = used & ~excluded & (~misfit | late)
+        repeated = misfit & (refused > 1) & ~excluded & ~implausible & (~outside | together)
+        state_only = (refused > self.patience) & ~excluded & (x.taken >= SETTLED) & self.anchors
+        strain = x.strain + (state_only & misfit)
         lasting = (strain > LASTING).any(axis=1)[:, None]
-        apart = apart & ~lasting
+        state_only = state_only & ~lasting
         state = changed(
             x,
             # Constants that must explain a lasting misfit start again with a poor fit.
@@ -182,16 +183,16 @@ class Gate:
             refused=refused,
             changes=changes,
             fits=np.where(back, 0, fits),
-            aside=aside,
-            apart=apart,
+            excluded=excluded,
+            state_only=state_only,
             strain=np.where(lasting, 0, strain),
             since=np.where(refused > 0, np.where(x.refused > 0, x.since, t), np.nan),
-            off=np.where(misfit, d, np.where(refused > 0, x.off, np.nan)),
+            deviation=np.where(misfit, d, np.where(refused > 0, x.deviation, np.nan)),
             last=last,
             run=run,
         )
         # A single misfit does not count as a change of the process; a second in a row may.
-        anchored = kept & apart.any(axis=1)[:, None]
+        anchored = kept & state_only.any(axis=1)[:, None]
         learned = kept & ~anchored
         return Gated(learned, anchored, learned | repeated, state.used(z, kept, learned))
 

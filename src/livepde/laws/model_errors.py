@@ -385,7 +385,7 @@ def linear_model(
     fine = len(samples) >= MANY and work * MOST_COLUMNS < MOST_WORK
     numbers = FULL if fine else SMALL
     errors = ErrorColumns(samples, numbers)
-    answers, states, predicted = errors.followed(one)
+    responses, states, predicted = errors.followed(one)
     noise, times, sensors = samples.noise, samples.times, predicted.shape[1]
     level = _level(one.residuals, used)
     parts: list[Array] = []
@@ -400,12 +400,12 @@ def linear_model(
         place += flat.shape[1]
         return np.arange(place - flat.shape[1], place)
 
-    own = add(answers)
+    own = add(responses)
     family: dict[str, list[tuple[float, IntArray, int]]] = {}
-    for first, (answer, course) in zip(errors.first, errors.answers, strict=True):
+    for first, (shape, course) in zip(errors.first, errors.shapes, strict=True):
         columns = own[first : first + course.size]
-        if answer.kind in ("source", "conductivity", "flow"):
-            family.setdefault(answer.kind, []).append((answer.mode, columns, course.size))
+        if shape.kind in ("source", "conductivity", "flow"):
+            family.setdefault(shape.kind, []).append((shape.mode, columns, course.size))
         else:
             causes += [(column, math.inf) for column in columns.tolist()]
     for kind, members in family.items():

@@ -295,7 +295,7 @@ def _with_jump_test(
     row = int(state.since_older[0])
     known = [*_since(work, state, row), interval]
     # `onset` ignores readings that the gate refused in a row, but the jump may explain them.
-    doubted = int(np.where(screened.aside, 0, screened.refused).max())
+    doubted = int(np.where(screened.excluded, 0, screened.refused).max())
     moving = np.where(state.watch.repeating(screened.run), np.nan, e)
     shown = [bool(item.present.any()) for item in known]
     onsets = [max(onset, doubted) for onset in jumps.onsets(state.watch, moving)]

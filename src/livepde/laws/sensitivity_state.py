@@ -342,7 +342,7 @@ def stored(
         return changed(state, now=now, **parts)
     log = added(state.log, span, taken, now.parts)
     parts["log"] = log
-    if np.count_nonzero(now.screened.aside):
+    if np.count_nonzero(now.screened.excluded):
         parts |= _set_aside(work, state, now, log, taken)
     if work.window:
         parts["assimilated"] = state.assimilated + (taken & span.present)
@@ -365,7 +365,7 @@ def _set_aside(
     Their readings since the first refusal are removed from the log, and a refit in progress that
     uses one of these readings is dropped.
     """
-    kept = withdrawn(log, now.screened.aside & taken[:, None], now.screened.since)
+    kept = withdrawn(log, now.screened.excluded & taken[:, None], now.screened.since)
     if kept is log:
         return {"log": log}
     # A refit counts the removed readings as refused. Otherwise evidence would depend on the number

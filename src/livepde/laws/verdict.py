@@ -43,8 +43,8 @@ LARGER = 1.5  # noise over its initial guess, above which the first samples had 
 LARGE = 1.0  # misfit over noise that a column must explain if no test has found a misfit
 COUNTS = len(STATUS_CODES) + 1  # number of counts of a `StepLedger`
 
-SOME = 0.02  # share of failed steps above which the finding is a caution
-MOST = 0.5  # share of failed steps above which the result is not to be trusted
+CAUTION_SHARE = 0.02  # share of failed steps above which the finding is a caution
+SERIOUS_SHARE = 0.5  # share of failed steps above which the result is not to be trusted
 PLACES = {code: place for place, code in enumerate(STATUS_CODES)}
 FAILURES = ("departed", "not_converged", "not_finite", "singular")  # each code has a finding
 
@@ -224,7 +224,8 @@ def _position(filter_: Filter, x: FilterState) -> Position:
     for label, place in reduction.stay:
         names[place] = label
     sensors, screened = problem.observed.names, x.screened
-    since, off = screened.since[0].tolist(), screened.off[0].tolist()
+    since, deviation = screened.since[0].tolist(), screened.deviation[0].tolist()
+    excluded = np.flatnonzero(screened.excluded[0]).tolist()
     return Position(
         ledger=x.ledger.of_member(0),
         moved=by_label,
@@ -235,8 +236,8 @@ def _position(filter_: Filter, x: FilterState) -> Position:
         time_unit=problem.model.time_unit,
         unknowns=names,
         moving=reduction.moves,
-        aside={sensors[i]: (since[i], off[i]) for i in np.flatnonzero(screened.aside[0])},
-        apart=int(screened.apart[0].sum()),
+        excluded={sensors[i]: (since[i], deviation[i]) for i in excluded},
+        state_only=int(screened.state_only[0].sum()),
         strain=int(screened.strain[0].max()),
         start_uncertain=len(problem.initial_errors) > 0,
     )
@@ -313,7 +314,7 @@ def step_findings(counts: Mapping[str, int]) -> Iterator[Finding]:
         text, _ = FINDINGS[code].filled(count=count, samples=samples)
         share, departed = count / samples, code == "departed"
         # With a right model, one in a million cases departs: any departure is significant.
-        severity: Severity = "caution" if departed or share > SOME else "note"
-        if share > (SOME if departed else MOST):
+        severity: Severity = "caution" if departed or share > CAUTION_SHARE else "note"
+        if share > (CAUTION_SHARE if departed else SERIOUS_SHARE):
             severity = "do not trust"
         yield Finding("steps", severity, text, code, float(count), remedy=Status(code).remedy)

@@ -42,15 +42,15 @@ def prior_left(data: xr.Dataset, label: str, k: int = -1) -> float:
     return float(data[f"{label}_left"].values[k]) if f"{label}_left" in data else math.nan
 
 
-def modes_told(data: xr.Dataset, name: str, k: int = -1) -> tuple[float, int, float]:
+def modes_determined(data: xr.Dataset, name: str, k: int = -1) -> tuple[float, int, float]:
     """Return the number of a field's modes that data determine at snapshot k, of all, and `left`.
 
     `left` is the root mean square over all modes of the ratio s of posterior to prior standard
     deviation. Each mode contributes 1 - s^2 to the number of determined modes.
     """
     modes = data[f"{name}_modes"]
-    count, told = int(modes.attrs["of"]), float(modes.values[k])
-    return told, count, math.sqrt(max(1.0 - told / count, 0.0)) if count else math.nan
+    count, determined = int(modes.attrs["of"]), float(modes.values[k])
+    return determined, count, math.sqrt(max(1.0 - determined / count, 0.0)) if count else math.nan
 
 
 def note(data: xr.Dataset, name: str) -> Array | None:

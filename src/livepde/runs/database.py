@@ -92,7 +92,7 @@ def check_file(path: Path, connection: sqlite3.Connection) -> None:
     try:
         (found,), *_ = connection.execute("PRAGMA quick_check(1)").fetchall()
     except (sqlite3.Error, UnicodeDecodeError) as error:
-        raise RunError(told(path, error)) from error
+        raise RunError(database_failure(path, error)) from error
     if found != "ok":
         raise RunError(damaged(path, str(found).splitlines()[-1]))
 
@@ -166,7 +166,7 @@ def released(path: Path, lock: FileLock | None) -> Iterator[None]:
         if lock is not None:
             lock.release()
         if isinstance(error, sqlite3.Error | UnicodeDecodeError):
-            raise RunError(told(path, error)) from error
+            raise RunError(database_failure(path, error)) from error
         if not isinstance(error, RunError):
             raise RunError(f"{path} cannot be written: {error.strerror or error}.") from error
         raise
@@ -182,7 +182,7 @@ def sound(path: Path) -> Iterator[None]:
         raise RunError(damaged(path, reason[:200])) from error
 
 
-def told(path: Path, error: sqlite3.Error | UnicodeDecodeError) -> str:
+def database_failure(path: Path, error: sqlite3.Error | UnicodeDecodeError) -> str:
     """Return a message with the remedy for an error of SQLite."""
     code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
     if code & 0xFF in CORRUPT:

@@ -43,13 +43,13 @@ from livepde.runs.database import (
     check_file,
     checksum,
     damaged,
+    database_failure,
     fill,
     locked,
     reader,
     released,
     remedy_of,
     sound,
-    told,
     writer,
 )
 from livepde.samples import noise_channel
@@ -208,7 +208,7 @@ class Journal:
         """Roll back uncommitted records, and refuse further writes."""
         with suppress(sqlite3.Error):
             self._db.rollback()
-        self._failure = told(self.path, error)
+        self._failure = database_failure(self.path, error)
         self._remedy = "" if self.path is MEMORY else remedy_of(error)
 
     @property
@@ -245,7 +245,7 @@ class Journal:
             disk = self._lock is not None and remedy_of(error)
             if disk and isinstance(error, sqlite3.OperationalError):
                 self._fail(error)  # SQLite may have rolled back uncommitted records
-            raise RunError(told(self.path, error)) from error
+            raise RunError(database_failure(self.path, error)) from error
 
     def _one(self, command: str, *values: Any) -> Any:
         return self._read(command, *values)[0][0]

@@ -16,7 +16,7 @@ from livepde.diagnostics.check_report import Bound, Check, Sense, Table
 from livepde.diagnostics.information_gain import TRADED, InformationGain
 from livepde.frames import ERRORS, estimates, model_errors, relative_error
 from livepde.linalg import Array
-from livepde.plots.style import modes_told, note, prior_left
+from livepde.plots.style import modes_determined, note, prior_left
 from livepde.records import NORMAL_95, field_names, refused_readings, scalars, used_errors
 from livepde.runs.journal import Journal
 from livepde.showing import in_percent
@@ -429,7 +429,7 @@ def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:
         rows.append((label, in_percent(left), words))
     for name in field_names(data):
         if f"{name}_modes" in data:
-            known, count, left = modes_told(data, name)
+            known, count, left = modes_determined(data, name)
             rows.append((name, in_percent(left), f"{known:.1f} of {count} modes determined"))
     return Table("Identifiability", ("unknown", "std. dev. / prior", "state"), rows)
 

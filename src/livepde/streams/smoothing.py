@@ -204,10 +204,10 @@ class _NoiseLevel:
         # sigma^2 (1 + (1 - s)^2 + s^2) for white noise; the curvature of the signal is neglected.
         share = (self.t[1] - self.t[0]) / (t - self.t[0])
         rest = self.z[1] - (1.0 - share) * self.z[0] - share * z
-        told = present & np.isfinite(rest)
+        complete = present & np.isfinite(rest)
         scale = 1.0 + (1.0 - share) ** 2 + share**2
-        self.squares[told] += rest[told] ** 2 / scale[told]
-        self.counts[told] += 1.0
+        self.squares[complete] += rest[complete] ** 2 / scale[complete]
+        self.counts[complete] += 1.0
         self.z[0, present], self.t[0, present] = self.z[1, present], self.t[1, present]
         self.z[1, present], self.t[1, present] = z[present], t
         sigma = np.full(z.shape, np.nan)

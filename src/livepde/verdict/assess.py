@@ -97,10 +97,10 @@ class Position:
     unknowns: Sequence[str]  # label of each constant reduced unknown
     moving: bool  # whether unknowns vary in time
     # Excluded sensors: name -> (time of exclusion, last reading minus prediction)
-    aside: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    # apart, strain: number of sensors that correct the state but not the unknowns, and number of
-    # readings of one sensor that did so since the disturbance began
-    apart: int = 0
+    excluded: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    # state_only, strain: number of sensors that correct the state but not the unknowns, and largest
+    # number of readings of one sensor that did so since the disturbance began
+    state_only: int = 0
     strain: int = 0
     start_uncertain: bool = False  # whether the initial state has its own uncertainty
 
@@ -429,7 +429,7 @@ def _stuck(at: Position) -> Iterator[Finding]:
     distance = np.abs(ledger.value - ledger.last) / at.noise
     for i in np.flatnonzero((ledger.stuck >= STUCK_READINGS - 1) & (distance > STUCK_DISTANCE)):
         name, count = at.sensors[int(i)], int(ledger.stuck[i]) + 1
-        if name in at.aside:  # its readings are not used
+        if name in at.excluded:  # its readings are not used
             continue
         text, _ = FINDINGS["stuck"].filled(name=name, count=count)
         setting = channel_setting(name, "role", '"ignored"')
@@ -440,10 +440,10 @@ def _stuck(at: Position) -> Iterator[Finding]:
 
 def _aside(at: Position) -> Iterator[Finding]:
     """Yield a finding for each excluded sensor."""
-    for name, (excluded, deviation) in at.aside.items():
+    for name, (since, deviation) in at.excluded.items():
         text, remedy = FINDINGS["aside"].filled(
             name=name,
-            since=f"{excluded:g} {at.time_unit}".rstrip(),
+            since=f"{since:g} {at.time_unit}".rstrip(),
             off=f"{deviation:+.3g} {at.unit.replace('degC', 'K')}".rstrip(),
         )
         setting = channel_setting(name, "role", '"ignored"')
@@ -457,7 +457,7 @@ def _disturbed(at: Position) -> Iterator[Finding]:
         return
     text, remedy = FINDINGS["changed"]
     # After a pause, a few readings suffice to correct the state, so the unknowns remain usable.
-    severity: Severity = "do not trust" if at.apart or at.strain > BRIEF else "caution"
+    severity: Severity = "do not trust" if at.state_only or at.strain > BRIEF else "caution"
     yield Finding("changed", severity, text, evidence=float(at.strain), remedy=remedy)
 
 

@@ -393,7 +393,7 @@ class Dictionary:
         return bounds
 
     def effects(
-        self, noise: Array, change: Array, late: Array, moved: Array, answers: Array
+        self, noise: Array, change: Array, late: Array, moved: Array, responses: Array
     ) -> Array:
         """Return the effect of each direction on the readings, in units of their noise.
 
@@ -414,7 +414,7 @@ class Dictionary:
             signals = [by_kind[kind] for kind in self.kinds if kind in by_kind]
             scaled = np.concatenate(signals, axis=2) / noise[:, :, own]
             effects[:, :, own, self._varying] = scaled
-        effects[..., self.parts["process"]] = answers.swapaxes(-1, -2) / noise[..., None]
+        effects[..., self.parts["process"]] = responses.swapaxes(-1, -2) / noise[..., None]
         return effects
 
 

@@ -99,7 +99,7 @@ class Judge:
             "Y": rank * sensors,
             "M": rank**2,
             "moved": sensors * dictionary.axes,
-            "answers": self.terms * sensors,
+            "responses": self.terms * sensors,
             "a": unknowns if self.recorded else 0,
             "C": unknowns**2 if self.recorded else 0,
         }
@@ -129,7 +129,7 @@ class Judge:
         # Missing terms require a solve for each member.
         follows = self.terms > 0 and members <= MOST_MEMBERS
         if follows and np.count_nonzero(reached) < members:
-            ledger = self._extend_answers(ledger, sample)
+            ledger = self._extend_responses(ledger, sample)
         rows, waiting = ledger.rows.copy(), ledger.waiting
         rows[np.arange(members), waiting] = self._row(sample, M)
         # The update of this sample will multiply M by W^T, and predictions by their maps of the
@@ -152,7 +152,7 @@ class Judge:
         if self.dictionary.axes:
             row[:, at["moved"]] = self.dictionary.moved(sample.u)
         if self.terms:  # interpolated later for the whole batch
-            row[:, at["answers"]] = np.nan
+            row[:, at["responses"]] = np.nan
         if self.recorded:
             known = sample.C.shape[1] == self.unknowns
             row[:, at["a"]] = sample.a() if known else 0.0
@@ -311,9 +311,9 @@ class Judge:
         last = np.concatenate([ledger.last[:, None], h[:, :-1]], axis=1)
         late = (last - h) * (ledger.times[:, 1:] / (t - before))[:, :, None]
         moved, change = rows[:, :, at["moved"]], h - ledger.first[:, None]
-        answers = self._answers(ledger)[:, :batch]
-        answers = answers.reshape(members, batch, self.terms, self.sensors)
-        f = self.dictionary.effects(rows[:, :, at["noise"]], change, late, moved, answers)
+        responses = self._responses(ledger)[:, :batch]
+        responses = responses.reshape(members, batch, self.terms, self.sensors)
+        f = self.dictionary.effects(rows[:, :, at["noise"]], change, late, moved, responses)
         f *= used[..., None]
         f[~np.isfinite(f)] = 0.0  # without a previous sample, or in rows that are not filled
         growth = np.ones((members, batch, self.windows, len(self.dictionary)))
@@ -321,14 +321,14 @@ class Judge:
         growth[..., self._drift] = age[..., None]
         return f, growth
 
-    def _answers(self, ledger: Ledger) -> Array:
+    def _responses(self, ledger: Ledger) -> Array:
         """Return readings due to missing terms at waiting samples, (members, batch, numbers)."""
-        known = ledger.rows[:, :, self._at["answers"]]
+        known = ledger.rows[:, :, self._at["responses"]]
         elapsed = (ledger.rows[:, :, 0] - ledger.reached[:, :1])[:, :, None]
         start, slope = ledger.readings.reshape(len(known), 2, 1, -1).swapaxes(0, 1)
         return np.where(np.isnan(known), start + elapsed * slope, known)
 
-    def _extend_answers(self, ledger: Ledger, sample: ScoredSample) -> Ledger:
+    def _extend_responses(self, ledger: Ledger, sample: ScoredSample) -> Ledger:
         """Return the ledger with responses of the process that extend to the time of a sample.
 
         One step of the process spans several samples, whose responses are interpolated.
@@ -337,7 +337,7 @@ class Judge:
         if process is None:
             return ledger
         rows = ledger.rows.copy()
-        rows[:, :, self._at["answers"]] = self._answers(ledger)
+        rows[:, :, self._at["responses"]] = self._responses(ledger)
         p, readings = ledger.process.copy(), ledger.readings.copy()
         reached, q = ledger.reached.copy(), sample.q()
         for k in np.flatnonzero(~_reached(ledger, t)).tolist():

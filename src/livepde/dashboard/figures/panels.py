@@ -322,8 +322,9 @@ def open_shares(data: xr.Dataset, at: float | None) -> dict[str, float]:
             found[label] = left
     for name in field_names(data):
         if f"{name}_modes" in data:
-            some, count, left = style.modes_told(data, name, canvas.at_time(data, "snapshot", at))
-            found[f"{name} ({some:.1f} of {count} modes determined)"] = left
+            newest = canvas.at_time(data, "snapshot", at)
+            known, count, left = style.modes_determined(data, name, newest)
+            found[f"{name} ({known:.1f} of {count} modes determined)"] = left
     return found
 
 
