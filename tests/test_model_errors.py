@@ -150,7 +150,7 @@ def test_hypotheses_without_weight_are_left_out():
     assert found.weights.sum() == pytest.approx(1.0, abs=1e-12)
 
 
-# --- the responses of the process ------------------------------------------------------------------
+# --- responses of the process ---------------------------------------------------------------------
 
 
 LENGTH, STEP, COUNT = 1.0, 0.02, 120
