@@ -134,6 +134,13 @@ def by_name(z: Any, names: Sequence[str]) -> dict[str, Any]:
     return values
 
 
+def columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Return name -> its values in all rows, NaN if missing; noise has its own name."""
+    rows = [by_name(row, ()) for row in rows]
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {name: [row.get(name, np.nan) for row in rows] for name in names}
+
+
 def _series(values: Any) -> Any:
     """Convert a data array with one labelled axis to a series; return other values unchanged."""
     if getattr(values, "ndim", 0) == 1 and hasattr(values, "to_series") and len(values.coords):

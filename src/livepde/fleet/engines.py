@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Self, TypeAlias
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Self, TypeAlias
 
 import numpy as np
 
@@ -43,29 +43,42 @@ class Beliefs:
     factors: Factors | None = None
 
 
+class Beginning(NamedTuple):
+    """The problem of a member, with its own initial state, and the prepared data for it."""
+
+    problem: laws.Problem
+    work: Any
+
+
 def beginnings(
+    law: laws.AnyLaw,
     work: Any,
+    problem: laws.Problem,
     readings: Sequence[Mapping[str, laws.InitialReading]],
     errors: Sequence[Array],
     initial: Sequence[Any],
-) -> list[Any]:
-    """Return the prepared data of the law for the start of each member.
+) -> list[Beginning]:
+    """Return the beginning of each member.
 
     `readings`: readings from which each initial state was computed. `errors`: its own errors,
     (errors, n). `initial`: u0 as specified, which laws with a covariance evaluate on other meshes.
     """
-    if not isinstance(work, SensitivityWork):
-        return [work] * len(initial)
-    made: dict[int, SensitivityWork] = {}  # shared by members with one u0, since it caches matrices
-    prepared = []
+    made: dict[int, Beginning] = {}  # shared by members with one u0, since work caches matrices
+    result = []
     for initial_readings, own_errors, u0 in zip(readings, errors, initial, strict=True):
         separate = bool(initial_readings) or bool(len(own_errors))
         begin = made.get(id(u0)) if not separate else None
         if begin is None:
-            begin = work.made_of(initial_readings, own_errors, u0)
+            own = replace(
+                problem,
+                initial_readings=initial_readings,
+                initial_errors=own_errors,
+                initial=u0,
+            )
+            begin = Beginning(own, law.work_from(work, own))
             made |= {} if separate else {id(u0): begin}
-        prepared.append(begin)
-    return prepared
+        result.append(begin)
+    return result
 
 
 class FleetEngine(ABC):
@@ -74,10 +87,10 @@ class FleetEngine(ABC):
     States are values: a returned state never changes.
     """
 
-    def __init__(self, law: Any, work: Any, begins: Sequence[Any]) -> None:
+    def __init__(self, law: Any, work: Any, begins: Sequence[Beginning]) -> None:
         self.law = law
         self.work = work
-        self._begins = begins  # prepared data of the law for the start of each member
+        self._begins = begins
 
     def subset(self, which: IntArray) -> Self:
         """Return an engine for the members with these numbers."""
@@ -85,9 +98,16 @@ class FleetEngine(ABC):
         engine._begins = [self._begins[k] for k in which]
         return engine
 
-    def begun(self, k: int) -> Any:
-        """Return the prepared data of the law for the start of a member."""
+    def begun(self, k: int) -> Beginning:
+        """Return the beginning of a member."""
         return self._begins[k]
+
+    def _started(
+        self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]
+    ) -> Iterator[Any]:
+        """Yield the initial state of the law for each member."""
+        for begin, *start in zip(self._begins, q0, u0, moments, strict=True):
+            yield self.law.start(begin.work, *start)
 
     @abstractmethod
     def start(self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]) -> State:
@@ -129,7 +149,7 @@ class SeparateEngine(FleetEngine):
     """
 
     def __init__(
-        self, law: laws.AnyLaw, work: Any, begins: Sequence[Any], problem: laws.Problem
+        self, law: laws.AnyLaw, work: Any, begins: Sequence[Beginning], problem: laws.Problem
     ) -> None:
         super().__init__(law, work, begins)
         self.problem = problem
@@ -137,14 +157,13 @@ class SeparateEngine(FleetEngine):
     def start(
         self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]
     ) -> tuple[Any, ...]:
-        arguments = zip(self._begins, q0, u0, moments, strict=True)
-        return tuple(self.law.start(*values) for values in arguments)
+        return tuple(self._started(q0, u0, moments))
 
     def begin(self, state: tuple[Any, ...], span: Span) -> tuple[Any, ...]:
         members = zip(self._begins, state, strict=True)
         return tuple(
-            laws.stepped(self.law, work, self.problem, previous, span.member(k))[0]
-            for k, (work, previous) in enumerate(members)
+            laws.stepped(self.law, begin.work, self.problem, previous, span.member(k))[0]
+            for k, (begin, previous) in enumerate(members)
         )
 
     def step(
@@ -185,14 +204,13 @@ class BlockEngine(FleetEngine):
     def start(
         self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]
     ) -> SensitivityState:
-        starts = zip(self._begins, q0, u0, moments, strict=True)
-        joined: SensitivityState = join(*(self.law.start(*start) for start in starts))
+        joined: SensitivityState = join(*self._started(q0, u0, moments))
         return joined
 
     def begin(self, state: SensitivityState, span: Span) -> SensitivityState:
         members = enumerate(self._begins)
         joined: SensitivityState = join(
-            *(self.law.begin(work, take(state, k), span.member(k)) for k, work in members)
+            *(self.law.begin(own.work, take(state, k), span.member(k)) for k, own in members)
         )
         return joined
 

@@ -22,15 +22,14 @@ from livepde.fleet.estimate import FleetEstimate, FleetResult, number_of
 from livepde.fleet.taken_by_members import TakenByMembers
 from livepde.frames import layout_of
 from livepde.identifier import Identifier
-from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status
-from livepde.laws.sensitivity_state import SensitivityWork
+from livepde.laws import AnyLaw, Belief, MemberReports, Status
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
 from livepde.linalg.member_arrays import put, take
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.samples import (
-    by_name,
     check_noise,
+    columns,
     in_order_of,
     is_frame,
     is_tabular,
@@ -47,13 +46,6 @@ from livepde.verdict import Verdict
 FORMAT = 13  # version of the checkpoint format
 
 Values = ArrayLike | Mapping[str, ArrayLike]
-
-
-def columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Return name -> its values in all rows, NaN if missing; noise has its own name."""
-    rows = [by_name(row, ()) for row in rows]
-    names = dict.fromkeys(name for row in rows for name in row)
-    return {name: [row.get(name, np.nan) for row in rows] for name in names}
 
 
 class Fleet:
@@ -113,8 +105,7 @@ class Fleet:
     ) -> None:
         self.members = _member_names(members)
         self._judging = law
-        if isinstance(law, SensitivityLaw):  # statistics of a verdict cost more than the step
-            law = replace(law, verdict=False)
+        law = law.for_fleet()
         q0s, u0s = self._each("q0", q0), self._each("u0", u0)
         sources = [item or {} for item in self._each("u0_from", u0_from)]
         error_lists = [tuple(item) for item in self._each("u0_errors", u0_errors)]
@@ -169,7 +160,8 @@ class Fleet:
     def _stepper(self, sources: list[Mapping[str, Any]], u0s: list[Any]) -> FleetEngine:
         """Return an engine that steps members as blocks if the law supports it, else one by one."""
         readings = [initial_readings(self.model, self.observed, item) for item in sources]
-        begins = beginnings(self._work, readings, self._errors, u0s)
+        context = self.law, self._work, self.problem
+        begins = beginnings(*context, readings, self._errors, u0s)
         if not self.note:
             return BlockEngine(self.law, self._work, begins)
         differences = {
@@ -415,9 +407,7 @@ class Fleet:
 
     def _initial_member(self, k: int) -> Identifier:
         """Return the identifier of a member before its first sample."""
-        prepared = self._engine.begun(k)
-        problem = prepared.filter.problem if isinstance(prepared, SensitivityWork) else self.problem
-        start = self._q0[k], self._u0[k], problem, prepared
+        start = self._q0[k], self._u0[k], *self._engine.begun(k)
         return self._member._started(*start, assumed=self._assumed[k])
 
     def verdict(self, member: str | int) -> Verdict:
@@ -427,12 +417,11 @@ class Fleet:
         member again, which takes as long as a separate run.
         """
         k = number_of(self.members, member)
-        law, prepared = self._judging, self._engine.begun(k)
-        if self._state is None or not isinstance(law, SensitivityLaw) or not law.verdict:
+        if self._state is None:
             return Verdict.unjudged()
         ends = {name: values[k].copy() for name, values in self.ends.items()}
         identifier, state = self._initial_member(k), self._engine.member(self._state, k)
-        return assessed(identifier, law, prepared, state, ends, self._samples)
+        return assessed(identifier, self._judging, state, ends, self._samples)
 
     def template(self) -> Any:
         """Return a state of the first member with zero inputs, as a template of the structure."""

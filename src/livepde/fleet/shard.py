@@ -15,13 +15,13 @@ from livepde.errors import DataError, OffsetError, RunError, SampleError, option
 from livepde.fem import FunctionSpace
 from livepde.fleet.engines import State
 from livepde.fleet.estimate import FleetEstimate
-from livepde.fleet.fleet import Fleet, columns
+from livepde.fleet.fleet import Fleet
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw
 from livepde.linalg import Array, IntArray
 from livepde.model import Model
 from livepde.observation import Observation, Observed
-from livepde.samples import number, readings
+from livepde.samples import columns, number, readings
 
 if TYPE_CHECKING:
     import pyarrow as pa

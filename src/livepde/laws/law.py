@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 import numpy as np
 
 from livepde.errors import LawError, LinearAlgebraError
-from livepde.fem import Moment
+from livepde.fem import Inputs, Moment
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.model import Model
@@ -478,6 +478,38 @@ class Law(ABC, Generic[Work, State]):
         A law that steps members as arrays implements `step_members` and `member_belief`.
         """
         return f"{type(self).__name__} steps one at a time"
+
+    def for_fleet(self) -> Law[Work, State]:
+        """Return the law that steps the members of a fleet; default: this law.
+
+        A law whose verdict costs more than its step leaves it out, and implements `reassessed`.
+        """
+        return self
+
+    def work_from(self, work: Work, problem: Problem) -> Work:
+        """Return the prepared data for another initial state; default: `work` itself.
+
+        `problem` differs from that of `work` only in `Problem.initial` and the errors of the
+        initial state.
+        """
+        return work
+
+    def reassessed(
+        self, problem: Problem, state: State, t0: float, start: Callable[[Work, Inputs], State]
+    ) -> tuple[Work, State] | Verdict:
+        """Process the stored samples of a member of a fleet again, for its verdict.
+
+        Return work and state after them, or a verdict that states why they cannot be assessed. The
+        default is the verdict of a law without tests.
+
+        Parameters
+        ----------
+        state
+            State of the law that `for_fleet` returned.
+        t0, start
+            Initial time, and a function that returns the state there.
+        """
+        return self.unjudged()
 
     def finite(self, work: Work, state: State) -> bool:
         """Return True if the belief and its squares are finite.

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from livepde.errors import LawError
-from livepde.fem import Moment
+from livepde.fem import Inputs, Moment
 from livepde.laws.assimilation import (
     Assimilation,
     MemberReports,
@@ -22,10 +22,28 @@ from livepde.laws.columns import Columns
 from livepde.laws.filter import Filter, reported_factors
 from livepde.laws.filter_state import NO_LEDGER, FilterState, InputHistory, ShadowState
 from livepde.laws.gate import Gate, Screened
-from livepde.laws.history import added, empty_log, opened, skipped
+from livepde.laws.history import (
+    LogRows,
+    added,
+    empty_log,
+    first_interval,
+    intervals_since,
+    opened,
+    skipped,
+)
 from livepde.laws.innovations import Innovations
 from livepde.laws.iterated_smoother import AGREED, Window, distance, next_reference, placed
-from livepde.laws.law import Belief, Deferred, Fit, FixedInterval, Law, Problem, Report, finite
+from livepde.laws.law import (
+    Belief,
+    Deferred,
+    Fit,
+    FixedInterval,
+    Law,
+    Problem,
+    Report,
+    finite,
+    stepped,
+)
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.noise_rows import PAUSE_ROWS, input_rank, with_initial_rows
 from livepde.laws.one_member import step_alone, watched
@@ -73,6 +91,7 @@ from livepde.verdict import Verdict
 
 GATE = 6.0  # expected standard deviations: a Gaussian value lies beyond with probability 2e-9
 FIRST = 20  # largest number of Gauss-Newton steps for a sample at the initial time
+NOT_STORED = "innovations: the first samples are no longer stored (`law.refit.window`)"
 GUESS = 2.0  # weight of the initial guess of the noise level, in samples
 
 
@@ -461,6 +480,34 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 one = changed(one, log=skipped(one.log))
             each[k] = one
         return put_each(new, each), reports.with_members(alone)
+
+    def for_fleet(self) -> SensitivityLaw:
+        return replace(self, verdict=False)
+
+    def work_from(self, work: SensitivityWork, problem: Problem) -> SensitivityWork:
+        return replace(work, filter=replace(work.filter, problem=problem))
+
+    def reassessed(
+        self,
+        problem: Problem,
+        state: SensitivityState,
+        t0: float,
+        start: Callable[[SensitivityWork, Inputs], SensitivityState],
+    ) -> tuple[SensitivityWork, SensitivityState] | Verdict:
+        if not self.verdict:
+            return Verdict.unjudged()
+        channels, rows = problem.channels, LogRows.of(state.log, problem.observed.size)
+        if state.window[0] or not len(rows.times) or rows.times[0] != t0:
+            return Verdict.of((), (NOT_STORED,), judged=False)
+        work = self.prepare(problem)
+        again = start(work, Inputs(dict(zip(channels, rows.inputs[0].tolist(), strict=True))))
+        if np.isfinite(rows.readings[0]).any():
+            first = first_interval(state.log, channels)
+            again, _ = stepped(self, work, problem, again, first)
+        for interval in intervals_since(state.log, channels):
+            again, _ = stepped(self, work, problem, again, interval)
+        # The log lacks readings of excluded sensors: the memory of the gate is that of the member.
+        return work, changed(again, now=changed(again.now, screened=state.now.screened))
 
     def live(self) -> SensitivityLaw:
         if self.refit is None or self.refit.apart is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import itemgetter
@@ -15,7 +15,7 @@ from livepde.laws.filter import Filter, robust_factors
 from livepde.laws.filter_state import NO_LEDGER, FilterState, unaccompanied
 from livepde.laws.history import added, trimmed, withdrawn
 from livepde.laws.later import Later
-from livepde.laws.law import Fit, InitialReading
+from livepde.laws.law import Fit
 from livepde.laws.noise_rows import rows_of_sensors
 from livepde.laws.policies import Guards, Jumps, Refit, Watch
 from livepde.laws.step_diagnostics import Diagnostics
@@ -43,15 +43,6 @@ class SensitivityWork:
     jumps: Jumps | None
     fades: bool
     relinearises: bool
-
-    def made_of(
-        self, readings: Mapping[str, InitialReading], errors: Array, initial: Any
-    ) -> SensitivityWork:
-        """Return the work for a member with its own initial state, readings and their errors."""
-        problem = replace(
-            self.filter.problem, initial_readings=readings, initial_errors=errors, initial=initial
-        )
-        return replace(self, filter=replace(self.filter, problem=problem))
 
     @cached_property
     def unjudged(self) -> SensitivityWork:
