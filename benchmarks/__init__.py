@@ -1,6 +1,6 @@
-"""The project's benchmarks: ratios measured in one run, never absolute times.
+"""The project's benchmarks, which measure ratios within one run and no absolute times.
 
-`python -m benchmarks NAME`, in the folder of the project, runs one; nothing here is installed.
+Run one in the project's folder with `python -m benchmarks NAME`. They are not installed.
 """
 
 from __future__ import annotations
@@ -10,4 +10,4 @@ from pathlib import Path
 __all__ = ["ROOT"]
 
 ROOT = Path(__file__).resolve().parents[1]
-"""The project's folder, from which processes are started that import the benchmarks."""
+"""The project's folder, in which processes that import the benchmarks are started."""

@@ -1,4 +1,4 @@
-"""Benchmarks: each a command with its own options."""
+"""Command line of the benchmarks."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ __all__ = ["app"]
 
 program = Program(
     "python -m benchmarks",
-    """Measure what things cost, as ratios that hold on any machine, and what they find.
+    """Measure the cost of livepde, as ratios that hold on any machine, and the quality of results.
 
-    With --quick each runs its checks on fewer seeds and smaller sizes, in less than two minutes on
-    two cores. An option that is given wins over the value of --quick.
+    With --quick, each benchmark runs its checks with fewer seeds and smaller sizes, in less than
+    two minutes on two cores. Explicit options override the values of --quick.
 
     Example:  python -m benchmarks step""",
 )
@@ -32,13 +32,13 @@ app = program.app
 Problems = Annotated[list[str] | None, several("Only this problem.", "--only")]
 Levels = Annotated[
     list[float] | None,
-    several("Noise over the data's root mean square.", "--level", min=0.0, max=1.0),
+    several("Noise relative to the data's root mean square.", "--level", min=0.0, max=1.0),
 ]
 
 
 @program.command(
-    quick="Two sizes; of the rods those with 31 nodes, so that bounds of longer rods and of the "
-    "square with numbers are not checked."
+    quick="Two sizes, and only rods with 31 nodes: the bounds of longer rods and of the square "
+    "with constant unknowns are not checked."
 )
 def step(
     size: Annotated[
@@ -50,12 +50,12 @@ def step(
     modes: Annotated[
         list[int] | None,
         several(
-            "Unknowns of the sensitivity law, default 1, 10 and 50, with --quick 1 and 10.", min=1
+            "Modes of the sensitivity law, default 1, 10 and 50, with --quick 1 and 10.", min=1
         ),
     ] = None,
     quick: bool = False,
 ) -> Outcome:
-    """Time a step of each law against one forward step of the same model.
+    """Time a step of each law relative to one forward step of the same model.
 
     Example:  python -m benchmarks step --size 1000 --json
     """
@@ -72,13 +72,13 @@ def step(
     return _both(_both(laws, filters), usual)
 
 
-@program.command(quick="One round of the rod and of the column.")
+@program.command(quick="One round, with the rod and the column only.")
 def jobs(
     only: Annotated[list[str] | None, several("Only this job.", "--only")] = None,
     rounds: Annotated[int, Count(3, 1, "Runs of each job and of its fit.")] = 3,
     quick: bool = False,
 ) -> Outcome:
-    """Time whole runs against fits that a user would write, at equal error.
+    """Time whole runs relative to fits that a user would write, at equal error.
 
     Example:  python -m benchmarks jobs --only rod --json
     """
@@ -88,8 +88,8 @@ def jobs(
 
 
 @program.command(name="import", quick="Fewer processes.")
-def startup(rounds: Annotated[int, Count(15, 3, "Fresh processes of each.")]) -> Outcome:
-    """Time the import of livepde, in fresh processes, against that of SciPy and scikit-fem.
+def startup(rounds: Annotated[int, Count(15, 3, "New processes for each import.")]) -> Outcome:
+    """Time the import of livepde relative to the import of SciPy and scikit-fem.
 
     Example:  python -m benchmarks import --json
     """
@@ -98,11 +98,11 @@ def startup(rounds: Annotated[int, Count(15, 3, "Fresh processes of each.")]) ->
     return benchmark(rounds)
 
 
-@program.command(quick="One process and one pair of runs, whose slow moments count.")
+@program.command(quick="One process and one pair of runs: other load on the machine counts.")
 def overhead(
-    rounds: Annotated[int, Count(5, 1, "Fresh processes, and pairs of runs.")],
+    rounds: Annotated[int, Count(5, 1, "New processes, and pairs of runs.")],
 ) -> Outcome:
-    """Time what the command line adds: to the first estimate, and to each sample of a rod.
+    """Time the overhead of the command line: until the first estimate, and per sample of a rod.
 
     Example:  python -m benchmarks overhead --json
     """
@@ -112,16 +112,16 @@ def overhead(
 
 
 @program.command(
-    quick="Fewer rods: the less of them, the less a fleet saves, and the more the start of a "
-    "command weighs, so that bounds on times may be missed that 1000 rods keep."
+    quick="Fewer rods: a small fleet saves less, and the start of the command has a larger share. "
+    "Bounds on times that hold for 1000 rods may fail."
 )
 def fleet(
-    members: Annotated[int, Count(1000, 200, "How many rods step.")],
+    members: Annotated[int, Count(1000, 200, "Rods in the fleet whose steps are timed.")],
     runs: Annotated[
-        int, Count(25, 8, "Rods of which run directories are made; 0 for none.", least=0)
+        int, Count(25, 8, "Rods for which run directories are written; 0 for none.", least=0)
     ],
 ) -> Outcome:
-    """Time a fleet of rods against as many separate identifiers: a step, and the command.
+    """Time steps and command of a fleet of rods relative to separate identifiers.
 
     Example:  python -m benchmarks fleet --json
     """
@@ -132,13 +132,13 @@ def fleet(
 
 
 @program.command(
-    quick="Fewer rods, of which the memory of 10 000 is extrapolated; few kills.",
+    quick="Fewer rods, from which the memory of 10 000 is extrapolated, and few kills.",
 )
 def shard(
-    members: Annotated[int, Count(10_000, 2000, "How many rods are live.")],
-    kills: Annotated[int, Count(20, 4, "How often a worker is killed.")],
+    members: Annotated[int, Count(10_000, 2000, "Number of live rods.")],
+    kills: Annotated[int, Count(20, 4, "Number of times a worker is killed.")],
 ) -> Outcome:
-    """Measure live shards of rods: memory, time of a sample, and kills of their workers.
+    """Measure live shards of rods: memory, time per sample, and recovery of killed workers.
 
     Example:  python -m benchmarks shard --json
     """
@@ -148,8 +148,8 @@ def shard(
 
 
 @program.command(
-    quick="One seed, the rod alone, and of the moving horizon the first setting on the reduced "
-    "model, in 0.6 of the time: a horizon that is not tuned, and the worst of one seed, say less."
+    quick="Only the rod, one seed, 0.6 of the time, and the first setting of the moving horizon on "
+    "the reduced model: the horizon is not tuned, and the worst case is of a single seed."
 )
 def control(
     *,
@@ -158,7 +158,7 @@ def control(
     draw: Annotated[Path | None, typer.Option(help="Folder for a figure of each problem.")] = None,
     quick: bool = False,
 ) -> Outcome:
-    """Hold control with livepde against true and wrong models and a moving horizon.
+    """Compare control by livepde with control by true and wrong models and a moving horizon.
 
     Example:  python -m benchmarks control --only rod --seeds 2
     """
@@ -175,8 +175,8 @@ def control(
 
 
 @program.command(
-    quick="Small squares, where a step of the law costs more forward steps than on large ones: "
-    "the exponent is theirs."
+    quick="Small squares, where a step of the law costs more forward steps than on large ones. "
+    "The exponent is for the small squares."
 )
 def scale(
     size: Annotated[
@@ -190,11 +190,11 @@ def scale(
         list[float] | None, several("Gain of the law, default 1, 100 and 10000.")
     ] = None,
     million: Annotated[
-        bool, typer.Option(help="Only the run with a million nodes: 100 steps, minutes, 3 GB.")
+        bool, typer.Option(help="Only run a million nodes: 100 steps, several minutes, 3 GB.")
     ] = False,
     quick: bool = False,
 ) -> Outcome:
-    """Time a step of the gradient law for large fields against one forward step.
+    """Time a step of the gradient law for large fields relative to one forward step.
 
     Example:  python -m benchmarks scale --size 100000 --gain 100
     """
@@ -206,19 +206,17 @@ def scale(
     return benchmark.scale(sizes, gain or benchmark.GAINS, cube or ())
 
 
-@program.command(
-    quick="The smallest square, one data set, the smallest cost, one reaction on partial data."
-)
+@program.command(quick="One data set, the smallest meshes, and one reaction on partial data.")
 def auto(
     *,
     size: Annotated[
         list[int] | None,
         several("Nodes of the square, default 64 to 10000, with --quick 64.", min=25),
     ] = None,
-    seeds: Annotated[int, Count(5, 1, "Data sets for each noise.")],
+    seeds: Annotated[int, Count(5, 1, "Data sets for each noise level.")],
     quick: bool = False,
 ) -> Outcome:
-    """Check what the gradient law that tunes itself promises: its errors and its cost.
+    """Check errors and cost of the gradient law with automatic gain.
 
     Example:  python -m benchmarks auto --quick
     """
@@ -232,14 +230,14 @@ def auto(
     return benchmark(sizes, seeds, costs, reactions, LEVELS[-1:] if quick else LEVELS)
 
 
-@program.command(quick="Few nodes: q is compared, and costs are too small for their bounds.")
+@program.command(quick="Few nodes: q is compared, but the bounds on costs do not apply.")
 def petsc(
     *,
     size: Annotated[int, Count(100_000, 3000, "Number of nodes.", least=2500)],
     ranks: Annotated[list[int] | None, several("Number of ranks, default 1 and 2.", min=1)] = None,
-    samples: Annotated[int, Count(6, 2, "Samples that are timed.")],
+    samples: Annotated[int, Count(6, 2, "Timed samples.")],
 ) -> Outcome:
-    """Time both laws on PETSc vectors against a forward step, and their scaling on several ranks.
+    """Time both laws on PETSc vectors relative to a forward step, on one and several ranks.
 
     Example:  python -m benchmarks petsc --size 100000
     """
@@ -249,23 +247,23 @@ def petsc(
 
 
 @program.command(
-    quick="A case of each kind of process, without its variants; with --folder all of its cases."
+    quick="One case for each kind of process, without variants. With --folder: all cases in it."
 )
 def cases(
     only: Annotated[list[str] | None, several("Only this case.")] = None,
     folder: Annotated[
-        Path | None, typer.Option(help="Where the cases are. Default: the next folder 'cases'.")
+        Path | None, typer.Option(help="Folder of the cases. Default: the nearest folder 'cases'.")
     ] = None,
     gallery: Annotated[
-        Path | None, typer.Option(help="Folder for a page with tables and figures.")
+        Path | None, typer.Option(help="Write a page with tables and figures into this folder.")
     ] = None,
     compared: Annotated[
         int,
-        typer.Option(help="Variants of livepde compare for each case on measurements.", min=0),
+        typer.Option(help="Variants that livepde compare tries on cases with measurements.", min=0),
     ] = 0,
     quick: bool = False,
 ) -> Outcome:
-    """Run every case of the project with its variants, and the code that they name.
+    """Run every case of the project with its variants. Code that the cases name is executed.
 
     Example:  python -m benchmarks cases --only soil_layers --json
     """
@@ -288,11 +286,11 @@ def cases(
 
 
 @program.command(
-    quick="Fewer twins: bounds are those of the share of 200, and that of 20 misses some of them "
-    "by chance."
+    quick="Fewer twins: the bounds are for shares of 200 twins, and shares of 20 miss some of "
+    "them by chance."
 )
-def coverage(twins: Annotated[int, Count(200, 20, "How many twins of each problem.")]) -> Outcome:
-    """Count how often the truth lies in the intervals that are reported.
+def coverage(twins: Annotated[int, Count(200, 20, "Twins of each problem.")]) -> Outcome:
+    """Count how often the truth lies in the reported intervals.
 
     Example:  python -m benchmarks coverage --twins 20
     """
@@ -302,8 +300,8 @@ def coverage(twins: Annotated[int, Count(200, 20, "How many twins of each proble
 
 
 @program.command(
-    quick="Few twins of the problems that cost least: bounds of coverage are those that chance "
-    "keeps, so that they see gross errors alone."
+    quick="Few twins of the cheapest problems. The bounds on coverage allow for chance, so that "
+    "only gross errors break them."
 )
 def honest(
     *,
@@ -313,7 +311,7 @@ def honest(
     workers: Workers = None,
     quick: bool = False,
 ) -> Outcome:
-    """Count how often intervals hold when the truth comes from another code on another mesh.
+    """Count how often intervals contain truths from another code on another mesh.
 
     Example:  python -m benchmarks honest --only rod --kind white --seeds 10
     """
@@ -325,14 +323,14 @@ def honest(
     return benchmark(names, kinds, seeds=seeds, workers=workers, progress=True)
 
 
-@program.command(quick="Few priors: one that misses the best cost breaks the bound on their share.")
+@program.command(quick="Few priors: a single one that misses the best cost breaks the bound.")
 def refit(
     *,
     only: Annotated[list[str] | None, several("Only this problem, or jumps.")] = None,
-    seeds: Annotated[int, Count(24, 4, "Priors of each problem, and twice the truths with jumps.")],
+    seeds: Annotated[int, Count(24, 4, "Priors of each problem; half as many truths with jumps.")],
     workers: Workers = None,
 ) -> Outcome:
-    """Fit stored samples from far priors, and compare with the best known fit.
+    """Fit stored samples from distant priors, and compare with the best known fit.
 
     Example:  python -m benchmarks refit --only column --seeds 8
     """
@@ -342,13 +340,13 @@ def refit(
     return benchmark(chosen(only, PARTS, "problem"), seeds=seeds, workers=workers, progress=True)
 
 
-@program.command(quick="The same: all parts together take less than five minutes.")
+@program.command(quick="No difference: all parts together take less than five minutes.")
 def silent(
     *,
     only: Annotated[list[str] | None, several("Only this part.")] = None,
     workers: Workers = None,
 ) -> Outcome:
-    """Check results that were once wrong without a word against separate computations.
+    """Check results that were once silently wrong against independent computations.
 
     Example:  python -m benchmarks silent --only smoother
     """
@@ -364,13 +362,13 @@ def first_hour(
     seeds: Annotated[int, Count(20, 2, "Truths of each walk.")],
     only: Annotated[list[str] | None, several("Only this walk.")] = None,
     wrong: Annotated[
-        bool, typer.Option("--wrong", help="One channel of each table is wrong.")
+        bool, typer.Option("--wrong", help="Corrupt one channel of each table.")
     ] = False,
 ) -> Outcome:
-    """Count how often the walks of docs/first-hour.md find truths of another code.
+    """Count how often the walks of docs/first-hour.md recover truths from another code.
 
-    With --wrong one channel is late, scaled, exchanged or in degrees Fahrenheit: whether the runs
-    are not trusted, and name it first.
+    With --wrong, one channel is late, scaled, exchanged or in degrees Fahrenheit. The runs must
+    not be trusted, and should name this channel first.
 
     Example:  python -m benchmarks first-hour --only pumping --seeds 4
     """
@@ -393,7 +391,7 @@ def compared(
     quick: bool = False,
     workers: Workers = None,
 ) -> Outcome:
-    """Count how often `livepde compare` turns a wrong case into a right one without a hint.
+    """Count how often `livepde compare` corrects a wrong case without a hint.
 
     Example:  python -m benchmarks compared --seeds 1
     """
@@ -405,13 +403,13 @@ def compared(
 
 
 @program.command(
-    quick="Of each process one jump up, one down and one calm run, and one data set for each "
-    "wrong model: two false alarms are more than the bound, with all runs five are."
+    quick="One jump up, one down and one calm run of each process, and one data set for each "
+    "wrong model. Two false alarms break the bound; with all runs, five do."
 )
 def alarms(
-    seeds: Annotated[int, Count(5, 1, "Jumps up, and as many down, of each.")], quick: bool = False
+    seeds: Annotated[int, Count(5, 1, "Jumps up and jumps down, each.")], quick: bool = False
 ) -> Outcome:
-    """Measure how soon jumps are flagged, how seldom without cause, and which models are doubted.
+    """Measure detection delays of jumps, false alarms, and detection of wrong models.
 
     Example:  python -m benchmarks alarms --seeds 3
     """
@@ -421,8 +419,8 @@ def alarms(
 
 
 @program.command(
-    quick="One data set, 1 % noise, the problems seed, seed-excited and heat2d: an error of one "
-    "draw, not a median."
+    quick="One data set with 1 % noise of the problems seed, seed-excited and heat2d: the error of "
+    "a single draw, not a median."
 )
 def accuracy(
     *,
@@ -431,20 +429,20 @@ def accuracy(
     seeds: Annotated[int, Count(3, 1, "Data sets for each noise level.")],
     quick: bool = False,
 ) -> Outcome:
-    """Hold our laws against what all data together can tell, at several noise levels.
+    """Compare errors of our laws with an offline fit of all data, at several noise levels.
 
     Example:  python -m benchmarks accuracy --only wall --seeds 5
     """
     from benchmarks.accuracy import accuracy as benchmark
     from benchmarks.problems import PROBLEMS
 
-    some = ["seed", "seed-excited", "heat2d"] if quick else []
+    default = ["seed", "seed-excited", "heat2d"] if quick else []
     levels = level or ([0.01] if quick else None)
-    names = chosen(only, PROBLEMS, "problem", some)
+    names = chosen(only, PROBLEMS, "problem", default)
     return benchmark(names, seeds, levels=levels, progress=True)
 
 
-@program.command(quick="One data set of the rod: an error of one draw, not a mean.")
+@program.command(quick="One data set of the rod: the error of a single draw, not a mean.")
 def peers(
     *,
     only: Problems = None,
@@ -453,7 +451,7 @@ def peers(
     row: Annotated[list[str] | None, several("Only this estimator.")] = None,
     quick: bool = False,
 ) -> Outcome:
-    """Hold our laws against filters as arrays, and other packages where they are installed.
+    """Compare our laws with ensemble and other filters, and with other packages if installed.
 
     Example:  python -m benchmarks peers --only rod --seeds 16
     """
@@ -465,13 +463,13 @@ def peers(
     return benchmark(names, seeds, levels=level or [0.01], rows=rows, progress=True)
 
 
-@program.command(quick="Few kills of short runs: not every moment of a run is among them.")
+@program.command(quick="Few kills of short runs, which do not cover every phase of a run.")
 def faults(
-    kills: Annotated[int, Count(600, 6, "Kills in all, over a file, standard input and a broker.")],
-    samples: Annotated[int, Count(2000, 400, "Samples of a run that is killed.", least=50)],
+    kills: Annotated[int, Count(600, 6, "Kills in total, with file, standard input and broker.")],
+    samples: Annotated[int, Count(2000, 400, "Samples of each killed run.", least=50)],
     malformed: Annotated[int, Count(100_000, 2000, "Broken rows and messages.")],
     flips: Annotated[int, Count(200, 20, "Damaged journals.")],
-    seed: Annotated[int, typer.Option(help="Of what is drawn at random.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 0,
     only: Annotated[
         list[str] | None,
         several(
@@ -479,9 +477,9 @@ def faults(
             "journals, files, clocks, visitors, cases."
         ),
     ] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Runs that are killed at a time.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Runs killed in parallel.")] = 1,
 ) -> Outcome:
-    """Kill runs, take their sources away, feed them broken rows, damage their journals and clocks.
+    """Kill runs, stop their sources, feed them broken rows, damage their journals and clocks.
 
     Example:  python -m benchmarks faults --kills 20 --only file
     """
@@ -492,9 +490,9 @@ def faults(
     return benchmark(kills, samples, malformed, flips, seed, parts, workers, progress=True)
 
 
-@program.command(quick="One run in the place of five: no median.")
+@program.command(quick="One run instead of five, so that there is no median.")
 def journal(quick: bool = False) -> Outcome:
-    """Measure what the journal costs: its share of a step of the soil case.
+    """Measure the cost of the journal relative to a step of the soil case.
 
     Example:  python -m benchmarks journal --json
     """
@@ -503,17 +501,17 @@ def journal(quick: bool = False) -> Outcome:
     return benchmark(repetitions=1 if quick else None)
 
 
-@program.command(quick="Five problems, few runs: one false alarm is too many.")
+@program.command(quick="Five problems and few runs: a single false alarm breaks the bound.")
 def census(
     *,
     only: Problems = None,
     fault: Annotated[list[str] | None, several("Only this fault.")] = None,
     seeds: Annotated[int, Count(4, 1, "Runs of each fault and problem.")],
-    sound: Annotated[int, Count(40, 6, "Runs of each problem with nothing wrong.")],
+    sound: Annotated[int, Count(40, 6, "Runs of each problem without a fault.")],
     workers: Workers = None,
     quick: bool = False,
 ) -> Outcome:
-    """Count how often runs that are wrong say so, name the cause, and sound ones keep quiet.
+    """Count how often faulty runs report a fault and its cause, and correct runs report none.
 
     Example:  python -m benchmarks census --only rod --seeds 2 --sound 3
     """
@@ -526,16 +524,16 @@ def census(
 
 
 @program.command(
-    quick="One month, of which a tenth as many samples are retained: a leak or a slowdown that "
-    "shows in many months only is not seen."
+    quick="One month, with a tenth as many samples retained: slow leaks and slowdowns are not "
+    "detected."
 )
 def soak(
-    months: Annotated[int, Count(24, 1, "How many months, with a row each minute.")],
+    months: Annotated[int, Count(24, 1, "Number of months, with a row each minute.")],
     quick: bool = False,
 ) -> Outcome:
-    """Run for months with a fault of each kind a week: memory and time of a step must not grow.
+    """Run for months with weekly faults of each kind: memory and step time must not grow.
 
-    The run ends with a whole week, after the last of its faults.
+    The run is a number of whole weeks, so that its last fault ends before it does.
 
     Example:  python -m benchmarks soak --months 2 --json
     """
@@ -546,28 +544,28 @@ def soak(
     return benchmark(weeks * WEEK, share=0.1 if quick else 1.0, progress=True)
 
 
-@program.command(quick="The first samples only.")
+@program.command(quick="Only the first samples.")
 def fmu(
     case: Annotated[
         Path | None,
-        typer.Argument(help="The case file (TOML). Default: what livepde init writes."),
+        typer.Argument(help="The case file (TOML). Default: the case that livepde init writes."),
     ] = None,
     unit: Annotated[
         Path | None,
-        typer.Option(help="The unit of the case. Default: one that is written for the purpose."),
+        typer.Option(help="The unit of the case. Default: a new unit is written."),
     ] = None,
     fmi: Annotated[Standard, typer.Option(help="Version of the standard: FMI 2.0 or 3.0.")] = (
         Standard.two
     ),
     samples: Annotated[
         int | None,
-        typer.Option(min=1, help="How many of the case. Default all, with --quick 60."),
+        typer.Option(min=1, help="Number of samples. Default all, with --quick 60."),
     ] = None,
     quick: bool = False,
     allow_code: CodeOption = False,
     settings: SetOption = None,
 ) -> Outcome:
-    """Run a case as a co-simulation unit (FMU, by FMPy) and in Python, and compare all outputs.
+    """Run a case as a co-simulation unit (FMU, with FMPy) and in Python, and compare the outputs.
 
     Example:  python -m benchmarks fmu mycase/case.toml --unit rod.fmu
     """
@@ -580,7 +578,7 @@ def fmu(
 
 
 def _both(one: Outcome, other: Outcome) -> Outcome:
-    """Return tables, checks and notes of two benchmarks as one."""
+    """Return the combined tables, checks and notes of two outcomes."""
     return replace(
         one,
         tables=[*one.tables, *other.tables],

@@ -1,4 +1,4 @@
-"""Programs of measurements: each command is a function that returns an outcome."""
+"""Command-line programs for measurements: each command is a function that returns an outcome."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Measurement: TypeAlias = Callable[..., Outcome]
 
 Out = Annotated[
     Path | None,
-    typer.Option(help="Keep dataset and figures in a new run directory.", show_default=False),
+    typer.Option(help="Write dataset and figures to a new run directory.", show_default=False),
 ]
 Workers = Annotated[
     int | None, typer.Option(min=1, help="Processes, default one for each processor.")
@@ -29,12 +29,12 @@ Workers = Annotated[
 
 @dataclass(frozen=True)
 class Count:
-    """Declaration of a whole number, as `Annotated[int, Count(...)]`.
+    """Option with a whole number, declared as `Annotated[int, Count(...)]`.
 
     Attributes
     ----------
     usual, quick
-        Values if the option is not given: without and with --quick.
+        Default values without and with --quick.
     help
         Meaning of the number.
     least
@@ -48,24 +48,24 @@ class Count:
 
     @property
     def option(self) -> Any:
-        """The option of the command line."""
+        """Typer option with this help and bound."""
         return typer.Option(min=self.least, help=f"{self.help} With --quick {self.quick}.")
 
 
 def several(what: str, *flags: str, **bounds: Any) -> Any:
-    """Return an option that may be repeated, for `Annotated[list[T] | None, ...]`."""
+    """Return a repeatable option, for `Annotated[list[T] | None, ...]`."""
     return typer.Option(*flags, help=f"{what} Repeat for more.", **bounds)
 
 
 def chosen(
     names: Sequence[str] | None, known: Collection[str], what: str, default: Collection[str] = ()
 ) -> list[str]:
-    """Return the names that are given, or the default if there are none.
+    """Return the given names, or the default if there are none.
 
     Raises
     ------
     ConfigurationError
-        A name is not known.
+        A name is unknown.
     """
     for name in names or ():
         named(name, dict.fromkeys(known), what)
@@ -73,12 +73,12 @@ def chosen(
 
 
 class Program:
-    """Command line of several measurements.
+    """Command-line program with one command for each measurement.
 
     Parameters
     ----------
     words
-        Command that starts it, such as "python -m benchmarks".
+        Command that starts the program, such as "python -m benchmarks".
     help
         Description, with an example in its last line.
     keeps
@@ -97,20 +97,20 @@ class Program:
             rich_markup_mode="rich",
             context_settings={"help_option_names": ["-h", "--help"]},
         )
-        self.app.callback()(lambda: None)  # so that a program of one command has its name, too
+        self.app.callback()(lambda: None)  # a program with one command requires its name, too
 
     def command(self, quick: str, name: str | None = None) -> Callable[[Measurement], Measurement]:
         """Return a decorator that adds a function as a command with --quick and --json.
 
-        Each parameter of the function is an option. A parameter `quick` or `as_json` is passed the
-        value of that option. The docstring is the help.
+        Each parameter of the function becomes an option. Parameters named `quick` and `as_json`
+        receive the values of these options. The docstring is the help.
 
         Parameters
         ----------
         quick
-            Help of --quick: what is left out.
+            Help of --quick: what it leaves out.
         name
-            Name of the command; default that of the function.
+            Name of the command; default the name of the function.
         """
 
         def add(function: Measurement) -> Measurement:
@@ -143,13 +143,13 @@ class Program:
         return add
 
     def _words(self, context: typer.Context, hidden: Collection[str]) -> list[str]:
-        """Return the command in words: with all numbers, those of --quick aside."""
+        """Return the words of the command, with all option values except those set by --quick."""
         words = [*self.words.split(), context.command.name or ""]
         for option in context.command.params:
             name, flag = option.name or "", max(option.opts, key=len)
             value = context.params.get(name)
-            told = _is_given(context, name) or not context.params["quick"]
-            if name in hidden or value is None or not told:
+            shown = _is_given(context, name) or not context.params["quick"]
+            if name in hidden or value is None or not shown:
                 continue
             if isinstance(value, bool):
                 words += [flag] if value else []
@@ -160,13 +160,13 @@ class Program:
 
 
 def _count(parameter: inspect.Parameter) -> Count | None:
-    """Return the declaration of a parameter that is a `Count`."""
-    found = getattr(parameter.annotation, "__metadata__", ())
-    return next((item for item in found if isinstance(item, Count)), None)
+    """Return the `Count` in the annotation of a parameter, or None."""
+    metadata = getattr(parameter.annotation, "__metadata__", ())
+    return next((item for item in metadata if isinstance(item, Count)), None)
 
 
 def _takes_path(parameter: inspect.Parameter) -> bool:
-    """Return whether a parameter is `Annotated[Path, ...]`, or that or None."""
+    """Return whether a parameter is `Annotated[Path, ...]` or `Annotated[Path | None, ...]`."""
     kind, *_ = get_args(parameter.annotation) or (parameter.annotation,)
     return Path in (kind, *get_args(kind))
 
@@ -177,21 +177,21 @@ def _declare(
     shared: Mapping[str, tuple[Any, Any]],
     counts: Mapping[str, Count],
 ) -> None:
-    """Give a command the signature from which Typer reads its options."""
+    """Set the signature of a command, from which Typer reads its options."""
     keyword = inspect.Parameter.KEYWORD_ONLY
-    found = [inspect.Parameter("context", keyword, annotation=typer.Context)]
+    declared = [inspect.Parameter("context", keyword, annotation=typer.Context)]
     for name, item in parameters.items():
         if name in shared:
             continue
         if (count := counts.get(name)) is not None:
             option = Annotated[int, count.option]
             item = item.replace(annotation=option, default=count.usual)
-        found.append(item.replace(kind=keyword))
-    found += [
+        declared.append(item.replace(kind=keyword))
+    declared += [
         inspect.Parameter(name, keyword, annotation=option, default=default)
         for name, (option, default) in shared.items()
     ]
-    run.__signature__ = inspect.Signature(found)  # type: ignore[attr-defined]
+    run.__signature__ = inspect.Signature(declared)  # type: ignore[attr-defined]
     run.__annotations__ = {}
 
 
