@@ -1,7 +1,7 @@
-"""How close the laws come to what the data can tell: errors, intervals, and what a step costs.
+"""Accuracy of the laws relative to an offline fit, coverage of their intervals, and their costs.
 
-Every contender is given the same model, samples and noise level. Below stands the prior, which has
-seen nothing; above, the fit of all data with hindsight (`bench.offline`).
+Every contender receives the same model, samples and noise level. The prior, which uses no data, is
+the lower limit of accuracy, and the offline fit of all data the upper (`benchmarks.offline`).
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from livepde.stepping import StepFailed
 
 LawBuilder: TypeAlias = Callable[[Data], tuple[Observation, AnyLaw] | None]
 
-PROMISED = "sensitivity"  # the row of which the promises below are checked
+PROMISED = "sensitivity"  # row whose promises below are checked
 ALL_DATA = "offline fit of all data"
 EACH_SAMPLE = "offline fit, again at each sample"
-LARGEST_ERROR = 1.3  # of the promised row over that of the offline fit
+LARGEST_ERROR = 1.3  # largest ratio of the errors of the promised row and the offline fit
 LARGEST_TIME = 1 / 20
-SAMPLES = 1000  # for which that time is promised
+SAMPLES = 1000  # run length for which that time is promised
 
 
 # --- our laws ------------------------------------------------------------------------------------
@@ -75,9 +75,9 @@ LAWS: dict[str, LawBuilder] = {
     "gradient, auto": partial(_gradient, True, False),
     "gradient, auto, smoothed": partial(_gradient, True, True),
 }
-"""Row -> observation and law for a data set; None where it is not meant for the sensors.
+"""Row -> observation and law for a data set; None if the law does not support its sensors.
 
-Everything as it comes, but for the number of modes and the hand-set gain that the problem states.
+All options are defaults, except the number of modes and the constant gain of each problem.
 """
 
 
@@ -87,7 +87,7 @@ def _law(builder: LawBuilder, data: Data) -> Score | None:
 
 
 def run_law(data: Data, observation: Observation, law: AnyLaw) -> Score:
-    """Run a law over a data set; `observation` says what it is told of the sensors."""
+    """Run a law with an observation operator over a data set, and return its score."""
     process, samples = data.process, list(data)
     identifier = Identifier(
         process.model,
@@ -124,16 +124,16 @@ def run_law(data: Data, observation: Observation, law: AnyLaw) -> Score:
 
 
 def _hidden(data: Data, missed: Array) -> float:
-    """Return the root mean square of what validation sensors missed, shape (times, validation)."""
+    """Return the root mean square of validation errors of shape (times, validation)."""
     late = data.process.times >= data.process.assimilate_from
     return float(np.sqrt(np.nanmean(missed[late][1:] ** 2)))
 
 
-# --- what to hold them against -------------------------------------------------------------------
+# --- references ----------------------------------------------------------------------------------
 
 
 def _prior(data: Data) -> Score:
-    """Judge the prior: what is known without any sample."""
+    """Return the score of the prior, which uses no sample."""
     judge, trajectory = Judge(data), Trajectory(data)
     nothing = np.zeros(trajectory.size)
     error, covered = judge.judged(
@@ -151,7 +151,7 @@ def _fitted(data: Data) -> Fit:
 
 
 def _all_data(data: Data) -> Score:
-    """Judge the fit of all data; its time is divided by the samples."""
+    """Return the score of the offline fit; its time is divided by the number of samples."""
     found, judge = _fitted(data), Judge(data)
     error, covered = judge.judged((k, found.q[k], found.factor(k)) for k in judge.scored)
     if data.process.hidden is not None:
@@ -162,11 +162,11 @@ def _all_data(data: Data) -> Score:
 
 
 def _each_sample(data: Data) -> Score:
-    """Judge fits of the data so far: what one who fits online would know.
+    """Return the score of an offline fit that is repeated at each sample with the data so far.
 
-    Cost: for each of `SAMPLES` samples a single run with sensitivities over those so far, half of
-    them on average; the least that one Gauss-Newton step costs. It is a third where unknowns become
-    as many as samples: later runs have more of them.
+    Its cost is a lower bound, one Gauss-Newton step per sample: a run with sensitivities over the
+    samples so far, on average half of `SAMPLES`. If the number of unknowns grows with the samples,
+    it is a third, since later runs have more unknowns.
     """
     found, judge = _fitted(data), Judge(data)
     run = found.seconds / found.evaluations / len(data) * SAMPLES
@@ -189,7 +189,7 @@ ROWS: Mapping[str, Contender] = {
     ALL_DATA: _all_data,
     EACH_SAMPLE: _each_sample,
 }
-"""Row -> contender."""
+"""Name of the row -> contender."""
 
 
 # --- the benchmark -------------------------------------------------------------------------------
@@ -212,9 +212,9 @@ def accuracy(
     seeds
         Data sets for each noise level.
     levels
-        Noise levels; default those of each problem.
+        Noise levels; default the levels of each problem.
     problems
-        What there is to choose from.
+        Known problems by name.
     progress
         Show a bar on standard error.
     """
@@ -237,7 +237,7 @@ def accuracy(
 
 
 def _scores(problem: Problem, level: float | None, seed: int) -> dict[str, Score] | str:
-    """Return the score of each row on a data set, or why there is no such data set."""
+    """Return the score of each row on a data set, or why the data set is unavailable."""
     try:
         data = problem.data(level, seed)
     except (LivepdeError, StepFailed) as error:
@@ -247,7 +247,7 @@ def _scores(problem: Problem, level: float | None, seed: int) -> dict[str, Score
 
 
 def _checks(found: Found) -> list[Check]:
-    """Return the promises: errors at each level, and the time for each problem."""
+    """Return the checks: error ratios at each noise level, and cost ratios for each problem."""
     checks = []
     for problem, level, row in found:
         if row != PROMISED or level is None:
@@ -261,14 +261,14 @@ def _checks(found: Found) -> list[Check]:
 
 
 NOTES = (
-    "error: relative, of the parameter, at the end; where it moves the root mean square over times "
-    "in the second half. Median over seeds, least and largest. soil: K, at the validation sensor, "
-    "one step ahead (prior and offline fit: in a free run).",
-    f"limit: error over that of '{EACH_SAMPLE}', which is given all data up to the time that is "
-    f"scored. '{ALL_DATA}' is the same for what is constant, and a smoother for what moves: it "
-    "knows the future.",
-    "covered: share of values whose 95 % interval holds the truth, mean over seeds.",
-    "step: processor time of a step over that of a forward step with the matrix kept, mean over "
-    f"seeds; of '{ALL_DATA}' all of its time, divided by the samples; of '{EACH_SAMPLE}' computed: "
-    "a run with sensitivities over the samples so far.",
+    "error: relative error of the parameter at the end, or its root mean square over the second "
+    "half if the parameter varies; median, minimum and maximum over seeds. soil: error in K at the "
+    "validation sensor, one step ahead (prior and offline fit: free run).",
+    f"limit: error over the error of '{EACH_SAMPLE}', which uses all data up to the scored time. "
+    f"'{ALL_DATA}' is equal for constant parameters. For varying ones it is a smoother, which also "
+    "uses later data.",
+    "covered: share of values whose 95 % interval contains the truth, mean over seeds.",
+    "step: processor time of a step over a forward step with a stored factorisation, mean over "
+    f"seeds. '{ALL_DATA}': its total time divided by the number of samples. '{EACH_SAMPLE}': "
+    "computed for one run with sensitivities over the samples so far.",
 )

@@ -1,12 +1,12 @@
-"""Alarms: how soon a jump is flagged, how seldom one is without cause, which models are doubted.
+"""Detection of jumps and of wrong models, and false alarms.
 
-A jump: a coefficient changes by a fifth between two samples, at noise of 1 % of the data. It has to
-be flagged within 30 samples, and the estimate has to find the new value without a restart. Without
-a jump the same filters have to stay silent for 10 000 samples on average.
+Jumps: a coefficient changes by a fifth between two samples, with noise of 1 % of the data. It must
+be flagged within 30 samples, and the estimate must reach the new value without a restart. Without
+a jump, the same filters may raise one alarm in 10 000 samples on average.
 
-A wrong model: uniform where the ground has layers, a loss or a source left out. The run has to say
-that the model does not explain the data; with the right model it must not. Twins have data of the
-estimator's own scheme, so that a right model is right; real data are those of the cases.
+Wrong models are uniform although the ground has layers, or lack a loss or a source. The run must
+report that the model does not explain the data; with the right model it must not. Simulated data
+use the estimator's own scheme, so that the right model is exact. Measured data are from the cases.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from livepde.runs import Check, Outcome, Table, drive, unexplained
 from livepde.stepping import Advance, simulate
 
 JUMP = 0.2  # relative change of the coefficient
-NOISE = 0.01  # of the root mean square of the data
-STEP = 0.05  # between two samples
+NOISE = 0.01  # relative to the root mean square of the data
+STEP = 0.05  # time between two samples
 BEFORE = (200, 300)  # samples before the jump
 AFTER = 300  # samples after it
 CALM = 3000  # samples of a run without a jump
-CALM_RUNS = 3  # of each process
-SOON = 30  # samples within which a jump has to be flagged
-SELDOM = 1.0  # false alarms in 10 000 samples, at most
-FOUND = JUMP / 3  # relative error after the jump, at most
-WATCHED = 300  # samples of a run whose model is in question
+CALM_RUNS = 3  # runs of each process without a jump
+SOON = 30  # samples within which a jump must be flagged
+SELDOM = 1.0  # largest number of false alarms in 10 000 samples
+FOUND = JUMP / 3  # largest relative error after the jump
+WATCHED = 300  # samples of a run with a wrong or a right model
 TWINS = 10  # data sets for each wrong model
 
 POINTS = (0.25, 0.5, 0.75)
@@ -61,13 +61,13 @@ class Process:
     Attributes
     ----------
     title
-        What jumps, and what is seen.
+        What jumps, and what is observed.
     model, observation, u0
-        As an `Identifier` takes them.
+        Arguments of `Identifier`.
     draw
         rng -> coefficients of the truth before the jump, shape (m,).
     law
-        Of the estimator.
+        Law of the estimator.
     where
         Coefficients that are compared with the truth; default all.
     """
@@ -81,10 +81,7 @@ class Process:
     where: Any = field(default_factory=lambda: slice(None))
 
     def data(self, at: int, count: int, change: float, rng: np.random.Generator) -> Data:
-        """Return `count` samples; the coefficient changes after sample `at`, relative by `change`.
-
-        A change of zero is no jump.
-        """
+        """Return `count` samples; after sample `at`, q jumps by `change` (relative, 0: no jump)."""
         q, times = self.draw(rng), _times(count)
         states = _states(self.model, q, self.u0, times[: at + 1])
         if at < count:
@@ -103,7 +100,7 @@ class Data:
     q
         Coefficients before the jump.
     observation
-        With its noise.
+        Observation operator with the noise of the data.
     """
 
     times: Array
@@ -120,7 +117,7 @@ def _seen(
     q: Array,
     rng: np.random.Generator,
 ) -> Data:
-    """Return what sensors show of states, with noise."""
+    """Return noisy readings of states."""
     observed = observation.bind(model.state_space, model.X, model.parameter_space)
     exact = np.array([observed.G @ u for u in states])
     noise = NOISE * float(np.sqrt((exact**2).mean()))
@@ -134,7 +131,7 @@ def _times(count: int) -> Array:
 
 
 def _states(model: Model, q: Array, u0: Any, times: Array) -> list[Array]:
-    """Return the states of the forward model by the estimator's own scheme."""
+    """Return the states of the forward model, computed by the estimator's own scheme."""
     latent, control = model.latent.inverse(q), Advance(SensitivityLaw.scheme)
     return [u for _, u in simulate(model, latent, u0, times.tolist(), control)]
 
@@ -160,7 +157,7 @@ def _heat() -> Process:
 
 
 def _reaction(unknown: Any, title: str, observation: Observation, **options: Any) -> Process:
-    """Return the paper's equation with the forcing of `seed-excited`."""
+    """Return a process with the paper's equation and the forcing of `seed-excited`."""
     model = Model(
         Field(MESH, linear(MESH), dirichlet={"boundary": 0.0}),
         {"q": unknown},
@@ -217,12 +214,12 @@ PROCESSES: Mapping[str, Callable[[], Process]] = {
     "reaction field": _reaction_field,
     "burgers": _burgers,
 }
-"""Name -> maker of a process."""
+"""Name -> function that returns the process."""
 
 
 @dataclass(frozen=True)
-class Told:
-    """What one run told of one jump.
+class Detection:
+    """Alarms and errors of a run with one jump, or without a jump.
 
     Attributes
     ----------
@@ -230,23 +227,23 @@ class Told:
         Samples from the jump to the first alarm after it; infinite if there was none.
     false
         Alarms before the jump.
-    again
-        Alarms after the first one.
+    repeated
+        Alarms after the first one that follows the jump.
     error
-        Relative error at the end, root mean square over what is compared.
+        Relative error at the end, root mean square over the compared coefficients.
     covered
-        Share of what is compared that lies in its 95 % interval at the end.
+        Share of the compared coefficients that lie in their 95 % interval at the end.
     """
 
     delay: float
     false: int
-    again: int
+    repeated: int
     error: float
     covered: float
 
 
-def followed(process: Process, seed: int, change: float = 0.0, samples: int = 0) -> Told:
-    """Run a process with a jump; the same seed gives the same numbers.
+def followed(process: Process, seed: int, change: float = 0.0, samples: int = 0) -> Detection:
+    """Run a process with a jump; a seed determines all numbers.
 
     Parameters
     ----------
@@ -267,11 +264,11 @@ def followed(process: Process, seed: int, change: float = 0.0, samples: int = 0)
     truth = ((1.0 + change) * data.q)[process.where]
     belief, latent = identifier._latent_belief(), process.model.latent
     error = latent.value(belief.q)[process.where] / truth - 1.0
-    # The interval in latent coefficients, through which every transform maps its ends.
+    # Intervals are those of the latent coefficients: a transform maps their ends.
     std = np.asarray(belief.q_std, dtype=float)
     exact = latent.inverse((1.0 + change) * data.q)
     inside = np.abs(belief.q - exact) <= NORMAL_95 * std
-    return Told(
+    return Detection(
         late[0] if late else np.inf,
         len(alarms) - len(late),
         max(len(late) - 1, 0),
@@ -280,17 +277,17 @@ def followed(process: Process, seed: int, change: float = 0.0, samples: int = 0)
     )
 
 
-# --- models that are wrong -----------------------------------------------------------------------
+# --- wrong models --------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Suspect:
-    """A model that lacks something, and one that does not.
+    """A wrong model, and the right model for the same data.
 
     Attributes
     ----------
     title
-        What is wrong.
+        What is wrong with the wrong model.
     right, wrong
         Models of a rod with three points.
     draw
@@ -341,7 +338,7 @@ def _suspects() -> dict[str, Suspect]:
 
 
 SUSPECTS: Mapping[str, Suspect] = _suspects()
-"""Name -> what is wrong."""
+"""Name -> wrong and right model."""
 
 CASES: tuple[tuple[str, str, dict[str, Any], bool], ...] = (
     ("soil, uniform", "soil_uniform", {"law.noise": "0.1 K"}, True),
@@ -349,7 +346,7 @@ CASES: tuple[tuple[str, str, dict[str, Any], bool], ...] = (
     ("stream bed, uniform", "streambed_035_uniform", {}, True),
     ("stream bed, layers with offsets", "streambed_035_layers", {}, False),
 )
-"""Row, case, settings, whether the model is wrong: noise of the thermometers in all."""
+"""Row, case, settings, and whether the model is wrong; the noise is always the thermometers'."""
 
 
 def warned(suspect: Suspect, seed: int) -> tuple[bool, bool]:
@@ -358,57 +355,57 @@ def warned(suspect: Suspect, seed: int) -> tuple[bool, bool]:
     q, times = suspect.draw(rng), _times(WATCHED)
     states = _states(suspect.right, q, 0.0, times)
     data = _seen(suspect.right, Points(POINTS), states, times, q, rng)
-    told = []
+    doubted = []
     for model in (suspect.right, suspect.wrong):
         identifier = Identifier(model, data.observation, SensitivityLaw(), u0=0.0)
         run = identifier.run(zip(times[1:], data.z[1:], strict=True))
-        told.append(unexplained(run.to_xarray()))
-    return told[0], told[1]
+        doubted.append(unexplained(run.to_xarray()))
+    return doubted[0], doubted[1]
 
 
-# --- all of it -----------------------------------------------------------------------------------
+# --- the benchmark -------------------------------------------------------------------------------
 
 
 def alarms(seeds: int = 5, *, few: bool = False, progress: bool = False) -> Outcome:
-    """Run everything.
+    """Run all processes with and without jumps, all wrong models, and all cases.
 
     Parameters
     ----------
     seeds
-        Jumps up, and as many down, of each process.
+        Number of jumps up, and of jumps down, of each process.
     few
-        One run without a jump of each process, and one data set for each wrong model.
+        True: one run without a jump of each process, and one data set for each wrong model.
     """
     calm_runs, twins = (1, 1) if few else (CALM_RUNS, TWINS)
     runs = [
         (name, seed, sign * JUMP) for name in PROCESSES for seed in range(seeds) for sign in (1, -1)
     ]
     runs += [(name, seed, 0.0) for name in PROCESSES for seed in range(calm_runs)]
-    jumps: dict[str, list[Told]] = {name: [] for name in PROCESSES}
-    quiet: dict[str, list[Told]] = {name: [] for name in PROCESSES}
-    for (name, _, change), told in each(_followed, runs, "runs", progress=progress):
-        (jumps if change else quiet)[name].append(told)
+    jumps: dict[str, list[Detection]] = {name: [] for name in PROCESSES}
+    quiet: dict[str, list[Detection]] = {name: [] for name in PROCESSES}
+    for (name, _, change), detection in each(_followed, runs, "runs", progress=progress):
+        (jumps if change else quiet)[name].append(detection)
     models: dict[str, list[tuple[bool, bool]]] = {name: [] for name in SUSPECTS}
     pairs = [(name, seed) for name in SUSPECTS for seed in range(twins)]
     for (name, _), doubted in each(_warned, pairs, "wrong models", progress=progress):
         models[name].append(doubted)
     real, notes = [], []
-    for (name, *_, wrong), said in each(_case, CASES, "cases", progress=progress):
-        if isinstance(said, str):
-            notes.append(said)
+    for (name, *_, wrong), answer in each(_case, CASES, "cases", progress=progress):
+        if isinstance(answer, str):
+            notes.append(answer)
         else:
-            real.append((name, wrong, said))
+            real.append((name, wrong, answer))
     tables = [_jumps(jumps), _false(jumps, quiet), _models(models, real)]
     return Outcome(tables, _checks(jumps, quiet, models, real), [*NOTES, *notes])
 
 
 NOTES = (
-    f"Jump of {JUMP:.0%} up or down, noise {NOISE:.0%} of the data, samples {STEP:g} apart; data "
-    f"of the estimator's scheme. Error and share in the 95 % interval: {AFTER} samples later.",
+    f"Jumps by {JUMP:.0%} up or down, noise of {NOISE:.0%}, samples every {STEP:g}, data from the "
+    f"estimator's scheme. Errors and coverage of 95 % intervals: {AFTER} samples after the jump.",
 )
 
 
-def _followed(name: str, seed: int, change: float) -> Told:
+def _followed(name: str, seed: int, change: float) -> Detection:
     return followed(PROCESSES[name](), seed, change, CALM)
 
 
@@ -417,11 +414,11 @@ def _warned(name: str, seed: int) -> tuple[bool, bool]:
 
 
 def _case(row: str, name: str, settings: Mapping[str, Any], _wrong: bool) -> bool | str:
-    """Return whether a run of a case is doubted by itself, or why the case cannot be run."""
+    """Return whether a run of a case doubts its model, or why the case cannot be run."""
     try:
         path = next((path for path in find_cases() if path.stem == name), None)
         if path is None:
-            return f"{row}: not run, there is no case {name}.toml beside the other cases."
+            return f"{row}: not run, since the folder of cases has no {name}.toml."
         prepared = load(path, settings=settings).prepare()
         run = drive(prepared.identifier, prepared.stream, journal=prepared.journal())
     except LivepdeError as error:
@@ -429,23 +426,23 @@ def _case(row: str, name: str, settings: Mapping[str, Any], _wrong: bool) -> boo
     return unexplained(run.result.to_xarray())
 
 
-def _jumps(found: Mapping[str, Sequence[Told]]) -> Table:
+def _jumps(detections: Mapping[str, Sequence[Detection]]) -> Table:
     rows = []
-    for name, told in found.items():
-        delays = np.array([one.delay for one in told])
-        errors = np.array([one.error for one in told])
+    for name, runs in detections.items():
+        delays = np.array([run.delay for run in runs])
+        errors = np.array([run.error for run in runs])
         rows.append(
             (
                 name,
                 PROCESSES[name]().title,
-                len(told),
+                len(runs),
                 _percent(delays <= SOON),
                 float(np.median(delays)),
                 float(delays.max()),
-                sum(one.again for one in told),
+                sum(run.repeated for run in runs),
                 f"{100 * np.median(errors):.2g} %",
                 f"{100 * errors.max():.2g} %",
-                _percent(np.array([one.covered for one in told])),
+                _percent(np.array([run.covered for run in runs])),
             )
         )
     columns = (
@@ -463,11 +460,13 @@ def _jumps(found: Mapping[str, Sequence[Told]]) -> Table:
     return Table("Jumps", columns, rows)
 
 
-def _false(jumps: Mapping[str, Sequence[Told]], quiet: Mapping[str, Sequence[Told]]) -> Table:
+def _false(
+    jumps: Mapping[str, Sequence[Detection]], quiet: Mapping[str, Sequence[Detection]]
+) -> Table:
     rows = []
-    for name, told in quiet.items():
-        number = sum(one.false for one in told)
-        rows.append((name, CALM * len(told), number, sum(one.false for one in jumps[name])))
+    for name, runs in quiet.items():
+        number = sum(run.false for run in runs)
+        rows.append((name, CALM * len(runs), number, sum(run.false for run in jumps[name])))
     columns = ("process", "samples without a jump", "alarms", "alarms before a jump")
     return Table("False alarms", columns, rows)
 
@@ -476,14 +475,14 @@ def _models(
     models: Mapping[str, Sequence[tuple[bool, bool]]], real: Sequence[tuple[str, bool, bool]]
 ) -> Table:
     rows: list[tuple[Any, ...]] = []
-    for name, told in models.items():
-        right, wrong = (sum(one) for one in zip(*told, strict=True))
-        rows.append((SUSPECTS[name].title, f"{wrong} of {len(told)}", f"{right} of {len(told)}"))
-    for name, wrong, said in real:
-        answer = "yes" if said else "no"
+    for name, pairs in models.items():
+        right, wrong = (sum(doubts) for doubts in zip(*pairs, strict=True))
+        rows.append((SUSPECTS[name].title, f"{wrong} of {len(pairs)}", f"{right} of {len(pairs)}"))
+    for name, wrong, doubted in real:
+        answer = "yes" if doubted else "no"
         rows.append((f"{name} (real)", *((answer, "–") if wrong else ("–", answer))))
     columns = ("model", "warned", "the right one warned")
-    return Table("Does the run say that its model does not explain the data?", columns, rows)
+    return Table("Runs that report that the model does not explain the data", columns, rows)
 
 
 def _percent(values: Any) -> str:
@@ -491,26 +490,26 @@ def _percent(values: Any) -> str:
 
 
 def _checks(
-    jumps: Mapping[str, Sequence[Told]],
-    quiet: Mapping[str, Sequence[Told]],
+    jumps: Mapping[str, Sequence[Detection]],
+    quiet: Mapping[str, Sequence[Detection]],
     models: Mapping[str, Sequence[tuple[bool, bool]]],
     real: Sequence[tuple[str, bool, bool]],
 ) -> list[Check]:
     checks = []
-    for name, told in jumps.items():
-        soon = float(np.mean([one.delay <= SOON for one in told]))
-        largest = max(one.error for one in told)
+    for name, runs in jumps.items():
+        soon = float(np.mean([run.delay <= SOON for run in runs]))
+        largest = max(run.error for run in runs)
         checks.append(Check(f"{name}: flagged within {SOON} samples", soon, 1.0, ">="))
         checks.append(Check(f"{name}: error after the jump", largest, FOUND, "<="))
-    samples = CALM * sum(len(told) for told in quiet.values())
-    number = sum(one.false for told in quiet.values() for one in told)
+    samples = CALM * sum(len(runs) for runs in quiet.values())
+    number = sum(run.false for runs in quiet.values() for run in runs)
     rate = 1e4 * number / samples
     checks.append(Check("false alarms in 10 000 samples", rate, SELDOM, "<="))
     for name, pairs in models.items():
-        right, wrong = (float(np.mean(one)) for one in zip(*pairs, strict=True))
+        right, wrong = (float(np.mean(doubts)) for doubts in zip(*pairs, strict=True))
         checks.append(Check(f"{name}: wrong model warned", wrong, 1.0, ">="))
         checks.append(Check(f"{name}: right model warned", right, 0.0, "<="))
-    for name, wrong, said in real:
+    for name, wrong, warns in real:
         bound, sense = (1.0, ">=") if wrong else (0.0, "<=")
-        checks.append(Check(f"{name}: warned", float(said), bound, sense))  # type: ignore[arg-type]
+        checks.append(Check(f"{name}: warned", float(warns), bound, sense))  # type: ignore[arg-type]
     return checks

@@ -1,9 +1,9 @@
-"""What `GradientLaw(gain="auto")` promises, on the square of `benchmarks.scale`.
+"""Errors and cost of `GradientLaw(gain="auto")`, on the square of `benchmarks.scale`.
 
-A field of unknowns is identified from the strip of a square, on several meshes, from exact data and
-from data with white noise. The law is told nothing: neither a gain nor how large the noise is. Its
-error is that of q in L2, relative to that of q = 0. With exact data it is held against the best of
-a grid of constant gains and c_1, chosen by the truth. Its cost is that of the processes of
+A field is identified from data on a strip of a square, on several meshes, from exact data and from
+data with white noise. The law receives neither a gain nor the noise level. Errors are L2 errors of
+q relative to the error of q = 0. With exact data, the error is compared with the smallest error of
+a grid of constant gains and c_1. The cost is measured on the processes of
 `python -m benchmarks step`, in steps of the forward model.
 
 Reactions on partial data are those of `benchmarks.partial`.
@@ -27,14 +27,14 @@ from livepde.model import Model
 from livepde.runs import Outcome
 
 SIZES = (64, 256, 1024, 2500, 10_000)  # nodes of the square
-LEVELS = (0.0, 1e-3, 1e-2)  # noise over the root mean square of the readings
+LEVELS = (0.0, 1e-3, 1e-2)  # noise relative to the root mean square of the readings
 SEEDS = 5  # data sets for each level of noise
 SAMPLES = 100
-GAINS = (1.0, 1e2, 1e4, 1e6)  # of the law that it is held against
-DAMPINGS = (0.1, 1.0)  # and its c_1
-WORST = 1.05  # largest error on any sample with status ok; q = 0 has 1
-RATIO = 1.3  # error with exact data over that of the best constant gain
-COSTS = {31: 15.0, 1_000: 15.0, 10_000: 10.0}  # nodes -> forward steps that a step may cost
+GAINS = (1.0, 1e2, 1e4, 1e6)  # constant gains for comparison
+DAMPINGS = (0.1, 1.0)  # their c_1
+WORST = 1.05  # bound on the error of any sample with status ok; q = 0 has 1
+RATIO = 1.3  # bound on the error with exact data over the error of the best constant gain
+COSTS = {31: 15.0, 1_000: 15.0, 10_000: 10.0}  # nodes -> bound on the cost of a step
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class Course:
     Attributes
     ----------
     worst, last
-        The largest on a sample with status ok, and that after the last sample.
+        Largest error of a sample with status ok, and error after the last sample.
     failed
-        Samples with another status.
+        Number of samples with another status.
     """
 
     worst: float
@@ -74,13 +74,13 @@ class Square:
 
     @classmethod
     def of(cls, size: int) -> Square:
-        """Return the square with about so many nodes."""
+        """Return a square with approximately `size` nodes."""
         model = scale.problem(size)
         truth = model.initial_parameter(scale.q_true)
         return cls(model, truth, list(scale.readings(model, SAMPLES)))
 
     def noisy(self, level: float, seed: int) -> list[tuple[float, Array]]:
-        """Return the samples with white noise of a level, relative to all readings."""
+        """Return samples with white noise, relative to the root mean square of all readings."""
         if level == 0.0:
             return self.samples
         rng = np.random.default_rng(seed)
@@ -88,7 +88,7 @@ class Square:
         return [(t, z + size * rng.standard_normal(len(z))) for t, z in self.samples]
 
     def follow(self, law: GradientLaw, samples: Sequence[tuple[float, Array]]) -> Course:
-        """Return the errors of q of a law."""
+        """Run a law, and return its errors of q."""
         identifier = Identifier(self.model, scale.OMEGA, law, q0=0.0, u0=2.0)
         worst = last = 0.0
         failed = 0
@@ -102,7 +102,7 @@ class Square:
         return Course(worst, last, failed)
 
     def error(self, q: Array) -> float:
-        """Return the error of q in L2, relative to that of q = 0."""
+        """Return the L2 error of q relative to the error of q = 0."""
         mass, miss = self.model.parameter_mass, q - self.truth
         return float(np.sqrt((miss @ (mass @ miss)) / (self.truth @ (mass @ self.truth))))
 
@@ -114,7 +114,7 @@ def auto(
     reactions: Sequence[str] = (),
     levels: Sequence[float] = partial.LEVELS,
 ) -> Outcome:
-    """Check the promises of the law that tunes itself.
+    """Check errors and cost of the law with automatic gain.
 
     Parameters
     ----------
@@ -123,9 +123,9 @@ def auto(
     seeds
         Data sets for each level of noise.
     costs
-        Numbers of nodes where the cost is measured, of `COSTS`.
+        Numbers of nodes for which the cost is measured; keys of `COSTS`.
     reactions, levels
-        Processes of `benchmarks.partial` on partial data, and their noise.
+        Names of processes in `benchmarks.partial`, and their noise levels.
     """
     rows: list[tuple[object, ...]] = []
     checks: list[Check] = []
@@ -150,8 +150,8 @@ def auto(
     columns = ("nodes", "noise", "least", "largest", "worst", "failed", "best constant gain")
     table = Table("Error of q after the last sample (q = 0: 1)", columns, rows)
     note = (
-        f"{SAMPLES} samples, {seeds} data sets for each noise; worst: on any sample with status "
-        "ok; failed: samples with another. Constant gains: "
+        f"{SAMPLES} samples, {seeds} data sets for each noise level. worst: largest error of a "
+        "sample with status ok; failed: samples with another status. Constant gains: "
         f"{', '.join(f'{gain:g}' for gain in GAINS)} with c1 {DAMPINGS[0]:g} and {DAMPINGS[1]:g}."
     )
     tables, checks = [table, times], [*checks, *bounds]
@@ -162,7 +162,7 @@ def auto(
 
 
 def _best(square: Square) -> tuple[float, str]:
-    """Return the smallest error of constant gains with exact data, and with which that was."""
+    """Return the smallest error of constant gains with exact data, and a description of it."""
     found = []
     for gain, c1 in product(GAINS, DAMPINGS):
         course = square.follow(GradientLaw(gain, ResidualDamping(c1)), square.samples)
@@ -171,7 +171,7 @@ def _best(square: Square) -> tuple[float, str]:
 
 
 def _costs(sizes: Sequence[int]) -> tuple[Table, list[Check]]:
-    """Return the cost of a step, in forward steps of the same process."""
+    """Return a table and checks of the cost of a step, in forward steps of the same process."""
     rows, checks = [], []
     for size in sizes:
         low, middle, high, mean = steps.first_steps(steps.problem(size), GradientLaw(gain="auto"))

@@ -1,8 +1,8 @@
-"""Every case of the project, with its variants: what it finds, how well, and at what price.
+"""Estimates, errors and costs of every case of the project and of its variants.
 
-Beside each run goes a forward run with the unknowns frozen at their prior, sample by sample in the
-same process. It gives two numbers: the error of the model without data, and the time of a forward
-step, of which the cost of the law is a multiple.
+Each run alternates, sample by sample, with a forward run whose unknowns stay at their prior. The
+forward run provides two references: the error of the model without data, and the time of a forward
+step, in which the cost of the law is expressed.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ their prior. *Time* is the processor time of a sample over the time of a forward
 the first run of each case.
 
 **What to expect of measurements.** No model of a field is exact, and a long record shows it. Then
-the verdict is `caution` and not `trusted`: use the interval with model errors. `do not trust` says
+the verdict is `caution` and not `trusted`: use the interval with model errors. `do not trust` means
 that no such interval is narrow enough to use, or that the fit failed. `livepde compare` then tests
-the likely causes. Its recommendation stands below each case on measurements.
+the likely causes. Its recommendation is shown below each case on measurements.
 
 Experiments of the paper and of examples have [their own page](experiments.md). Written by
 `python -m benchmarks cases --gallery docs/gallery --compared 6`.
@@ -67,7 +67,7 @@ QUICK = (
     "soil_uniform",
     "thermal_response",
 )
-"""Cases of all kinds of processes that take seconds each."""
+"""One case for each kind of process; each takes seconds."""
 MEASURED = (
     "horkheim",
     "oude_korendijk",
@@ -84,14 +84,14 @@ MEASURED = (
     "thermal_response",
     "thermal_response_grout",
 )
-"""Cases on measurements with numbers as unknowns: `livepde compare` is shown for them."""
+"""Cases on measurements with constant unknowns, for which `livepde compare` is shown."""
 WORKERS = 2
-WARM_UP = 2  # samples in which matrices are built that are built once
+WARM_UP = 2  # untimed samples, in which matrices are assembled once
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run: a case, or one of its variants with one seed."""
+    """Description of one run: a case, or one of its variants with one seed."""
 
     path: Path
     variant: str = ""
@@ -101,34 +101,34 @@ class Job:
 
     @property
     def label(self) -> str:
-        """Case and variant."""
+        """Name of the case and the variant."""
         return f"{self.path.stem}: {self.variant}" if self.variant else self.path.stem
 
 
 @dataclass(frozen=True)
 class Run:
-    """What a run gave.
+    """Result of a run.
 
     Attributes
     ----------
     numbers
-        As `runs.measures` has them.
+        Result of `runs.measures`.
     unknowns
         Label -> unit, reference (NaN if none).
     expected
-        Numbers that the case expects of it.
+        Expectations of the case on these numbers.
     samples, ratio
-        Samples, and their time over that of as many forward steps.
+        Number of samples, and time of a sample over the time of a forward step.
     prior
-        RMSE with the unknowns frozen at their prior.
+        RMSE with the unknowns at their prior.
     verdict
-        At the end: its level, and the findings that are no notes.
+        Level of the last verdict, and its findings except notes.
     intervals
-        Label -> ends of the 95 % interval, and of that which allows for errors of the model.
+        Label -> ends of the 95 % interval, and of the interval with model errors.
     compared
-        What `livepde compare --json` prints; empty if it was not called.
+        Output of `livepde compare --json`; empty if it was not called.
     error
-        Why there is nothing of this.
+        Reason why the run failed; empty otherwise.
     """
 
     title: str = ""
@@ -146,12 +146,12 @@ class Run:
 
 
 def find_cases(folder: Path | None = None) -> list[Path]:
-    """Return the project's case files: those of a folder, or of the next 'cases' above this one.
+    """Return the case files in a folder, by default in the nearest 'cases' here or in a parent.
 
     Raises
     ------
     CaseError
-        There is none.
+        There are no case files.
     """
     here = Path.cwd()
     folders = [folder] if folder else [base / "cases" for base in (here, *here.parents)]
@@ -161,12 +161,12 @@ def find_cases(folder: Path | None = None) -> list[Path]:
             return found
     raise CaseError(
         f"{folder or here}: there are no case files (*.toml) here"
-        + ("." if folder else ", nor in a folder 'cases' above; go there, or add --folder DIR.")
+        + ("." if folder else ", nor in 'cases' here or in a parent folder. Add --folder DIR.")
     )
 
 
 def _one_thread() -> None:
-    """Keep a worker to one thread: its dense matrices are small, and all cores have a worker."""
+    """Limit a worker to one thread, since matrices are small and each core has a worker."""
     threadpool_limits(1)
 
 
@@ -178,7 +178,7 @@ def bench_cases(
     variants: bool = True,
     compared: int = 0,
 ) -> tuple[Outcome, list[tuple[Job, Run]]]:
-    """Run cases with their variants in processes of their own; code of theirs is run.
+    """Run cases with their variants in separate processes, and execute code that the cases name.
 
     Parameters
     ----------
@@ -187,20 +187,20 @@ def bench_cases(
     progress
         Show a bar on standard error.
     variants
-        Whether to run them, too.
+        Whether to run the variants of the cases.
     pictures
         Folder for a figure of each case.
     compared
-        Variants of `livepde compare` for each case on measurements; 0: it is not called.
+        Variants that `livepde compare` tries on cases with measurements; 0: do not call it.
 
     Returns
     -------
     outcome
         Two tables, and a check for every number that a case expects.
     runs
-        Means over the seeds: of each case, and of each variant.
+        Results of each case and of each variant, averaged over seeds.
     """
-    # A fresh interpreter for each worker: nothing of this one, such as its threads, is copied.
+    # Workers start with a new interpreter, so that they inherit no threads from this process.
     with ProcessPoolExecutor(WORKERS, get_context("spawn"), _one_thread) as pool:
         order, failed = _jobs(paths, pictures, variants, compared)
         found = _collect(pool, order, progress)
@@ -209,8 +209,8 @@ def bench_cases(
     checks = [check for job, run in runs for check in _checks(job, run)]
     notes = [f"{job.label}: {run.error}" for job, run in runs if run.error]
     notes.append(
-        "Time is that of a sample over that of a forward step of the same model, taken in turns; "
-        "'prior' is the RMSE of the model with its unknowns at their prior."
+        "time: processor time of a sample over a forward step of the same model, run in turns; "
+        "prior: RMSE of the model with its unknowns at their prior."
     )
     return Outcome(_tables(runs), checks, notes), runs
 
@@ -218,7 +218,7 @@ def bench_cases(
 def _jobs(
     paths: Sequence[Path], pictures: Path | None, variants: bool, compared: int
 ) -> tuple[list[Job], list[tuple[Job, Run]]]:
-    """Return the jobs of all cases, and cases that cannot be read."""
+    """Return the jobs of all cases, and a failed run for each case that cannot be read."""
     order: list[Job] = []
     failed = []
     for path in paths:
@@ -232,7 +232,7 @@ def _jobs(
 
 
 def _collect(pool: Executor, order: Sequence[Job], progress: bool) -> list[tuple[Job, Run]]:
-    """Return the runs of all jobs."""
+    """Return each job with its run."""
     waiting = {pool.submit(run_job, job): job for job in order}
     done: Iterable[Any] = as_completed(waiting)
     for _ in watched(done, len(order), "runs") if progress else done:
@@ -241,13 +241,13 @@ def _collect(pool: Executor, order: Sequence[Job], progress: bool) -> list[tuple
 
 
 def _outcome(future: Future[Run]) -> Run:
-    """Return a run; one that raised what it should not is a row as well."""
+    """Return a run; an unexpected exception becomes the error of the run."""
     error = future.exception()
     return Run(error=f"{type(error).__name__}: {error}") if error else future.result()
 
 
 def jobs_of(path: Path, pictures: Path | None = None, variants: bool = True) -> list[Job]:
-    """Return the runs of a case: itself, and its variants with all of their seeds."""
+    """Return the jobs of a case: the case itself, and its variants with all seeds."""
     figure = pictures / f"{path.stem}.png" if pictures else None
     jobs = [Job(path, figure=figure)]
     if not variants:
@@ -263,7 +263,7 @@ def jobs_of(path: Path, pictures: Path | None = None, variants: bool = True) -> 
 
 
 def run_job(job: Job) -> Run:
-    """Run a case beside its forward model; a failure is a sentence."""
+    """Run a case together with its forward model; a failure becomes the error of the run."""
     try:
         case = load(job.path, allow_code=True, settings=job.settings)
         prepared = case.prepare()
@@ -295,20 +295,20 @@ def run_job(job: Job) -> Run:
 
 
 def _both_intervals(data: xr.Dataset) -> dict[str, tuple[float, float, float, float]]:
-    """Return the last intervals of each number; NaN for the second where the verdict has none."""
-    errors, found = verdict(data).errors, {}
+    """Return the last intervals of each constant, without and with model errors (NaN if none)."""
+    errors, intervals = verdict(data).errors, {}
     allowed = {one.label: one for one in errors.unknowns} if errors is not None else {}
     for label in scalars(data):
         low, high = (float(end[-1]) for end in interval_95(data, label))
-        found[label] = low, high, math.nan, math.nan
+        intervals[label] = low, high, math.nan, math.nan
         if label in allowed:
             one = allowed[label]
-            found[label] = one.plain_low, one.plain_high, one.low, one.high
-    return found
+            intervals[label] = one.plain_low, one.plain_high, one.low, one.high
+    return intervals
 
 
 def _compared(job: Job) -> dict[str, Any]:
-    """Return what `livepde compare` prints of a case."""
+    """Return the JSON output of `livepde compare` for a case."""
     command = [sys.executable, "-m", "livepde", "compare", str(job.path), "--json", "--jobs", "1"]
     command += ["--most", str(job.compared), "--allow-code"]
     ended = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
@@ -316,18 +316,18 @@ def _compared(job: Job) -> dict[str, Any]:
 
 
 def _verdict(data: xr.Dataset) -> str:
-    """Return the level of a verdict, and what it found of what, the gravest first."""
-    found = verdict(data)
-    graver = [item for item in found.findings if item.severity != "note"]
-    said = dict.fromkeys(f"{item.what} {item.subject}".strip() for item in graver)
-    return ": ".join(filter(None, (found.level, ", ".join([*said][:MOST]))))
+    """Return the level of a verdict and its findings except notes, the most severe first."""
+    judged = verdict(data)
+    graver = [item for item in judged.findings if item.severity != "note"]
+    findings = dict.fromkeys(f"{item.what} {item.subject}".strip() for item in graver)
+    return ": ".join(filter(None, (judged.level, ", ".join([*findings][:MOST]))))
 
 
-# --- a run beside a forward run ------------------------------------------------------------------
+# --- a run in turns with a forward run -----------------------------------------------------------
 
 
 class _Frozen(Law[tuple[Problem, ForwardStage], tuple[Array, Array]]):
-    """No law: the forward model with the parameter where it started; it times its own steps."""
+    """Law that keeps the parameter at its start, and records the time of its forward steps."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -362,7 +362,7 @@ class _Frozen(Law[tuple[Problem, ForwardStage], tuple[Array, Array]]):
 
 
 def _paired(prepared: Prepared) -> tuple[xr.Dataset, xr.Dataset, float]:
-    """Return the run, the forward run, and the ratio of their times."""
+    """Return the datasets of a run and of a forward run, and the ratio of their times."""
     frozen = _Frozen()
     runs = [prepared.identifier, prepared.identifier_with(frozen)]
     every = prepared.case.spec.output.fields_every
@@ -386,7 +386,7 @@ def _paired(prepared: Prepared) -> tuple[xr.Dataset, xr.Dataset, float]:
     return datasets[0], datasets[1], ratio
 
 
-# --- what is shown -------------------------------------------------------------------------------
+# --- report --------------------------------------------------------------------------------------
 
 
 def _grouped(found: Sequence[tuple[Job, Run]]) -> Iterator[tuple[Job, list[Run]]]:
@@ -399,7 +399,7 @@ def _grouped(found: Sequence[tuple[Job, Run]]) -> Iterator[tuple[Job, list[Run]]
 
 
 def _mean(runs: Sequence[Run]) -> Run:
-    """Return the mean over seeds; a run that failed stands for all."""
+    """Return the mean over seeds, or the first failed run if there is one."""
     first = next((run for run in runs if run.error), runs[0])
     if first.error or len(runs) == 1:
         return first
@@ -421,7 +421,7 @@ def _checks(job: Job, run: Run) -> list[Check]:
 
 
 def _tables(runs: Sequence[tuple[Job, Run]]) -> list[Table]:
-    """Return what was found, and how good and how dear it was."""
+    """Return a table of estimates, and a table of errors, costs and verdicts."""
     rows: list[tuple[Any, ...]] = []
     quality: list[tuple[Any, ...]] = []
     for job, run in runs:
@@ -450,12 +450,12 @@ def _tables(runs: Sequence[tuple[Job, Run]]) -> list[Table]:
 
 
 def _interval(ends: Sequence[float], std: float) -> str:
-    """Return an interval with the digits that a standard deviation leaves."""
+    """Format an interval with the digits that are significant given the standard deviation."""
     return " to ".join(digits(end, std)[0] for end in ends) if math.isfinite(ends[0]) else "–"
 
 
 def _recommendation(run: Run) -> list[str]:
-    """Return what `livepde compare` says of a case, as Markdown."""
+    """Return the recommendation of `livepde compare` for a case, as Markdown."""
     if not run.compared:
         return []
     shown = [
@@ -480,14 +480,14 @@ def _recommendation(run: Run) -> list[str]:
 
 
 def gallery(runs: Sequence[tuple[Job, Run]], folder: Path) -> Path:
-    """Write gallery.md: for each case its figure, the tables of its runs, and its checks."""
+    """Write gallery.md with the figure, the tables and the checks of each case."""
     parts = []
     for path in dict.fromkeys(job.path for job, _ in runs):
-        some = [(job, run) for job, run in runs if job.path == path]
-        job, run = some[0]
-        checks = [check for pair in some for check in _checks(*pair)]
+        pairs = [(job, run) for job, run in runs if job.path == path]
+        job, run = pairs[0]
+        checks = [check for pair in pairs for check in _checks(*pair)]
         source = [f"Reference: {run.source}"] if run.source else []
-        report = markdown("", _tables(some), checks, source).removeprefix("# \n\n")
+        report = markdown("", _tables(pairs), checks, source).removeprefix("# \n\n")
         lines = [f"## {run.title or path.stem}", f"`python -m benchmarks cases --only {path.stem}`"]
         if job.figure and job.figure.exists():
             lines.append(f"![{path.stem}]({job.figure.name})")

@@ -1,9 +1,9 @@
-"""What `livepde compare` makes of wrong tables and wrong cases, without a hint what is wrong.
+"""Recommendations of `livepde compare` for wrong tables and wrong cases, without a hint.
 
-The walks of docs/first-hour.md, each with one fault that a setting of the case could correct: a
-channel that is late, scaled, exchanged, in degrees Fahrenheit or off by a constant, or a case that
-states a wrong place or a wrong start. The recommended variant should be trusted or cautious, with
-the truth within its intervals.
+Each walk of docs/first-hour.md has one fault that a setting of the case can correct. A channel is
+late, scaled, exchanged, in degrees Fahrenheit or shifted by a constant, or the case has a wrong
+position or a wrong initial value. The verdict of the recommended variant should be `trusted` or
+`caution`, and its intervals should contain the truth.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from livepde.cases.variants import AS_STATED, Variant, run_variant
 from livepde.diagnostics.check_report import Check, Table
 from livepde.runs import Outcome
 
-RIGHT = 0.6  # of the runs: usable, and the truth within the intervals
-WRONG = 0.03  # of the runs: trusted, and an unknown off by more than `FAR`
-FAR = 3.0  # standard deviations, as in the census: sound intervals miss in 5 %
+RIGHT = 0.6  # smallest share of usable variants whose intervals contain the truth
+WRONG = 0.03  # largest share of trusted variants with an error larger than `FAR`
+FAR = 3.0  # standard deviations, as in the census: correct 95 % intervals miss in 5 %
 TWO_SIDED = 1.96  # standard deviations from the middle of a 95 % interval to its ends
 USABLE = "trusted", "caution"
 
 
 class Stated(NamedTuple):
-    """A case that states something wrong: the walk, and the setting."""
+    """Case of a walk with a wrong setting."""
 
     walk: str
     setting: str
@@ -63,18 +63,18 @@ QUICK = tuple(one for one in WRONGS if str(one) in ("heater: T_60 offset", "colu
 
 
 class Ended(NamedTuple):
-    """How a comparison ended.
+    """Result of a comparison.
 
     Attributes
     ----------
     before, level
-        Levels of the case itself, and of the recommended variant.
+        Verdict levels of the case itself, and of the recommended variant.
     variant
-        Its name.
+        Name of the recommended variant.
     outside
-        Unknowns whose truth lies outside of its intervals.
+        Unknowns whose truth lies outside their intervals.
     off
-        Largest error of an unknown, in standard deviations of its interval.
+        Largest error of an unknown, in standard deviations.
     """
 
     before: str
@@ -96,14 +96,14 @@ def compared(
     Parameters
     ----------
     seeds
-        Truths of each.
+        Number of truths of each wrong case.
     workers
         Processes, default one for each processor.
     """
     todo = [(wrong, seed) for wrong in wrongs for seed in range(seeds)]
     rows, right, trusted = [], 0, 0
-    found = each(_ended, todo, "cases", workers=workers or os.cpu_count() or 1, progress=progress)
-    for (wrong, seed), ended in found:
+    runs = each(_ended, todo, "cases", workers=workers or os.cpu_count() or 1, progress=progress)
+    for (wrong, seed), ended in runs:
         right += not ended.outside and ended.level in USABLE
         trusted += ended.off > FAR and ended.level == "trusted"
         rows.append((str(wrong), seed, *ended[:3], ended.outside or "–", ended.off))
@@ -118,7 +118,7 @@ def compared(
 
 
 def _ended(wrong: Fault | Stated, seed: int) -> Ended:
-    """Return how the comparison of one wrong case ended."""
+    """Compare variants of one wrong case, and return the result."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / FOLDER.relative_to(ROOT)
         shutil.copytree(FOLDER, folder)

@@ -1,12 +1,12 @@
-"""Whether intervals hold what they promise: coverage over twins with true values from the prior.
+"""Coverage of intervals in twin experiments with true values drawn from the prior.
 
-Each twin draws its unknowns from the prior, makes its data with the estimator's own scheme, adds
-noise, and asks whether the truth lies in the 68 % and 95 % intervals. If prior, model and noise are
-right, as many do as the level says, and the normalised innovations are white: of 100 twins 95 have
-a mean square within 1.96 standard errors of 1, and a correlation of successive ones within as many
-of 0. In the last problems the model is wrong: its data have a loss of heat, or a second layer, of a
-random size, that the model does not know. Then the interval has to be wide enough, or the run has
-to say that the model does not explain the data.
+Each twin draws its unknowns from the prior, simulates data with the estimator's own scheme, adds
+noise, and tests whether the truth lies in the 68 % and 95 % intervals. If prior, model and noise
+are right, the coverage equals the level and the normalised innovations are white. Then 95 of 100
+twins have a mean square within 1.96 standard errors of 1, and a lag-one correlation within 1.96
+standard errors of 0. In the last problems the model is wrong: it lacks a heat loss or a second
+layer of random size. Then the interval must still contain the truth, or the run must report that
+the model does not explain the data.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ from livepde.runs import Outcome, unexplained
 from livepde.stepping import Advance, Alexander2, ForwardStage, Interval, advance
 
 LEVELS = (0.68, 0.95)
-WITHIN = {0.68: (0.60, 0.76), 0.95: (0.90, 0.98)}  # what the shares over 200 twins have to lie in
-AT_LEAST = 0.9  # share of twins with innovations within chance, which is 0.95
-HONEST = 0.9  # of the wrong models: wide enough, or doubted
-FALSE_ALARM = 0.05  # of the right models doubted, at most
+WITHIN = {0.68: (0.60, 0.76), 0.95: (0.90, 0.98)}  # bounds on the coverage of 200 twins
+AT_LEAST = 0.9  # smallest share of twins with white innovations, whose expectation is 0.95
+HONEST = 0.9  # smallest share of wrong models with the truth in the interval, or doubted
+FALSE_ALARM = 0.05  # largest share of right models that are doubted
 NOISE = 0.05
 MESH = line(0.0, 1.0, 20)
 
@@ -59,18 +59,18 @@ class Problem:
     Attributes
     ----------
     title
-        What is unknown.
+        Description of the unknowns.
     unknowns
-        What the estimator knows of them.
+        Name -> prior.
     law
-        Of the estimator.
+        Law of the estimator.
     sensors
-        Where.
+        Positions of the sensors.
     loss, contrast
-        rng -> what of the truth the model does not know; None: nothing. A heat loss; by which share
-        a is smaller in the second half than in the first, where the heat comes in.
+        rng -> term that only the truth has; None: no such term. `loss` is a heat loss, `contrast`
+        the relative reduction of a in the second half; heat enters the first half.
     samples
-        How many, 0.1 apart.
+        Number of samples, 0.1 apart.
     """
 
     title: str
@@ -83,7 +83,7 @@ class Problem:
 
     @property
     def right(self) -> bool:
-        """True if the estimator has the model of the truth."""
+        """True if the estimator uses the model of the truth."""
         return self.loss is None and self.contrast is None
 
     def truth(self, rng: np.random.Generator) -> Model:
@@ -92,7 +92,7 @@ class Problem:
         return self.model(loss, contrast)
 
     def model(self, loss: float = 0.0, contrast: float = 0.0) -> Model:
-        """Return u_t - (c a u_x)_x + (b + loss) (u - 2) = 0, with b among the unknowns or not.
+        """Return the model u_t - (c a u_x)_x + (b + loss) (u - 2) = 0; b = 0 if it is not unknown.
 
         c is 1 in the first half and 1 - contrast in the second.
         """
@@ -117,7 +117,7 @@ SPREAD = (0.1667, 0.3333, 0.5, 0.6667, 0.8333)
 
 
 def _between(low: float, high: float) -> Callable[[np.random.Generator], float]:
-    """Return a draw whose logarithm is uniform."""
+    """Return a function that draws from the log-uniform distribution on (low, high)."""
     return lambda rng: float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
@@ -157,20 +157,20 @@ PROBLEMS: Mapping[str, Problem] = {
 
 @dataclass(frozen=True)
 class Twin:
-    """What one twin tells.
+    """Scores of one twin.
 
     Attributes
     ----------
     inside
-        Level -> share of what is compared that lies in its interval: numbers at the end of the run,
-        a field at all vertices, a moving number at ten times.
+        Level -> share of true values that lie in their interval: constants at the end of the run,
+        fields at all vertices, moving constants at ten times.
     error
-        Mean square of errors of latent values over their deviations.
+        Mean square error of latent values, in units of their variances.
     doubted
-        True if the run says that its model does not explain the data.
+        True if the run reports that its model does not explain the data.
     white
-        True if the mean square of the normalised innovations, and their correlation, are what those
-        of white noise are in 95 of 100 cases.
+        Whether the mean square of the normalised innovations, and their lag-one correlation, lie in
+        the 95 % ranges of white noise.
     """
 
     inside: Mapping[float, float]
@@ -180,7 +180,7 @@ class Twin:
 
 
 def coverage(twins: int = 200, *, progress: bool = False) -> Outcome:
-    """Run all problems, each with so many twins."""
+    """Run all problems, each with `twins` twins."""
     todo = [(name, seed) for name in PROBLEMS for seed in range(twins)]
     found: dict[str, list[Twin]] = {name: [] for name in PROBLEMS}
     for (name, _), scored in each(_twin, todo, "twins", progress=progress):
@@ -224,9 +224,9 @@ def coverage(twins: int = 200, *, progress: bool = False) -> Outcome:
         "correlation",
     )
     note = (
-        f"True values are drawn from the prior, {twins} times; noise {NOISE:g}. Errors over "
-        "deviations are root mean squares, 1 if the deviations are right. Innovations: share of "
-        "twins whose mean square and correlation are within 95 % chance of those of white noise."
+        f"{twins} draws of true values from the prior, noise {NOISE:g}. error / deviation: root "
+        "mean square, 1 for correct standard deviations. innovations: share of twins whose mean "
+        "square and correlation lie in the 95 % ranges of white noise."
     )
     return Outcome([Table("Share of true values in the interval", columns, rows)], checks, [note])
 
@@ -240,7 +240,7 @@ def _twin(name: str, seed: int) -> Twin:
 
 
 def twin(problem: Problem, seed: int) -> Twin:
-    """Run one twin; the same seed gives the same numbers."""
+    """Run one twin; a seed determines all numbers."""
     rng = np.random.default_rng(seed)
     model = problem.model()
     truth = model if problem.right else problem.truth(rng)
@@ -259,7 +259,7 @@ def twin(problem: Problem, seed: int) -> Twin:
         if (moving and k in compared) or k == problem.samples:
             scores.append(_score(model, estimate, identifier._latent_belief(), path[k]))
     inside, errors = zip(*scores, strict=True)
-    result = identifier.run([])  # the estimates as a dataset, for what the run says of itself
+    result = identifier.run([])  # an empty result that collects the estimates for the verdict
     for estimate in samples:
         result.add(estimate)
     return Twin(
@@ -271,7 +271,7 @@ def twin(problem: Problem, seed: int) -> Twin:
 
 
 def _white(found: Diagnostics[float], values: int) -> tuple[bool, bool]:
-    """Return whether statistics of so many normalised innovations are those of white noise."""
+    """Return whether mean square and correlation of `values` innovations fit white noise."""
     square, correlation = found.innovation_ratio - 1.0, found.innovation_correlation
     return (
         abs(square) <= NORMAL_95 * np.sqrt(2.0 / values),
@@ -280,10 +280,10 @@ def _white(found: Diagnostics[float], values: int) -> tuple[bool, bool]:
 
 
 def _path(model: Model, times: Array, rng: np.random.Generator) -> Array:
-    """Return latent coefficients from the prior at each time, as they move, (times, m)."""
+    """Draw latent coefficients and their evolution from the prior, shape (times, m)."""
     latent = model.latent
     gram = model.Q.gram.toarray()
-    # q ~ N(prior, G^{-1}): with G = L L^T it is prior + L^{-T} times white noise.
+    # q ~ N(prior, G^{-1}): with G = L L^T, a draw is prior + L^{-T} times white noise.
     root = np.linalg.inv(np.linalg.cholesky(gram)).T
     a = latent.prior + root @ rng.standard_normal(latent.dim)
     path = [a]
@@ -302,7 +302,7 @@ def _path(model: Model, times: Array, rng: np.random.Generator) -> Array:
 
 
 def _states(model: Model, path: Array, times: Array) -> Iterator[Array]:
-    """Yield the states of the truth, whose parameter may change from sample to sample."""
+    """Yield the states of the truth, whose parameter may change at each sample."""
     forward, control = ForwardStage(model), Advance(Alexander2())
     nothing, none = Inputs({}), np.zeros(0)
     u = model.initial(0.0, Moment(times[0], nothing))
@@ -322,7 +322,7 @@ def _states(model: Model, path: Array, times: Array) -> Iterator[Array]:
 def _score(
     model: Model, estimate: Estimate, belief: Belief, truth: Array
 ) -> tuple[dict[float, float], float]:
-    """Return the shares inside the intervals, and the mean square of normalised errors."""
+    """Return the coverage of each level, and the mean square of the normalised errors."""
     space, exact = model.parameter_space, model.latent.value(truth)
     inside = {}
     for level in LEVELS:

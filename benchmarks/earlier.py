@@ -1,10 +1,10 @@
 """Measure the forward step of an earlier version: python -m benchmarks.earlier [COMMIT].
 
-Two processes step the same model in turns, one with the sources of the commit (a worktree of git
-that is removed afterwards), one with those of today. Printed are the forward step of today and that
-of the commit, both in forward steps of the lean reference (`benchmarks.rods.lean_forward`), and
-today's over the commit's: medians of the turns, of processor times. The second column is what
-`benchmarks.rods.EARLIER` holds.
+Two processes step the same model in turns: one with the sources of the commit, in a temporary git
+worktree, and one with the current sources. The table shows the forward step of the commit and the
+current one, both in forward steps of the lean reference (`benchmarks.rods.lean_forward`), and the
+ratio of current to commit. Values are medians over the turns, of processor times. The column of
+the commit defines `benchmarks.rods.EARLIER`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SIZES = ((31, 2), (200, 2), (1_000, 2), (10_000, 4))
 
 
 def main() -> None:
-    """Measure, and print."""
+    """Parse the command line, measure, and print the table."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("commit", nargs="?", default=COMMIT)
     options.add_argument("--turns", type=int, default=TURNS)
@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def compare(earlier: Path, commit: str, turns: int) -> None:
-    """Step both versions in turns."""
+    """Step both versions in turns, and print a row for each model."""
     then, now = _worker(earlier, "forward"), _worker(ROOT / "src", "lean")
     write = sys.stdout.write
     write(f"| nodes | ends | {commit} / lean | today / lean | today / {commit} |\n")
@@ -83,7 +83,7 @@ def _ask(worker: subprocess.Popen[str], task: str) -> list[float]:
 
 
 def serve(lean: bool) -> None:
-    """Answer each line of nodes, unknowns and ends with the median of a forward step, in s."""
+    """Answer each line "NODES UNKNOWNS ENDS" with median times of a forward step, in s."""
     models: dict[str, Any] = {}
     for line in sys.stdin:
         nodes, unknowns, ends = line.split()
