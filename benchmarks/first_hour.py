@@ -1,9 +1,9 @@
-"""The walks of docs/first-hour.md with data of other truths: how often their intervals hold.
+"""Coverage of the walks of docs/first-hour.md for other truths.
 
-Truths come from codes of their own: finite volumes with exponentials in time for the walls, the
-ground and the aquifer, finite differences with small steps for the plate, the solution of Ogata and
-Banks (1961) for the column, and for the pipe cells that move with the water. Nothing is shared with
-livepde but the priors that they are drawn from. `write` makes the tables of examples/first_hour.
+Truths come from independent codes: finite volumes with matrix exponentials in time for the walls,
+the ground and the aquifer, finite differences with small steps for the plate, the solution of Ogata
+and Banks (1961) for the column, and cells that move with the water for the pipe. They share only
+the priors with livepde. `write` writes the tables of examples/first_hour.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ Array = NDArray[Any]
 FOLDER = ROOT / "examples" / "first_hour"
 WALKS = ("furnace", "borehole", "plate", "pumping", "column", "heater", "wall", "pipe")
 WRITTEN = 0  # seed of the tables in the examples
-SHARE = 0.9  # of the vertices of a field whose interval has to hold
-TRUSTED = "trusted"  # among the scores of a run
-HELD = 0.9  # of the seeds: 18 of 20
+SHARE = 0.9  # smallest share of vertices at which the interval of a field contains the truth
+TRUSTED = "trusted"  # name of a score of a run
+HELD = 0.9  # smallest share of seeds whose interval contains the truth: 18 of 20
 WIDTH, EXACT = "width of ", "exact width of "
-WIDEST = 1.3  # times the width of a batch fit with inputs as they are read
+WIDEST = 1.3  # largest width over the width of a batch fit with noisy inputs
 NUDGE = 1e-3  # relative change of an unknown, for derivatives of the readings
 Factors: TypeAlias = Mapping[str, float]  # unknown -> factor on its drawn value
 AS_DRAWN: Factors = {}
@@ -59,38 +59,38 @@ KELVIN = 0.3  # noise of its thermocouples
 WALL = 0.24
 WALL_STEP = 600.0  # s
 WALL_KELVIN, WALL_FLUX = 0.1, 0.3  # noise of its surface thermometers and its heat-flux plate
-BEFORE = 3 * 86400.0  # the wall was heated and cooled before its table begins
+BEFORE = 3 * 86400.0  # s, simulated time before the table begins
 
-# The plate: an L of squares, sides of 1 m.
+# The L-shaped plate, with sides of 1 m.
 SIDE = 60  # cells of the truth along 1 m
 SENSORS = 30
 PLATE_NOISE = 0.2
 ALPHA, ALPHA_STD, LENGTH = 1e-4, 4e-5, 0.3  # prior of its diffusivity
 
-# The aquifer: a well, and two observation wells.
-WELLS = (18.0, 63.0)  # m from the pumped one
-WELL, FAR = 0.1, 5000.0  # m
+# The aquifer, with a pumped well and two observation wells.
+WELLS = (18.0, 63.0)  # m, distances from the pumped well
+WELL, FAR = 0.1, 5000.0  # m, inner and outer radius
 DRAWDOWN = 0.01  # m, noise of its loggers
 
 # The column.
-OUTLET = 10.0  # cm, place of its probe
+OUTLET = 10.0  # cm, position of its probe
 CONCENTRATION = 0.01  # noise of the probe
 
 # The buried pipe, read once a minute.
 PIPE, PIPE_SENSORS = 400.0, (130.0, 270.0, 400.0)  # m
 PIPE_CELL = 0.5  # m, of the truth
 PIPE_AREA, WATER, SOIL = 7.854e-3, 4.1e6, 9.0  # m^2, J/(m^3 K), degC
-VALVE = 120.0  # s, in which its supply follows a new set point
+VALVE = 120.0  # s, time constant with which its supply follows the set point
 PIPE_KELVIN, SUPPLY_KELVIN = 0.15, 0.03
 
-# The heated wall, with a heater that a controller switches.
+# The wall with a heater that a controller switches.
 BRICK, BRICK_CAPACITY, BRICK_DEPTHS = 0.1, 1.4e6, (0.01, 0.03, 0.06)
 POWER = 800.0  # W/m^2
 BRICK_KELVIN = 0.2
 
 
 def furnace(seed: int) -> tuple[list[str], Array, dict[str, float]]:
-    """Return the table of a wall with a drawn conductivity and flux, and the truths at its end."""
+    """Return header, table and final truths of a wall with random conductivity and heat flux."""
     rng = np.random.default_rng([seed, 1])
     k = 20.0 * np.exp(0.5 * rng.standard_normal())
     times = np.arange(0.0, 3601.0, 2.0)
@@ -108,7 +108,7 @@ def furnace(seed: int) -> tuple[list[str], Array, dict[str, float]]:
     C = C.reshape(len(DEPTHS), cells)
     capacity = np.full(cells, CAPACITY * width)
     system = diffusion(between[:-1], capacity, loss, B, C, np.zeros((len(DEPTHS), 2)))
-    # Relative to 25 degC, where it begins.
+    # Temperatures are relative to the initial 25 degC.
     shown = 25.0 + system.respond(np.column_stack([flux, cold - 25.0]), 2.0)
     shown += KELVIN * rng.standard_normal(shown.shape)
     header = ["time_s", *(f"T_{n}" for n in range(1, len(DEPTHS) + 1)), "T_cold"]
@@ -119,7 +119,7 @@ def furnace(seed: int) -> tuple[list[str], Array, dict[str, float]]:
 def wall(
     seed: int, days: float = 3.0, *, by: Factors = AS_DRAWN
 ) -> tuple[list[str], Array, dict[str, float]]:
-    """Return the table of a wall that begins in a curved profile, and its truths."""
+    """Return header, table and truths of a wall with a curved initial profile."""
     rng = np.random.default_rng([seed, 5])
     k, capacity = (
         0.8 * np.exp(0.5 * rng.standard_normal()),
@@ -130,9 +130,9 @@ def wall(
     phases = 2.0 * np.pi * rng.uniform(size=5)
     outside = 4.0 + 4.0 * np.sin(2 * np.pi * fine / 86400.0 + phases[0])
     outside += np.sin(2 * np.pi * fine / 40000.0 + phases[1])
-    # A cold front, two hours before the table begins: the wall is curved then.
+    # A cold front two hours before the table begins makes the initial profile curved.
     outside -= 3.0 * (1.0 + np.tanh((fine + 7200.0) / 1800.0))
-    # Of 16 K across the wall, and a heating that is switched by day and night.
+    # Flux for 16 K across the wall, with a heating that switches by day and night.
     flux = 16.0 * k / WALL * (1.0 + 0.25 * np.tanh(3.0 * np.sin(2 * np.pi * fine / 86400.0)))
     for phase, period in zip(phases[2:], (20000.0, 33000.0, 60000.0), strict=True):
         flux += 2.0 * np.sin(2 * np.pi * fine / period + phase)
@@ -151,21 +151,21 @@ def wall(
 
 
 def _faces(k: float, capacity: float) -> Linear:
-    """Return the temperature of the inner face by the flux into it and the other face."""
+    """Return the system from flux and outer temperature to the temperature of the inner face."""
     cells = 200
     width = WALL / cells
     between = np.full(cells, k / width)
     loss, B = np.zeros(cells), np.zeros((cells, 2))
     loss[-1], B[0, 0], B[-1, 1] = 2.0 * between[-1], 1.0, 2.0 * between[-1]
-    # The inner face is half a volume away from the first middle.
+    # The inner face is half a volume away from the first cell centre.
     C, D = np.eye(1, cells), np.array([[0.5 * width / k, 0.0]])
     return diffusion(between[:-1], np.full(cells, capacity * width), loss, B, C, D)
 
 
 def wall_noise(truths: Factors, readings: int) -> Array:
-    """Return what the noise of flux and outer face adds to the covariance of the inner face.
+    """Return the covariance of the inner face due to noise of the flux and the outer temperature.
 
-    The inputs are lines between their readings: one of them is a triangle of two intervals.
+    Inputs are interpolated linearly, so that each reading acts as a triangle over two intervals.
     """
     times = WALL_STEP * np.arange(readings + 1.0)
     fine = fine_times(times) / WALL_STEP
@@ -179,7 +179,7 @@ def wall_noise(truths: Factors, readings: int) -> Array:
 
 
 def borehole(seed: int) -> tuple[list[str], Array, dict[str, float]]:
-    """Return the table of a thermal response test, and its truths."""
+    """Return header, table and truths of a thermal response test."""
     problem, rng = Borehole(), np.random.default_rng([seed, 2])
     theta, shown = problem.draw(rng)
     shown = shown + problem.noise * rng.standard_normal(shown.shape)
@@ -191,7 +191,7 @@ def borehole(seed: int) -> tuple[list[str], Array, dict[str, float]]:
 
 
 def held(system: Linear, times: Array, g: Array) -> Array:
-    """Return z at times of a system with diagonal A, whose inputs hold from each time to the next.
+    """Return the outputs of a system with diagonal A and piecewise constant inputs.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def held(system: Linear, times: Array, g: Array) -> Array:
 
 
 def aquifer(T: float, S: float, times: Array, rate: Array) -> Array:
-    """Return the drawdown in the observation wells, shape (times, wells); rates hold, in m^3/s."""
+    """Return the drawdown in the observation wells, (times, wells), for stepwise rates in m^3/s."""
     cells = 400
     faces = np.linspace(np.log(WELL), np.log(FAR), cells + 1)
     middles, width = 0.5 * (faces[1:] + faces[:-1]), faces[1] - faces[0]
@@ -223,7 +223,7 @@ def aquifer(T: float, S: float, times: Array, rate: Array) -> Array:
 
 
 def pumping(seed: int, *, by: Factors = AS_DRAWN) -> tuple[list[str], Array, dict[str, float]]:
-    """Return the table of a pumping test with three rates and a recovery, and its truths."""
+    """Return header, table and truths of a pumping test with three rates and a recovery."""
     rng = np.random.default_rng([seed, 5])
     T, S = 4e-3 * np.exp(0.4 * rng.standard_normal()), 3e-4 * np.exp(0.4 * rng.standard_normal())
     T, S = T * by.get("k", 1.0), S * by.get("Ss", 1.0)
@@ -237,7 +237,7 @@ def pumping(seed: int, *, by: Factors = AS_DRAWN) -> tuple[list[str], Array, dic
 
 
 def breakthrough(v: float, D: float, hours: Array) -> Array:
-    """Return the concentration at the probe after a step at the inlet, of Ogata and Banks."""
+    """Return the concentration at the probe after a step at the inlet (Ogata and Banks)."""
     t = np.where(hours > 0.0, hours, np.nan)
     a, b = ((OUTLET + sign * v * t) / (2.0 * np.sqrt(D * t)) for sign in (-1.0, 1.0))
     # exp(v x/D) erfc(b) without the overflow of the first factor: v x/D - b^2 = -a^2.
@@ -246,12 +246,12 @@ def breakthrough(v: float, D: float, hours: Array) -> Array:
 
 
 def column(seed: int, *, by: Factors = AS_DRAWN) -> tuple[list[str], Array, dict[str, float]]:
-    """Return the table of a tracer pulse through a column, and its truths."""
+    """Return header, table and truths of a tracer pulse through a column."""
     rng = np.random.default_rng([seed, 6])
     v, D = 27.0 * np.exp(0.2 * rng.standard_normal()), 16.0 * np.exp(0.4 * rng.standard_normal())
     v, D = v * by.get("v", 1.0), D * by.get("D", 1.0)
     minutes = np.arange(0.0, 181.0, 4.0)
-    stop = 4.0 * rng.integers(15, 26)  # where the pulse ends
+    stop = 4.0 * rng.integers(15, 26)  # end of the pulse
     c = breakthrough(v, D, minutes / 60.0) - breakthrough(v, D, (minutes - stop) / 60.0)
     c += CONCENTRATION * rng.standard_normal(len(c))
     table = np.column_stack([minutes, np.where(minutes < stop, 1.0, 0.0), c])
@@ -259,9 +259,9 @@ def column(seed: int, *, by: Factors = AS_DRAWN) -> tuple[list[str], Array, dict
 
 
 def heater(seed: int, *, by: Factors = AS_DRAWN) -> tuple[list[str], Array, dict[str, float]]:
-    """Return the table of a wall whose heater a controller switches, and its truths.
+    """Return header, table and truths of a wall with a heater that a controller switches.
 
-    The heater has a value at its changes only, between the readings of the thermometers.
+    The table lists the heater only at its changes, between readings of the thermometers.
     """
     rng = np.random.default_rng([seed, 7])
     k, h = 0.8 * np.exp(0.3 * rng.standard_normal()), 10.0 * np.exp(0.3 * rng.standard_normal())
@@ -294,15 +294,15 @@ def heater(seed: int, *, by: Factors = AS_DRAWN) -> tuple[list[str], Array, dict
 
 
 def moved(K: float, D: float, flow: Any, supply: Any, until: float) -> tuple[Array, Array]:
-    """Return times, and the temperatures at the sensors, of water that moves by whole cells.
+    """Return times, and temperatures at the sensors, of water that moves by one cell per step.
 
-    A step lasts until the water has moved by one cell, so that advection is exact. Dispersion is
-    that of Crank and Nicolson between two halves of the loss, which is exact.
+    Advection is thereby exact. Dispersion uses the Crank-Nicolson scheme between two half steps of
+    the heat loss, which is exact.
 
     Parameters
     ----------
     flow, supply
-        Functions of the time: m^3/h and degC.
+        Functions of time: m^3/h and degC.
     """
     cells = round((PIPE + 50.0) / PIPE_CELL)  # the outlet is beyond the last sensor
     x = PIPE_CELL * (np.arange(cells) + 0.5)
@@ -334,7 +334,7 @@ def moved(K: float, D: float, flow: Any, supply: Any, until: float) -> tuple[Arr
 def pipe(
     seed: int, minutes: int = 300, *, by: Factors = AS_DRAWN
 ) -> tuple[list[str], Array, dict[str, float]]:
-    """Return the table of a pipe whose supply changes between set points, and its truths."""
+    """Return header, table and truths of a pipe whose supply changes between set points."""
     rng = np.random.default_rng([seed, 8])
     K, D = 1.0 * np.exp(0.3 * rng.standard_normal()), 0.1 * np.exp(0.4 * rng.standard_normal())
     K, D = K * by.get("K", 1.0), D * by.get("D", 1.0)
@@ -363,7 +363,7 @@ def pipe(
 
 
 def diffusivity(seed: int) -> Any:
-    """Return the diffusivity of the plate as a function of x and y: a drawn sum of cosines."""
+    """Return the diffusivity alpha(x, y) of the plate, the exponential of random cosines."""
     rng = np.random.default_rng([seed, 3])
     j, k = np.meshgrid(np.arange(5), np.arange(5), indexing="ij")
     decay = 1.0 / (1.0 + (np.pi * LENGTH) ** 2 * (j**2 + k**2))
@@ -383,7 +383,7 @@ def diffusivity(seed: int) -> Any:
 
 
 def plate(seed: int) -> tuple[list[str], Array, Array]:
-    """Return the table of the plate, and the places of its sensors."""
+    """Return header and table of the plate, and the positions of its sensors."""
     rng, alpha = np.random.default_rng([seed, 4]), diffusivity(seed)
     width = 1.0 / SIDE
     line = width * (np.arange(SIDE) + 0.5)
@@ -429,19 +429,19 @@ def plate(seed: int) -> tuple[list[str], Array, Array]:
 
 
 def _places() -> Array:
-    """Return where the sensors of the plate are: middles of cells of the truth, the same always."""
+    """Return the positions of the plate's sensors, cell centres that do not depend on the seed."""
     rng = np.random.default_rng(7)
-    found: list[Array] = []
-    while len(found) < SENSORS:
+    places: list[Array] = []
+    while len(places) < SENSORS:
         at = (np.floor(SIDE * rng.uniform(0.05, 0.95, 2)) + 0.5) / SIDE
-        if min(at) < 0.45 and all(np.linalg.norm(at - other) > 0.08 for other in found):
-            found.append(at)
-    return np.array(found)
+        if min(at) < 0.45 and all(np.linalg.norm(at - other) > 0.08 for other in places):
+            places.append(at)
+    return np.array(places)
 
 
-# Those whose unknowns are numbers, so that a batch fit is known.
+# Walks with constant unknowns, for which `batch_fit` is available.
 BATCH = {"pumping": pumping, "column": column, "heater": heater, "wall": wall, "pipe": pipe}
-# Those whose inputs have noise to speak of -> what that adds to the covariance of the readings.
+# Walks with significant noise of inputs -> covariance that it adds to the readings.
 NOISY = {"wall": wall_noise}
 TABLES = {
     "furnace": furnace,
@@ -459,7 +459,7 @@ def _cell(value: float) -> str:
 
 
 def write(folder: Path, walk: str, seed: int = WRITTEN) -> dict[str, float]:
-    """Write the tables of a walk into a folder, and return the truths of its numbers."""
+    """Write the tables of a walk into a folder, and return its true constants."""
     truths: dict[str, float] = {}
     if walk == "plate":
         header, table, places = plate(seed)
@@ -472,23 +472,23 @@ def write(folder: Path, walk: str, seed: int = WRITTEN) -> dict[str, float]:
 
 
 def save(path: Path, header: Sequence[str], table: Array) -> None:
-    """Write a table as CSV."""
+    """Write a table as CSV; NaN becomes an empty cell."""
     rows = [",".join(map(_cell, row)) for row in table.tolist()]
     path.write_text("\n".join([",".join(header), *rows]) + "\n")
 
 
 def first_hour(walks: tuple[str, ...] = WALKS, *, seeds: int, progress: bool = False) -> Outcome:
-    """Run the walks with several truths.
+    """Run each walk with several truths.
 
     Parameters
     ----------
     seeds
-        Truths of each walk.
+        Number of truths of each walk.
     """
     todo = [(walk, seed) for walk in walks for seed in range(seeds)]
     scores: dict[tuple[str, str], list[float]] = {}
-    for (walk, _), found in each(_scores, todo, "truths", progress=progress):
-        for name, score in found.items():
+    for (walk, _), scored in each(_scores, todo, "truths", progress=progress):
+        for name, score in scored.items():
             scores.setdefault((walk, name), []).append(score)
     rows, widths, checks = [], [], []
     for (walk, name), values in scores.items():
@@ -508,15 +508,15 @@ def first_hour(walks: tuple[str, ...] = WALKS, *, seeds: int, progress: bool = F
             continue
         holds = [value >= (SHARE if name == "alpha" else 1.0) for value in values]
         rows.append((walk, name, len(values), sum(holds), float(np.mean(values))))
-        # One of few may lie outside: a 95 % interval misses one of two in a tenth of all cases. A
-        # single one may not.
+        # One truth of several may lie outside, since 95 % intervals miss one of two truths with
+        # probability 0.1. A single truth must lie inside.
         least = min(HELD, (len(holds) - 1) / len(holds)) if len(holds) > 1 else 1.0
         title = f"{walk}, {name}: share of intervals"
         checks.append(Check(title, float(np.mean(holds)), least, ">="))
     columns = ("walk", "unknown", "truths", "in the interval", "mean share")
     note = (
-        "95 % intervals at the end of the run. Of the field alpha, the interval of a truth holds "
-        f"where it does at {SHARE:.0%} of the vertices or more."
+        "95 % intervals at the end of the run. The field alpha counts as inside if its intervals "
+        f"contain the truth at {SHARE:.0%} of the vertices or more."
     )
     tables = [Table("Truths in their 95 % interval", columns, rows)]
     if widths:
@@ -526,7 +526,7 @@ def first_hour(walks: tuple[str, ...] = WALKS, *, seeds: int, progress: bool = F
 
 
 def _scores(walk: str, seed: int) -> dict[str, float]:
-    """Return whether the truth of each unknown is in its interval, and whether a run is trusted."""
+    """Run a walk, and return its scores: coverage, widths of intervals, and trust."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / FOLDER.relative_to(ROOT)
         shutil.copytree(FOLDER, folder)
@@ -538,7 +538,7 @@ def _scores(walk: str, seed: int) -> dict[str, float]:
         result = prepared.identifier.run(prepared.stream)
         last = result.last
         if last is None:
-            raise RuntimeError(f"{walk}: there is no sample")
+            raise RuntimeError(f"{walk}: the run has no samples")
         held = {name: float(_holds(last[name], truth)) for name, truth in truths.items()}
         widths = _widths(walk, seed, case, prepared, last) if walk in BATCH else {}
         return {**held, **widths, TRUSTED: float(result.verdict.level == "trusted")}
@@ -547,17 +547,17 @@ def _scores(walk: str, seed: int) -> dict[str, float]:
 def batch_fit(
     walk: str, seed: int, problem: Problem, columns: Factors, *, noisy: bool = False
 ) -> dict[str, float]:
-    """Return the relative standard deviation of each unknown by a batch fit.
+    """Return the relative standard deviation of each unknown in a linearised batch fit.
 
-    The readings of the truth are linear in the logarithms of the unknowns, by central differences:
-    the noise is the same on both sides, and cancels.
+    Readings are linearised in the logarithms of the unknowns by central differences. Both sides
+    have the same noise, which cancels.
 
     Parameters
     ----------
     columns
         Column of each sensor -> its noise.
     noisy
-        The inputs have the noise of their readings, which no fit can remove; else they are exact.
+        True: account for the noise of the inputs. False: the inputs are exact.
     """
     table, latent = BATCH[walk], problem.model.latent
     header, _, truths = table(seed)
@@ -568,11 +568,11 @@ def batch_fit(
         change = (ends[0] - ends[1]) / (2.0 * NUDGE) / np.array([*columns.values()])
         rows.append(change[np.isfinite(change)])
     J = np.array(rows)
-    if noisy and walk in NOISY:  # of one sensor
+    if noisy and walk in NOISY:  # walks with a single sensor
         (std,) = columns.values()
         covariance = np.eye(len(J.T)) + NOISY[walk](truths, len(J.T)) / std**2
         J = np.linalg.solve(np.linalg.cholesky(covariance), J.T).T
-    # All unknowns have a normal prior of their logarithm.
+    # The logarithms of all unknowns have normal priors.
     prior = [latent.deviations[latent.parts[name].part.start] for name in truths]
     variance = np.diag(np.linalg.inv(J @ J.T + np.diag(1.0 / np.square(prior))))
     return dict(zip(truths, np.sqrt(variance).tolist(), strict=True))
@@ -581,11 +581,11 @@ def batch_fit(
 def _widths(
     walk: str, seed: int, case: Case, prepared: Prepared, last: Estimate
 ) -> dict[str, float]:
-    """Return the width of each interval over that of the batch fits."""
+    """Return the width of each interval relative to batch fits with noisy and exact inputs."""
     problem, channels = prepared.identifier.problem, case.spec.channels
     names, noise = problem.observed.names, problem.observed.noise
     if noise is None:
-        raise RuntimeError(f"{walk}: the noise is not stated")
+        raise RuntimeError(f"{walk}: the case does not specify the noise")
     each = zip(names, noise.tolist(), strict=True)
     columns = {str(channels[sensor].column): std for sensor, std in each}
     found = {}

@@ -1,4 +1,4 @@
-"""A fleet of rods against as many separate identifiers: a step, and the command with its runs."""
+"""Costs of a fleet of rods relative to separate identifiers, per step and for the command."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ NODES = 100
 SENSORS = (0.2, 0.4, 0.6, 0.8)
 NOISE = 0.01
 STEP = 0.05
-TRUTHS = 20  # rods of other coefficients; each member has noise of its own
-BEGIN = 20  # samples before the first pair: what is computed once is computed
+TRUTHS = 20  # rods with different coefficients; each member has its own noise
+BEGIN = 20  # untimed samples before the first pair, which include one-time computations
 LENGTH = 5  # steps of a pair
 REPETITIONS = 7
-FASTER = 10.0  # times, at least: the promise
-EQUAL = 1e-8  # relative to the largest estimate: rounding
-SAMPLES = 1000  # of a run
+FASTER = 10.0  # smallest speed-up of a step
+EQUAL = 1e-8  # largest relative difference of estimates, due to rounding
+SAMPLES = 1000  # samples of a run
 RUN = f"rod of {NODES} nodes, {SAMPLES} samples"
-COMMAND_FASTER = 4.0  # times, at least: what is written weighs as much as what is computed
+COMMAND_FASTER = 4.0  # smallest speed-up of the command: output costs as much as computation
 CASE = """\
 title = "A rod"
 equation = "heat"
@@ -76,29 +76,29 @@ Part: TypeAlias = tuple[Table, list[Check]]
 
 
 def fleet(members: int = 1000, runs: int = 25) -> Outcome:
-    """Time a fleet of rods of 100 nodes, whose diffusivity and loss are unknown, heated at one end.
+    """Time a fleet of heated rods of 100 nodes with unknown diffusivity and loss.
 
     Parameters
     ----------
     members
-        Rods whose step as blocks is held against one of as many separate objects.
+        Rods whose joint step is compared with steps of separate identifiers.
     runs
-        Rods that `livepde fleet` makes run directories of, together and separately; 0 for none.
+        Rods for which `livepde fleet` writes run directories, jointly and separately; 0 for none.
     """
     parts = [_steps(members), *([_commands(runs)] if runs else [])]
     return Outcome(
         tables=[table for table, _ in parts],
         checks=[check for _, checks in parts for check in checks],
         notes=[
-            "Steps: ratios of times taken in one process, one thread, one right after the other. "
-            "Commands: of processor times of `livepde fleet` with --jobs 1, from its start to its "
-            "end, run directories included."
+            "Steps: ratios of times measured in turns in one process with one thread. Commands: "
+            "ratios of total processor times of `livepde fleet` with --jobs 1, including run "
+            "directories."
         ],
     )
 
 
 def _steps(members: int) -> Part:
-    """Time a step of a fleet against one of as many separate objects with the same data."""
+    """Time a step of a fleet relative to a step of separate identifiers with the same data."""
     model, sensors, law = _rod(), Points(SENSORS, noise=NOISE), SensitivityLaw()
     together = Fleet(model, sensors, law, members, u0=0.0)
     separate = [Identifier(model, sensors, law, u0=0.0) for _ in range(members)]
@@ -112,9 +112,9 @@ def _steps(members: int) -> Part:
         middle = perf_counter()
         for t, z, heated in piece:
             inputs = _inputs(heated)
-            found = [one.step(t, row, inputs) for one, row in zip(separate, z, strict=True)]
+            singles = [one.step(t, row, inputs) for one, row in zip(separate, z, strict=True)]
         stop = perf_counter()
-        q = np.array([one.q for one in found])
+        q = np.array([single.q for single in singles])
         apart = max(apart, float(np.abs(estimate.q / q - 1.0).max()))
         if k:
             ratios.append((stop - middle) / (middle - start))
@@ -129,19 +129,19 @@ def _steps(members: int) -> Part:
 
 
 def _commands(members: int) -> Part:
-    """Time `livepde fleet` with members together against separately."""
+    """Time `livepde fleet` relative to `livepde fleet --separately`."""
     import pandas as pd
 
     with tempfile.TemporaryDirectory() as folder:
         home = Path(folder)
         _write_case(home, members)
-        seconds, found = [], []
+        seconds, tables = [], []
         for options in ((), ("--separately",)):
             out = home / f"rods{len(options)}"
-            seconds.append(_taken(home, "--out", str(out), *options))
-            found.append(pd.read_csv(out / "fleet.csv").set_index("name"))
-        unknowns = found[1][["alpha", "loss"]]
-        apart = float((found[0][["alpha", "loss"]] / unknowns - 1.0).abs().to_numpy().max())
+            seconds.append(_spent(home, "--out", str(out), *options))
+            tables.append(pd.read_csv(out / "fleet.csv").set_index("name"))
+        unknowns = tables[1][["alpha", "loss"]]
+        apart = float((tables[0][["alpha", "loss"]] / unknowns - 1.0).abs().to_numpy().max())
     ratio = seconds[1] / seconds[0]
     title = f"`livepde fleet --separately` over `livepde fleet`, {members} rods"
     table = Table(title, ("processor time of the command", "ratio"), [(RUN, ratio)])
@@ -152,7 +152,7 @@ def _commands(members: int) -> Part:
 
 
 def _write_case(home: Path, members: int) -> None:
-    """Write a case, a file of data for each rod, and the table of them."""
+    """Write a case, a data file for each rod, and the table of members."""
     model = _rod()
     names = [f"T_{100 * x:.0f}" for x in SENSORS]
     sensors = "\n".join(
@@ -170,8 +170,8 @@ def _write_case(home: Path, members: int) -> None:
     (home / "rods.csv").write_text("\n".join(["name,data", *table]) + "\n")
 
 
-def _taken(home: Path, *options: str) -> float:
-    """Return the processor time of a command `livepde fleet`."""
+def _spent(home: Path, *options: str) -> float:
+    """Run `livepde fleet`, and return its processor time in s."""
     command = [sys.executable, "-m", "livepde", "fleet", "case.toml", "--members", "rods.csv"]
     before = os.times()
     subprocess.run([*command, *options], cwd=home, check=True, stdout=subprocess.DEVNULL)
@@ -192,7 +192,7 @@ def _inputs(heated: float) -> dict[str, float]:
 
 
 def _samples(model: Model, members: int, count: int) -> list[tuple[float, Array, float]]:
-    """Return time, measurements of all members, and the temperature of the heated end."""
+    """Return, for each sample, time, measurements of all members, and the heated end."""
     rng = np.random.default_rng(0)
     times = [STEP * k for k in range(count + 1)]
 

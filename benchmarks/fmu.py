@@ -1,6 +1,6 @@
-"""Run a co-simulation unit as another program does, beside the identifier it was made of.
+"""Compare a co-simulation unit (FMU), run by FMPy, with the identifier it was created from.
 
-Both take the samples of a case, and all outputs are compared after each of them.
+Both process the samples of a case, and all outputs are compared after each sample.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from livepde.records import STATUS_CODES
 from livepde.runs import Outcome
 from livepde.samples import Sample
 
-CLOSE = 1e-10  # relative difference of any output, between the unit and the identifier
+CLOSE = 1e-10  # largest relative difference of an output between unit and identifier
 
 
 def fmu(
@@ -46,15 +46,15 @@ def fmu(
     Parameters
     ----------
     case
-        Default the one that `livepde init` writes.
+        Default: the case that `livepde init` writes.
     unit
-        Of the case; default one that is written for the purpose.
+        Unit of the case; by default a new unit is written.
     fmi
-        Version of the standard of a unit that is written.
+        Version of the standard for a new unit.
     samples
-        How many of the case are taken; default all.
+        Number of samples; default all samples of the case.
     progress
-        Show how far each of both is, if standard error is a terminal.
+        Show the progress of both runs, if standard error is a terminal.
     """
     with TemporaryDirectory() as folder:
         if case is None:
@@ -71,15 +71,15 @@ def fmu(
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """How far a unit is from the identifier it was made of.
+    """Differences between a unit and the identifier it was created from.
 
     Attributes
     ----------
     samples
-        How many both took.
+        Number of samples that both processed.
     differences
-        Output -> largest difference over all samples, relative to the largest value; NaN if only
-        one of both is NaN somewhere.
+        Output -> largest difference over all samples, relative to the largest value; NaN if a value
+        is NaN in only one of the two.
     """
 
     samples: int
@@ -87,51 +87,51 @@ class Comparison:
 
     @property
     def largest(self) -> float:
-        """The largest of all, NaN if one is."""
+        """Largest difference of all outputs; NaN if a difference is NaN."""
         return float(np.max(list(self.differences.values())))
 
 
 def compare_fmu(
     unit: str | Path, case: Case, *, samples: int | None = None, progress: bool = False
 ) -> Comparison:
-    """Give samples of a case to its unit, by FMPy, and to an identifier: two runs of the case.
+    """Run a case in its unit and in an identifier, and compare their outputs.
 
     Parameters
     ----------
     samples
-        How many; default all.
+        Number of samples; default all.
     progress
-        Show how far each of both is, if standard error is a terminal.
+        Show the progress of both runs, if standard error is a terminal.
 
     Raises
     ------
     ConfigurationError
-        FMPy is missing, or the case has no data of its own.
+        FMPy is missing, or the case reads a live source.
     RunError
         The unit does not run.
     """
     if case.live:
         raise ConfigurationError(
-            f"{case.path}: the unit is compared on the data of the case, and its source goes "
-            "on: set another data.file."
+            f"{case.path}: the comparison requires data that end, and the case reads a live "
+            "source. Set another data.file."
         )
     prepared = case.prepare()
     process = of_case(case, prepared.origin)
     given = list(islice(prepared.stream, samples))
     names = [*(item.name for item in process.outputs()), "status"]
 
-    def taken(rows: Iterator[list[float]], what: str) -> Array:
+    def collect(rows: Iterator[list[float]], what: str) -> Array:
         return np.array(list(watched(rows, len(given), what) if progress else rows))
 
-    expected = taken(_stepped(prepared.identifier, process, given), "in Python")
-    found = taken(_driven(unit, process, given), "in the unit")
-    return Comparison(len(given), dict(zip(names, _apart(expected, found), strict=True)))
+    expected = collect(_stepped(prepared.identifier, process, given), "in Python")
+    actual = collect(_driven(unit, process, given), "in the unit")
+    return Comparison(len(given), dict(zip(names, _apart(expected, actual), strict=True)))
 
 
-def _apart(expected: Array, found: Array) -> list[float]:
-    """Return by how much columns differ, relative to their largest value."""
-    both = np.isnan(expected) & np.isnan(found)
-    apart = np.where(both, 0.0, np.abs(found - expected)).max(axis=0)
+def _apart(expected: Array, actual: Array) -> list[float]:
+    """Return the largest difference of each column, relative to its largest value."""
+    both = np.isnan(expected) & np.isnan(actual)
+    apart = np.where(both, 0.0, np.abs(actual - expected)).max(axis=0)
     size = np.where(np.isnan(expected), 0.0, np.abs(expected)).max(axis=0)
     relative: list[float] = (apart / np.where(size > 0.0, size, 1.0)).tolist()
     return relative
@@ -140,14 +140,14 @@ def _apart(expected: Array, found: Array) -> list[float]:
 def _stepped(
     identifier: Identifier, process: UnitProcess, samples: list[Sample]
 ) -> Iterator[list[float]]:
-    """Yield what the outputs have to be after each sample."""
+    """Yield the expected outputs, those of the identifier, after each sample."""
     for sample in samples:
         estimate = identifier.step(sample.t, sample.z)
         yield [*process.shown(identifier, estimate), STATUS_CODES.index(estimate.status.code)]
 
 
 def _driven(unit: str | Path, process: UnitProcess, samples: list[Sample]) -> Iterator[list[float]]:
-    """Yield the outputs after each sample."""
+    """Run the unit, and yield its outputs after each sample."""
     inputs = [port.name for port in process.inputs]
     outputs = [*(item.name for item in process.outputs()), "status"]
     times = [sample.t / process.second for sample in samples]
@@ -162,14 +162,14 @@ def _driven(unit: str | Path, process: UnitProcess, samples: list[Sample]) -> It
 
 
 class Instance:
-    """A unit that FMPy runs, its variables by name.
+    """Running unit whose variables are accessed by name.
 
     Attributes
     ----------
     fmu, description
-        As FMPy has them.
+        FMPy's objects for the unit and for its model description.
     messages
-        What the unit has logged.
+        Messages that the unit logged.
     """
 
     def __init__(self, fmu: Any, description: Any, messages: list[str]) -> None:
@@ -180,26 +180,26 @@ class Instance:
         self._set = fmu.setReal if description.fmiVersion == "2.0" else fmu.setFloat64
 
     def set(self, names: Sequence[str], values: Sequence[float]) -> None:
-        """Set inputs."""
+        """Set input variables."""
         self._set([self._variables[name].valueReference for name in names], list(values))
 
     def get(self, names: Sequence[str]) -> list[float]:
-        """Return outputs."""
-        found = []
+        """Return the values of output variables."""
+        values = []
         for name in names:
             variable = self._variables[name]
             read = getattr(self.fmu, f"get{variable.type}")
-            found.append(float(read([variable.valueReference])[0]))
-        return found
+            values.append(float(read([variable.valueReference])[0]))
+        return values
 
     def step(self, t: float, size: float) -> None:
-        """Take a step."""
+        """Take a communication step."""
         self.fmu.doStep(currentCommunicationPoint=t, communicationStepSize=size)
 
 
 @contextmanager
 def running(unit: str | Path, start: float) -> Iterator[Instance]:
-    """Run a unit from a time on; needs FMPy.
+    """Provide a running unit that starts at a time. Requires FMPy.
 
     Raises
     ------
@@ -212,18 +212,18 @@ def running(unit: str | Path, start: float) -> Iterator[Instance]:
         import fmpy
         from fmpy.fmi1 import FMICallException
     except ImportError:
-        raise ConfigurationError("Running a unit needs FMPy: pip install fmpy.") from None
+        raise ConfigurationError("Running a unit requires FMPy: pip install fmpy.") from None
     messages: list[str] = []
 
-    def heard(*told: Any) -> None:
-        messages.append(told[-1].decode())
+    def log(*entry: Any) -> None:
+        messages.append(entry[-1].decode())
 
     folder = fmpy.extract(str(unit))
     try:
         try:
             description = fmpy.read_model_description(folder)
             fmu = fmpy.instantiate_fmu(
-                folder, description, "CoSimulation", debug_logging=True, logger=heard
+                folder, description, "CoSimulation", debug_logging=True, logger=log
             )
         except Exception as error:
             raise RunError(f"{unit} does not run: {' '.join([*messages, str(error)])}.") from error

@@ -1,4 +1,4 @@
-"""Loop of a benchmark over its twins: jobs, their results, and a progress bar."""
+"""Loop of a benchmark over its jobs, in one or several processes, with a progress bar."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def each(
     Parameters
     ----------
     run
-        Function that is called with the items of a job; with several workers one of a module.
+        Function that is called with the items of a job; for several workers, it must be picklable.
     jobs
         Arguments of the calls.
     what
-        Description of the jobs beside the bar.
+        Label of the bar.
     workers
-        Processes. With several of them results come as they are ready, else in order.
+        Number of processes. With several, results are yielded as they complete, else in order.
     progress
         Show a bar on standard error.
     """
@@ -48,7 +48,7 @@ def _here(run: Callable[..., T], jobs: Sequence[Job]) -> Iterator[tuple[Job, T]]
 def _in_processes(
     run: Callable[..., T], jobs: Sequence[Job], workers: int
 ) -> Iterator[tuple[Job, T]]:
-    # A fresh interpreter for each worker: nothing of this one, such as its threads, is copied.
+    # Workers start with a new interpreter, so that they inherit no threads from this process.
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         waiting = {pool.submit(run, *job): job for job in jobs}
         for future in as_completed(waiting):

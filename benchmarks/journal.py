@@ -1,7 +1,7 @@
-"""What the journal costs: its share of a step of the soil case, with fields and checkpoints.
+"""Cost of the journal relative to a step of the soil case, with fields and checkpoints.
 
-Step and journal are timed within one run, sample by sample, so that a slow moment of the machine
-hits both.
+Step and journal are timed within one run, sample by sample, so that other load on the machine
+affects both.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from livepde.runs.live_loop import Live
 
 CASE = "soil_uniform"
 REPETITIONS = 5
-BOUND = 0.2  # of a step
+BOUND = 0.2  # largest time of the journal over the time of a step
 WRITES = ("accept", "append", "keep", "checkpoint", "note", "count", "commit")
 
 
 class Stopwatch:
-    """Adds up what the calls of methods cost, in seconds of the clock and of the processor."""
+    """Accumulates wall-clock and processor time of method calls, in s."""
 
     def __init__(self) -> None:
         self.wall, self.cpu, self.calls = 0.0, 0.0, 0
 
     def watch(self, thing: Any, *names: str) -> None:
-        """Time these methods of an object from now on."""
+        """Time all future calls of these methods of an object."""
         for name in names:
             setattr(thing, name, self._timed(getattr(thing, name)))
 
@@ -57,14 +57,14 @@ def journal(folder: Path | None = None, *, repetitions: int | None = None) -> Ou
     Parameters
     ----------
     folder
-        Where the cases are.
+        Folder of the cases.
     repetitions
         Runs of the case; default `REPETITIONS`.
     """
     count = repetitions or REPETITIONS
     path = next((path for path in find_cases(folder) if path.stem == CASE), None)
     if path is None:
-        raise ConfigurationError(f"benchmark journal: the case {CASE}.toml is not here.")
+        raise ConfigurationError(f"benchmark journal: there is no case {CASE}.toml.")
     runs = [_run(path) for _ in range(count)]
     ratios = [written.wall / stepped.wall for written, stepped, _, _ in runs]
     chosen = int(np.argsort(ratios)[len(ratios) // 2])
@@ -88,7 +88,7 @@ def journal(folder: Path | None = None, *, repetitions: int | None = None) -> Ou
 
 
 def _run(case: Path) -> tuple[Stopwatch, Stopwatch, int, int]:
-    """Return what was spent on the journal and on steps, the samples, and bytes on disk."""
+    """Return stopwatches of journal and steps, the number of samples, and the size in bytes."""
     loaded = load(case)
     prepared = loaded.prepare()
     identifier = prepared.identifier

@@ -1,8 +1,8 @@
-"""Models of a rod of layers and a plate of quarters whose conductivities are unknown.
+"""Models of a layered rod and of a plate with four quarters, with unknown conductivities.
 
-The ends are held at constant temperatures beside a constant source, or they follow input channels,
-as in README's rod. `benchmarks.earlier` builds these models with the sources of an earlier version:
-only names that it has, too, can be imported here.
+The ends have constant temperatures, with a constant source, or follow input channels, such as the
+rod of the README. `benchmarks.earlier` builds these models with the sources of an earlier version.
+Therefore this module imports only names that exist in both versions.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from livepde.model import Model
 
 ENDS = ("source", "channels")
 POINTS = (0.2, 0.4, 0.6, 0.8)
-STEP = 2.0**-8  # a binary number: the differences of all times are exactly this
+STEP = 2.0**-8  # time step; a power of two, so that differences of times are exact
 PRIOR, STD = 1.0, 0.2
 
 
 def rod(nodes: int, unknowns: int, ends: str) -> Model:
-    """Return u_t = (k u_x)_x + f on (0, 1) with an unknown k in each of so many layers.
+    """Return the model u_t = (k u_x)_x + f on (0, 1) with an unknown k in each layer.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def rod(nodes: int, unknowns: int, ends: str) -> Model:
 
 
 def plate(nodes: int) -> Model:
-    """Return the same on a square of about so many nodes, with four unknown quarters."""
+    """Return u_t = div(k grad u) + 10 on a square with u = 0 around it and k unknown by quarter."""
     cells = round(np.sqrt(nodes)) - 1
     mesh = rectangle((0.0, 1.0), (0.0, 1.0), (cells, cells))
     quarters = {f"k_{i}{j}": partial(_quarter, i, j) for i in range(2) for j in range(2)}
@@ -61,7 +61,7 @@ def plate(nodes: int) -> Model:
 
 
 def ends_at(ends: str, t: float) -> dict[str, float]:
-    """Return the input channels of a rod at a time."""
+    """Return the values of a rod's input channels at a time."""
     if ends == "source":
         return {}
     return {"T_left": float(np.sin(3.0 * t)), "T_right": float(np.sin(5.0 * t))}

@@ -1,10 +1,10 @@
-"""A reduced-order filter in thirty lines of NumPy and LAPACK: the reference for costs.
+"""Lean reduced-order filter in NumPy and LAPACK, the reference for costs.
 
-It is written as a user would write it for one problem, and shares no code with `livepde.laws`:
-matrices assembled once for one time step, in the order of a band; a leading axis of members, whose
-bands stand one behind the other, so that one factorisation serves all of them. No safeguards, no
-missing samples, no bounds, no substeps. For unknowns in which the process is linear it gives the
-numbers of `SensitivityLaw(guards=None, refit=None, shadows=None)` with implicit Euler.
+It is written as a user would write it for one problem, and shares no code with `livepde.laws`.
+Matrices are assembled once for one time step, in an order with small bandwidth. Members are a
+leading axis; their bands are concatenated, so that one factorisation serves all of them. There are
+no safeguards, missing samples, bounds or substeps. If the process is linear in its unknowns, the
+results equal `SensitivityLaw(guards=None, refit=None, shadows=None)` with implicit Euler.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ Factor: TypeAlias = tuple[Array, IntArray]
 
 
 class NotAffineError(LinearAlgebraError):
-    """The process has no constant matrices to be assembled once."""
+    """The process has no constant matrices that can be assembled once."""
 
 
 @dataclass(frozen=True, eq=False)
 class Matrices:
-    """An implicit Euler step S(a) u+ = M u/h + f of an affine process, for many members.
+    """Matrices of the implicit Euler step S(a) u+ = M u/h + f of an affine process.
 
     Members have states of shape (p, n) and reduced parameters a of shape (p, k). Rows of Dirichlet
-    values are those of the identity in S and zero in M.
+    values are rows of the identity in S and zero in M.
 
     Attributes
     ----------
     model, order
-        The process, and its coefficients in the order of the band, shape (n,).
+        The process, and the permutation of its coefficients to the order of the band, shape (n,).
     M
-        The mass over the time step, shape (n, n).
+        Mass matrix divided by the time step, shape (n, n).
     entries
         Reduced parameters, shape (p, k) -> entries of S, shape (p, nnz).
     slope
-        Derivative of S u in a by u, shape (n k, n); None if the process is not linear in a.
+        Matrix that maps u to d(S u)/da, shape (n k, n); None if the process is not linear in a.
     width, where
-        Half of the bandwidth, and the places of the entries in LAPACK's band storage, (nnz,).
+        Half-bandwidth, and the indices of the entries in LAPACK's band storage, shape (nnz,).
     """
 
     model: Model
@@ -66,7 +66,7 @@ class Matrices:
         Raises
         ------
         NotAffineError
-            A or B is not affine in the state, or reads time or inputs there.
+            A or B is not affine in the state, or depends on time or inputs.
         """
         n = model.X.dim
         pattern, mass, base, T = _parts(model, h)
@@ -91,17 +91,17 @@ class Matrices:
 
     @property
     def place(self) -> IntArray:
-        """Where in the order of the band each coefficient stands, shape (n,)."""
+        """Index of each coefficient in the order of the band, shape (n,)."""
         return np.argsort(self.order)
 
     def forcing(self, moment: Moment) -> Array:
-        """Return f at a time, shape (n,): the source, and Dirichlet values."""
+        """Return f at a time, shape (n,), with the source and the Dirichlet values."""
         model = self.model
         f = model.F(moment) * model.X.free
         return model.impose(f, moment)[self.order]
 
     def factorise(self, a: Array) -> Factor:
-        """Factorise S(a) of all members as one band."""
+        """Factorise S(a) of all members as one band matrix."""
         b, p, n = self.width, len(a), len(self.order)
         band = np.zeros((p, n * (3 * b + 1)))
         band[:, self.where] = self.entries(a)
@@ -111,14 +111,14 @@ class Matrices:
         return lu, pivots
 
     def solve(self, factor: Factor, known: Array) -> Array:
-        """Return S^-1 applied to states, shape (p, n), or to columns, shape (p, n, c)."""
+        """Apply S^-1 to states, shape (p, n), or to columns, shape (p, n, c)."""
         lu, pivots = factor
         columns = known.reshape(lu.shape[1], -1)
         x, _ = lapack.dgbtrs(lu, self.width, self.width, columns, pivots)
         return np.asarray(x.reshape(known.shape))
 
     def mass(self, u: Array) -> Array:
-        """Return M u/h of states, shape (p, n), or of columns, shape (p, n, c)."""
+        """Apply M/h to states, shape (p, n), or to columns, shape (p, n, c)."""
         rows = u.swapaxes(0, 1)
         moved = self.M @ rows.reshape(len(rows), -1)
         return np.asarray(moved.reshape(rows.shape).swapaxes(0, 1))
@@ -131,15 +131,15 @@ class Matrices:
 
 
 def assembled(model: Model, a: Array, h: float) -> tuple[sp.csr_array, sp.csr_array]:
-    """Return M/h and S at latent coefficients, shape (dim,), in the order of the model."""
+    """Return M/h and S for latent coefficients of shape (dim,), in the order of the model."""
     pattern, mass, base, T = _parts(model, h)
     return pattern.matrix(mass), pattern.matrix(base + T @ model.latent.value(a))
 
 
 def _parts(model: Model, h: float) -> tuple[Pattern, Array, Array, sp.csr_array]:
-    """Return the pattern of S, the data of M/h and of S at q = 0, and the map from q to the rest.
+    """Return the pattern of S, entries of M/h and of S at q = 0, and the map from q to the rest.
 
-    Rows of Dirichlet values are those of the identity in S and zero elsewhere.
+    Rows of Dirichlet values are rows of the identity in S and zero elsewhere.
     """
     form, n = model.physical_A, model.X.dim
     tensor = form.tensor("v", "u")
@@ -159,12 +159,12 @@ def _parts(model: Model, h: float) -> tuple[Pattern, Array, Array, sp.csr_array]
 
 
 def _linear(base: Array, parts: Array) -> Callable[[Array], Array]:
-    """Return the entries of S that is affine in a: base, shape (nnz,), and parts, (k, nnz)."""
+    """Return a -> entries of S = base + a parts, with shapes (nnz,) and (k, nnz)."""
     return lambda a: base + a @ parts
 
 
 def _general(base: Array, T: sp.csr_array, model: Model, Phi: Array) -> Callable[[Array], Array]:
-    """Return the entries of S that is affine in q, and q a function of a."""
+    """Return a -> entries of S, which is affine in q(a)."""
     prior = model.latent.prior[:, None]
 
     def entries(a: Array) -> Array:
@@ -175,14 +175,14 @@ def _general(base: Array, T: sp.csr_array, model: Model, Phi: Array) -> Callable
 
 @dataclass(frozen=True, eq=False)
 class Filter:
-    """Estimates and the square root [U; C] of their covariance, for p members side by side.
+    """Estimates of p members, and the square roots [U; C] of their covariances.
 
     Attributes
     ----------
     x
-        The state u in the order of the band, and U beside it, shape (p, n, 1 + k).
+        Columns [u, U] in the order of the band, shape (p, n, 1 + k).
     y
-        The reduced parameter a, and C beside it, shape (p, k, 1 + k).
+        Columns [a, C] of the reduced parameter, shape (p, k, 1 + k).
     """
 
     x: Array
@@ -190,7 +190,7 @@ class Filter:
 
 
 def initial(matrices: Matrices, u0: Array, members: int, k: int) -> Filter:
-    """Return the filter at a known state u0, shape (n,), with a ~ N(0, I)."""
+    """Return the initial filter for a known state u0, shape (n,), and a ~ N(0, I)."""
     x, y = np.zeros((members, len(u0), 1 + k)), np.zeros((members, k, 1 + k))
     x[:, :, 0], y[:, :, 1:] = u0[matrices.order], np.eye(k)
     return Filter(x, y)
@@ -202,11 +202,11 @@ def step(matrices: Matrices, G: Array, state: Filter, f: Array, z: Array) -> Fil
     Parameters
     ----------
     G
-        Observation of states in the order of the band, shape (sensors, n).
+        Observation operator in the order of the band, shape (sensors, n).
     f
         `Matrices.forcing` at the time of the sample.
     z
-        Shape (p, sensors).
+        Measurements, shape (p, sensors).
     """
     y, x = state.y, matrices.mass(state.x)
     members, k, _ = y.shape
@@ -214,7 +214,7 @@ def step(matrices: Matrices, G: Array, state: Filter, f: Array, z: Array) -> Fil
     x[:, :, 0] = u = matrices.solve(lu, x[:, :, 0] + f)
     x[:, :, 1:] = matrices.solve(lu, x[:, :, 1:] - matrices.derivative(u) @ y[:, :, 1:])
     seen = G @ x
-    # [U; C] W with W W^T = (I + Y^T Y)^-1, Y = G U: by a QR factorisation, nothing is squared.
+    # [U; C] W with W W^T = (I + Y^T Y)^-1, Y = G U; QR avoids forming the product Y^T Y.
     stacked, gain = np.empty((members, k + len(G), k)), np.zeros((members, 1 + k, 1 + k))
     stacked[:, :k], stacked[:, k:] = np.eye(k), seen[:, :, 1:]
     W = np.linalg.inv(np.linalg.qr(stacked, mode="r"))

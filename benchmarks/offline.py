@@ -1,12 +1,12 @@
-"""What all data together can tell: the most probable parameter, by Gauss-Newton with hindsight.
+"""Offline fit of all data: the maximum a posteriori parameter by Gauss-Newton.
 
 Minimises, over the reduced coordinates of `SensitivityLaw` and with its prior,
 
     |a|^2 + sum over samples of |(z - G u(a))/noise|^2
 
-on the same forward model and time scheme, with exact sensitivities. The inverse of J^T J at the
-minimum is the posterior covariance. No estimator that sees the samples one by one can do better on
-average; of a parameter that wanders it is the smoother, which knows the future as well.
+with the forward model and time scheme of the law, and exact sensitivities. The inverse of J^T J at
+the minimum approximates the posterior covariance. No online estimator is more accurate on average.
+For a parameter that moves, the fit is a smoother, which also uses later data.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ from livepde.laws.reduction import Reduction
 from livepde.linalg import Array
 from livepde.stepping import Advance, ForwardStage, Interval, StepFailed, advance
 
-EVALUATIONS = 60  # at most
-LOST = 1e4  # residual, in standard deviations, where the forward model cannot be computed
+EVALUATIONS = 60  # largest number of evaluations
+LOST = 1e4  # residual, in standard deviations, if the forward model fails
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The most probable parameter.
+    """Maximum a posteriori parameter.
 
     Attributes
     ----------
     coordinates
-        The reduced coordinates, shape (size,).
+        Reduced coordinates, shape (size,).
     q, factor
-        Latent coefficients at each time, shape (times, dim), and a function of the time's number
-        that returns a square root of their covariance, shape (dim, coordinates).
+        Latent coefficients at each time, shape (times, dim), and a method that returns a square
+        root of their covariance at a time index, shape (dim, coordinates).
     predicted, hidden
-        What assimilated and validation sensors show, shapes (times, sensors), (times, validation).
+        Predictions for assimilated and validation sensors, (times, sensors), (times, validation).
     seconds, evaluations
-        Processor time, and runs of the forward model with sensitivities.
+        Processor time, and number of forward runs with sensitivities.
     converged
-        False if the iteration was cut off.
+        False if the iteration stopped at `EVALUATIONS`.
     """
 
     coordinates: Array
@@ -60,16 +60,16 @@ class Fit:
     converged: bool
 
     def factor(self, at: int) -> Array:
-        """Return a square root of the covariance of the latent coefficients at a time."""
+        """Return a square root of the covariance of latent coefficients at a time index."""
         factor: Array = self.trajectory.directions(at) @ self.root
         return factor
 
 
 class Trajectory:
-    """The forward model with sensitivities as a function of the reduced coordinates.
+    """Forward model with sensitivities as a function of the reduced coordinates.
 
-    The coordinates are those of the initial parameter, followed for an unknown that moves as a
-    random walk by its normalised increments.
+    The coordinates of the initial parameter are followed by the normalised increments of unknowns
+    that move as random walks.
     """
 
     def __init__(self, data: Data) -> None:
@@ -95,12 +95,12 @@ class Trajectory:
             process.validation.bind(*spaces) if process.validation is not None else None
         )
         self.used = np.isfinite(data.z) & (process.times >= process.assimilate_from)[:, None]
-        self.used[0] = False  # describes the start, which is known
+        self.used[0] = False  # the initial state is known
         self.evaluations = 0
         self._last: tuple[bytes, Array, Array] | None = None
 
     def directions(self, at: int) -> Array:
-        """Return da_latent/d(coordinates) at the time with this number, shape (dim, size)."""
+        """Return the derivative of latent coefficients by the coordinates, shape (dim, size)."""
         if not len(self.moving):
             return self.Phi
         D = np.zeros((len(self.Phi), self.size))
@@ -112,22 +112,22 @@ class Trajectory:
         return D
 
     def latent(self, a: Array, at: int) -> Array:
-        """Return the latent coefficients at the time with this number."""
+        """Return the latent coefficients at a time index."""
         q: Array = self.model.latent.prior + self.directions(at) @ a
         return q
 
     def inputs(self, at: int) -> Inputs:
-        """Return the input channels of the sample with this number."""
+        """Return the input channels at a time index."""
         values: Mapping[str, float] = (self.data.process.inputs or [{}] * (at + 1))[at]
         return Inputs(dict(values))
 
     def run(self, a: Array, sensitivities: bool = True) -> tuple[Array, Array, Array]:
-        """Return predictions (times, sensors), validation ones, and the Jacobian of the first.
+        """Return predictions for assimilated and validation sensors, and the former's Jacobian.
 
         Raises
         ------
         StepFailed
-            The forward model cannot be computed at a.
+            The forward model fails at a.
         """
         process, model, observed = self.data.process, self.model, self.data.observed
         times = process.times.tolist()
@@ -148,7 +148,7 @@ class Trajectory:
         y[:, 0] = model.initial(process.u0, at.end)
         for k, (t0, t1) in enumerate(pairwise(times), start=1):
             q = self.latent(a, k)
-            # Later increments of a walk do not act yet.
+            # Later increments of a random walk have no effect yet.
             live = min(width, self.Phi.shape[1] + k * len(self.moving))
             D = self.directions(k)[:, :live]
             interval = Interval(
@@ -200,7 +200,7 @@ class Trajectory:
         return self._last[1], self._last[2]
 
     def residual(self, a: Array) -> Array:
-        """Return all residuals in standard deviations, those of the prior last."""
+        """Return the residuals of data and prior, in standard deviations."""
         return self._evaluated(a)[0]
 
     def jacobian(self, a: Array) -> Array:
@@ -209,19 +209,19 @@ class Trajectory:
 
 
 def fit(data: Data, start: Array | None = None) -> Fit:
-    """Return the most probable parameter given all data.
+    """Return the maximum a posteriori parameter given all data.
 
     Parameters
     ----------
     start
-        Where the iteration starts, leading coordinates; default the prior.
+        Initial values of the leading coordinates; default the prior.
     """
     begun = process_time()
     trajectory = Trajectory(data)
     first = np.zeros(trajectory.size)
     if start is not None:
         first[: len(start)] = start
-    found = least_squares(
+    minimum = least_squares(
         trajectory.residual,
         first,
         jac=trajectory.jacobian,
@@ -229,12 +229,12 @@ def fit(data: Data, start: Array | None = None) -> Fit:
         ftol=1e-8,
         max_nfev=EVALUATIONS,
     )
-    root = np.linalg.inv(np.linalg.qr(trajectory.jacobian(found.x), mode="r"))
+    root = np.linalg.inv(np.linalg.qr(trajectory.jacobian(minimum.x), mode="r"))
     seconds = process_time() - begun
-    predicted, hidden, _ = trajectory.run(found.x, sensitivities=False)
-    q = np.array([trajectory.latent(found.x, k) for k in range(len(data))])
+    predicted, hidden, _ = trajectory.run(minimum.x, sensitivities=False)
+    q = np.array([trajectory.latent(minimum.x, k) for k in range(len(data))])
     return Fit(
-        found.x,
+        minimum.x,
         q,
         trajectory,
         root,
@@ -242,5 +242,5 @@ def fit(data: Data, start: Array | None = None) -> Fit:
         hidden,
         seconds,
         trajectory.evaluations,
-        bool(found.status > 0),
+        bool(minimum.status > 0),
     )

@@ -1,12 +1,12 @@
-"""What the command line costs: the time to its first estimates, and per sample beside a loop.
+"""Overhead of the command line: time to the first estimates, and per sample relative to a loop.
 
-The rod has 31 nodes, two unknowns, five sensors, and both ends as channels of the stream. First
-estimates come from fresh processes of `livepde run`, by the processor time from the start of the
-interpreter on; bytecode is written beforehand, as pip does for what it installs. Per sample,
-`livepde run` (reading the table row by row, journal, result, checkpoints) is timed in turns with
-`Identifier.step` in a loop over the same samples, so that a slow moment of the machine hits both.
-Estimates are computed when they are read: a second loop reads of each what a run writes down,
-parameters with their standard deviations and diagnostics.
+The rod has 31 nodes, two unknowns, five sensors, and both ends as channels of the stream. Times to
+first estimates are processor times of new processes of `livepde run`, including the start of the
+interpreter; bytecode exists, as after an installation by pip. Per sample, `livepde run` (reading
+rows, journal, result, checkpoints) is timed in turns with a loop of `Identifier.step` over the same
+samples, so that other load on the machine affects both. Estimates are evaluated lazily. Therefore a
+second loop reads from each the values that a run writes: parameters with standard deviations, and
+diagnostics.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from livepde.runs import JOURNAL, Check, Outcome, Table, drive
 from livepde.stepping import Advance, ImplicitEuler, simulate
 
 SAMPLES = 2000
-RATIO = 1.4  # livepde run over Identifier.step in a loop, per sample
-FIRST = 0.8  # seconds of processor time until the first estimate after a step
+RATIO = 1.4  # largest time per sample of livepde run over Identifier.step in a loop
+FIRST = 0.8  # s, largest processor time until the first estimate after a step
 NOISE = 0.05
 SENSORS = 5
 CELLS = 30
@@ -68,7 +68,7 @@ T_left = {{ role = "boundary", column = "T_left", at = "left" }}
 T_right = {{ role = "boundary", column = "T_right", at = "right" }}
 {sensors}
 """
-# Steps in which a fresh process of `livepde run` says how much it has spent, then ends at once.
+# A new process of `livepde run` prints its processor time after two estimates, and exits.
 SCRIPT = """
 import os, sys
 from time import process_time
@@ -119,14 +119,14 @@ def rod(folder: Path, samples: int = SAMPLES) -> Path:
 
 
 def overhead(rounds: int = 5, samples: int = SAMPLES) -> Outcome:
-    """Time first estimates of the command line, and its samples against a loop of steps.
+    """Time first estimates of the command line, and its samples relative to a loop of steps.
 
     Parameters
     ----------
     rounds
-        Fresh processes, and runs of each kind.
+        Number of new processes, and of runs of each kind.
     samples
-        Of a run.
+        Samples of a run.
     """
     with TemporaryDirectory() as place:
         folder = Path(place)
@@ -144,10 +144,10 @@ def overhead(rounds: int = 5, samples: int = SAMPLES) -> Outcome:
         (name, *np.quantile(values, (0.0, 0.5, 1.0)).tolist())
         for name, values in (
             ("s to the estimate of the first sample", firsts[:, 0]),
-            ("s to that of the second, after a step", firsts[:, 1]),
-            ("us a sample, Identifier.step in a loop", 1e6 * step),
-            ("us a sample, the same, estimates read", 1e6 * read),
-            ("us a sample, livepde run", 1e6 * run),
+            ("s to the estimate of the second sample", firsts[:, 1]),
+            ("us per sample, Identifier.step in a loop", 1e6 * step),
+            ("us per sample, Identifier.step, estimates read", 1e6 * read),
+            ("us per sample, livepde run", 1e6 * run),
             ("livepde run / Identifier.step", run / step),
             ("livepde run / Identifier.step, estimates read", run / read),
         )
@@ -159,12 +159,12 @@ def overhead(rounds: int = 5, samples: int = SAMPLES) -> Outcome:
             Check("livepde run / Identifier.step in a loop, per sample", rows[5][2], RATIO, "<="),
             Check("livepde run / a loop that reads estimates", rows[6][2], RATIO, "<="),
         ],
-        notes=[f"{rounds} fresh processes, and as many runs of {samples} samples of each kind."],
+        notes=[f"{rounds} new processes, and {rounds} runs of {samples} samples of each kind."],
     )
 
 
 def _first(folder: Path, out: str) -> tuple[float, float]:
-    """Return the processor time of a fresh process until its first two estimates."""
+    """Return the processor times of a new process until its first and second estimate."""
     command = [sys.executable, "-c", SCRIPT, str(folder / out)]
     given = usual_environment(folder / "bytecode")
     done = subprocess.run(
@@ -175,12 +175,12 @@ def _first(folder: Path, out: str) -> tuple[float, float]:
 
 
 def _written(estimate: Estimate) -> Any:
-    """Read of an estimate what a run writes down."""
+    """Evaluate the parts of an estimate that a run writes."""
     return estimate.parameters, estimate.diagnostics.named()
 
 
 def _loop(loaded: Case, read: Callable[[Estimate], Any] = lambda _: None) -> float:
-    """Return the processor time of a sample in a loop that reads its estimates so."""
+    """Return the processor time per sample of a loop that calls `read` on each estimate."""
     prepared = loaded.prepare()
     step, samples = prepared.identifier.step, list(prepared.stream)
     begun = process_time()
@@ -190,7 +190,7 @@ def _loop(loaded: Case, read: Callable[[Estimate], Any] = lambda _: None) -> flo
 
 
 def _run(loaded: Case, folder: Path, number: int) -> float:
-    """Return the processor time of a sample in a run with its journal, as the command makes it."""
+    """Return the processor time per sample of a run with a journal, as in `livepde run`."""
     prepared = loaded.prepare()
     with ExitStack() as stack:
         journal = stack.enter_context(prepared.journal(folder / f"{number}-{JOURNAL}"))

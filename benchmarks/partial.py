@@ -2,12 +2,12 @@
 
     u_t - D Laplace(u) + q u = f   on the line or the square,   u = 0 on the boundary
 
-with u observed for 0.2 < x < 0.8. The true q is drawn from the prior, a field or a number. Its data
-come from finite elements written here, on a mesh four times as fine and with shorter steps of
-second order. Errors are those of q in L2, relative to that of the prior mean. They are held against
-the best of eight constant gains, chosen by the truth.
+with u observed for 0.2 < x < 0.8. The true q, a field or a constant, is drawn from the prior. Data
+come from finite elements of this module, on a mesh four times as fine and with shorter steps of
+second order. Errors are L2 errors of q relative to the error of the prior mean. They are compared
+with the smallest error of eight constant gains.
 
-A diffusivity or a velocity is refused: fluxes at the border of what is observed would decide it.
+The law refuses diffusivities and velocities, which fluxes at the border of u would determine.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from livepde.observation import Subdomain
 
 D = 0.1
 END, STEP = 10.0, 0.05
-FINER, SUBSTEPS = 4, 5  # cells and steps of the truth for each of the estimator's
+FINER, SUBSTEPS = 4, 5  # cells and steps of the truth per cell and step of the estimator
 MEAN, STD = 3.0, 1.5  # prior of q
-LEVELS = (0.0, 1e-3, 1e-2)  # noise over the root mean square of the readings
+LEVELS = (0.0, 1e-3, 1e-2)  # noise relative to the root mean square of the readings
 GAINS, DAMPINGS = (1.0, 1e2, 1e4, 1e6), (0.1, 1.0)
-RATIO = 1.3  # error over that of the best constant gain
-GROWTH = 1.1  # error at the end over that at half of the time
-WORST = 1.1  # largest error with status ok over that of the prior mean
+RATIO = 1.3  # bound on the error over the error of the best constant gain
+GROWTH = 1.1  # bound on the final error over the error at half time
+WORST = 1.1  # bound on the relative error of samples with status ok
 
 
 def omega(x: Any) -> Any:
@@ -51,14 +51,14 @@ def omega(x: Any) -> Any:
 
 @dataclass(frozen=True)
 class Reaction:
-    """A process: dimension, cells of the estimator on a side, and whether q is a field."""
+    """Reaction process: dimension, cells of the estimator per side, and whether q is a field."""
 
     d: int
     cells: int
     field: bool = True
 
     def source(self, x: Any, t: float) -> Any:
-        """Return f."""
+        """Return the source f."""
         y = 1.0 if self.d == 1 else np.sin(np.pi * x[1])
         y2 = 1.0 if self.d == 1 else np.sin(2 * np.pi * x[1])
         first = 3.0 * np.sin(np.pi * x[0]) * (1.0 + 0.6 * np.sin(2.0 * t)) * y
@@ -70,7 +70,7 @@ class Reaction:
         return np.sin(np.pi * x[0]) * (1.0 if self.d == 1 else np.sin(np.pi * x[1]))
 
     def model(self, A: Callable[..., Any] | None = None) -> Model:
-        """Return the estimator's model; with another A than the reaction if one is given."""
+        """Return the estimator's model, with the form A, default the reaction."""
         n = self.cells
         mesh = interval(0.0, 1.0, n) if self.d == 1 else rectangle((0.0, 1.0), (0.0, 1.0), (n, n))
         q: Any = Scalar(Normal(MEAN, STD))
@@ -86,14 +86,14 @@ class Reaction:
         )
 
     def states(self, q: Any, times: Any) -> Array:
-        """Return the states at the estimator's nodes, x slowest: shape (times, nodes).
+        """Return the states at the estimator's nodes, x slowest, shape (times, nodes).
 
-        By linear elements on a finer grid and Crank and Nicolson's scheme, without livepde.
+        Uses linear elements on a finer grid and the Crank-Nicolson scheme, without livepde.
 
         Parameters
         ----------
         q
-            Values at the estimator's nodes, interpolated between them; shape (nodes,).
+            Values at the estimator's nodes, shape (nodes,), interpolated linearly.
         """
         n = self.cells * FINER
         grid, off = np.linspace(0.0, 1.0, n + 1), np.ones(n)
@@ -128,12 +128,12 @@ class Reaction:
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """One truth, drawn from the prior, and its readings.
+    """Truth drawn from the prior, and its exact data.
 
     Attributes
     ----------
     model
-        Of the estimator.
+        Model of the estimator.
     truth
         Exact parameter, shape (m,).
     times, states
@@ -148,13 +148,13 @@ class Readings:
 
     @classmethod
     def drawn(cls, process: Reaction, seed: int, end: float | None = None) -> Readings:
-        """Return a truth and its data."""
+        """Draw a truth, and simulate its data."""
         model, end = process.model(), END if end is None else end
         times: Any = STEP * np.arange(round(end / STEP) + 1)
         rng = np.random.default_rng(seed)
         root = np.linalg.inv(np.linalg.cholesky(model.Q.gram.toarray())).T
         q: Array = model.latent.prior + root @ rng.standard_normal(model.Q.dim)
-        # Vertices sorted by x and then by y: coefficients of linear elements have their order.
+        # Coefficients of linear elements have the order of the vertices, sorted by x, then y.
         order = np.lexsort(model.mesh.p[::-1])
         values = q[order] if process.field else np.full(len(order), q[0])
         states = np.empty((len(times), len(order)))
@@ -162,13 +162,13 @@ class Readings:
         return cls(process, model, q, times, states)
 
     def noisy(self, level: float, seed: int) -> Array:
-        """Return the states with white noise of a level, relative to all of them."""
+        """Return states with white noise, relative to their root mean square."""
         rng = np.random.default_rng(1000 + seed)
         size = level * float(np.sqrt((self.states**2).mean()))
         return self.states + size * rng.standard_normal(self.states.shape)
 
     def error(self, q: Array) -> float:
-        """Return the error of q in L2, relative to that of the prior mean."""
+        """Return the L2 error of q relative to the error of the prior mean."""
         mass, (miss, away) = self.model.parameter_mass, (q - self.truth, self._away)
         return float(np.sqrt((miss @ (mass @ miss)) / (away @ (mass @ away))))
 
@@ -179,12 +179,12 @@ class Readings:
 
 @dataclass(frozen=True)
 class Course:
-    """Errors of q along a run: at half of the time, at the end, and the largest with status ok.
+    """Errors of q along a run: at half time, at the end, and the largest with status ok.
 
     Attributes
     ----------
     failed
-        Samples with another status.
+        Number of samples with another status.
     alpha
         Largest regularisation of u_alpha; 0 without smoothing.
     """
@@ -197,7 +197,7 @@ class Course:
 
 
 def follow(data: Readings, states: Array, law: GradientLaw) -> Course:
-    """Return the errors of q of a law."""
+    """Run a law, and return its errors of q."""
     identifier = Identifier(data.model, Subdomain(omega), law, u0=data.process.start)
     G = identifier.observed.G
     found = [
@@ -212,7 +212,7 @@ def follow(data: Readings, states: Array, law: GradientLaw) -> Course:
 
 
 def best(data: Readings, states: Array) -> float:
-    """Return the smallest error at the end of the constant gains."""
+    """Return the smallest final error of the constant gains."""
     laws = (GradientLaw(gain, ResidualDamping(c1)) for gain, c1 in product(GAINS, DAMPINGS))
     return min(follow(data, states, law).last for law in laws)
 
@@ -226,7 +226,7 @@ PROCESSES: Mapping[str, Reaction] = {
 
 
 def _tried(name: str, level: float, seed: int) -> tuple[Course, float]:
-    """Return the course of the law that tunes itself, and the error of the best constant gain."""
+    """Return the errors with automatic gain, and the error of the best constant gain."""
     data = Readings.drawn(PROCESSES[name], seed)
     states = data.noisy(level, seed)
     return follow(data, states, GradientLaw(gain="auto")), best(data, states)
@@ -238,16 +238,16 @@ def partial(
     seeds: int = 5,
     workers: int = 2,
 ) -> tuple[Table, list[Check]]:
-    """Return errors and checks of the law that tunes itself on partial data.
+    """Return errors and checks of the law with automatic gain on partial data.
 
     Parameters
     ----------
     names
-        Of `PROCESSES`.
+        Names of processes in `PROCESSES`.
     levels, seeds
-        Noise levels, and truths for each.
+        Noise levels, and number of truths for each level.
     workers
-        Processes that share the runs.
+        Number of worker processes.
     """
     jobs = list(product(names, levels, range(seeds)))
     done = dict(each(_tried, jobs, "partial data", workers=workers))
@@ -267,12 +267,12 @@ def partial(
             Check(f"{where}: largest error with status ok", worst, WORST, "<="),
         ]
     columns = ("process", "noise", "least", "largest", "ratio", "growth", "worst", "failed")
-    title = "Partial data, a reaction: error of q at the end (prior mean: 1), extremes over truths"
+    title = "Partial data, reaction: final error of q (prior mean: 1), minimum and maximum"
     return Table(title, columns, rows), [*checks, *refused()]
 
 
 def refused() -> list[Check]:
-    """Return the checks that operators with derivatives of u are refused, and reactions are not."""
+    """Check that the law refuses operators with derivatives of u, and accepts reactions."""
     operators: dict[str, tuple[bool, Callable[..., Any]]] = {
         "diffusivity": (True, lambda q, u, v, x: q * dot(grad(u), grad(v))),
         "velocity": (True, lambda q, u, v, x: q * grad(u)[0] * v),
@@ -289,7 +289,7 @@ def refused() -> list[Check]:
 
 
 def _refuses(A: Callable[..., Any], field: bool, d: int) -> bool:
-    """Return whether the law refuses an operator, in a sentence that names the other law."""
+    """Return whether the law refuses an operator with a message that names the other law."""
     model = Reaction(d, 8, field=field).model(A)
     try:
         Identifier(model, Subdomain(omega), GradientLaw(gain="auto"), u0=0.0)

@@ -1,9 +1,9 @@
-"""Both laws on PETSc vectors: cost against a forward step, memory of a rank, weak scaling.
+"""Both laws on PETSc vectors: cost relative to a forward step, memory of a rank, weak scaling.
 
-A heated plate by DOLFINx: a filter for three numbers from three points, and the paper's law for a
-reaction q(x) with u observed everywhere, each beside a step of `ImplicitStep`, which knows q.
-Each number of ranks is a program of its own. Ranks wait for each other, so that other work on the
-machine counts many times: the shortest sample of each counts.
+The models are a heated plate in DOLFINx, with a filter for three constants from three points, and
+a reaction q(x) with u observed everywhere and the paper's law. Each law alternates with
+`ImplicitStep`, which receives the true q. Each number of ranks is a separate program. Ranks wait
+for each other, which amplifies other load on the machine. Therefore the shortest sample counts.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from livepde.petsc.petsc_model import gathered
 from livepde.runs import Outcome
 
 STEP = 0.05
-FIRST = 2  # samples before the clock starts: preconditioners are made
+FIRST = 2  # untimed samples, in which preconditioners are built
 NUMBERS = [0.3, 1.0, 0.5]
-FILTER = 1.5 * (1 + len(NUMBERS))  # forward steps, at most,
-OBSERVER = 5.0  # the same,
-LARGE = 50_000  # from so many nodes on
-EQUAL = 1e-6  # of the norm of q, relative
-SHARE = 1.3  # of a rank, times the number of ranks
+FILTER = 1.5 * (1 + len(NUMBERS))  # bound on the cost of the filter, in forward steps
+OBSERVER = 5.0  # bound on the cost of the paper's law, in forward steps
+LARGE = 50_000  # number of nodes from which these bounds apply
+EQUAL = 1e-6  # largest relative difference of the norm of q
+SHARE = 1.3  # largest share of a rank, times the number of ranks
 AS_ROOT = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
 COLUMNS = ("ranks", "nodes", "law", "forward steps", "seconds", "efficiency", "share", "MB")
 
@@ -48,20 +48,20 @@ def petsc(size: int, ranks: Sequence[int], samples: int) -> Outcome:
     size
         Number of nodes.
     ranks
-        Numbers of ranks; the first is what the others are held against.
+        Numbers of ranks; the first is the reference for the others.
     samples
-        Samples of which the shortest counts.
+        Number of timed samples, of which the shortest counts.
     """
     command = shutil.which("mpirun")
     if command is None:
-        raise ConfigurationError("benchmark petsc needs mpirun: see docs/parallel.md.")
+        raise ConfigurationError("benchmark petsc requires mpirun: see docs/parallel.md.")
     one, checks, rows = ranks[0], [], []
-    # The same problem on all, then as many nodes for each rank: weak scaling.
+    # A fixed problem on all ranks, then a fixed number of nodes per rank (weak scaling).
     settings = [(count, size) for count in ranks]
     settings += [(count, size * count // one) for count in ranks[1:]]
-    found = {pair: _run(command, *pair, samples) for pair in settings}
-    first = found[one, size]
-    for (count, nodes), run in found.items():
+    runs = {pair: _run(command, *pair, samples) for pair in settings}
+    first = runs[one, size]
+    for (count, nodes), run in runs.items():
         for law, bound in (("filter", FILTER), ("observer", OBSERVER)):
             cost, seconds = run[law]["cost"], run[law]["seconds"]
             ideal = first[law]["seconds"] * (one / count) * (nodes / size)
@@ -77,9 +77,9 @@ def petsc(size: int, ranks: Sequence[int], samples: int) -> Outcome:
             Check(f"{count} ranks, {run['nodes']} nodes: share", run["share"], SHARE, "<=")
         )
     notes = [
-        "Forward steps: time of a sample over that of a step with a known q. Efficiency: against "
-        f"{one} rank(s), per node. Share and MB: nonzeros "
-        "of the largest rank, times the number of ranks, and its memory, libraries among it."
+        "forward steps: time of a sample over a step with known q. efficiency: per node, relative "
+        f"to {one} rank(s). share: share of nonzeros on the largest rank, times the number of "
+        "ranks. MB: memory of this rank, including libraries."
     ]
     return Outcome(tables=[Table("Both laws on PETSc", COLUMNS, rows)], checks=checks, notes=notes)
 
@@ -95,14 +95,14 @@ def _run(command: str, ranks: int, size: int, samples: int) -> dict[str, Any]:
         check=False,
     )
     if done.returncode:
-        said = done.stderr.strip().splitlines() or ["no reason given"]
-        raise ConfigurationError(f"benchmark petsc: {ranks} ranks ended with an error: {said[0]}")
+        lines = done.stderr.strip().splitlines() or ["no reason given"]
+        raise ConfigurationError(f"benchmark petsc: {ranks} ranks ended with an error: {lines[0]}")
     found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
 
 
 def _models(cells: int) -> tuple[DolfinxModel, DolfinxModel]:
-    """Return the plate with three unknown numbers, and that with an unknown field."""
+    """Return the plate with three unknown constants, and the reaction with an unknown field."""
     ufl, dolfinx = import_module("ufl"), import_module("dolfinx")
     comm = import_module("mpi4py.MPI").COMM_WORLD
     V = dolfinx.fem.FunctionSpace(
@@ -125,7 +125,7 @@ def _models(cells: int) -> tuple[DolfinxModel, DolfinxModel]:
 def _timed(
     model: DolfinxModel, true: Any, samples: int, law: Any, state: Any, read: Callable[[Any], Any]
 ) -> tuple[dict[str, float], Any]:
-    """Return times of a law, and its state at the end, on data of a true q."""
+    """Return times of a law on data of a true q, and its final state."""
     forward, u = ImplicitStep(model), model.interpolate(lambda x: 2.0)
     steps, times, comm = [], [], model.mesh.comm
     for k in range(FIRST + samples):
@@ -145,7 +145,7 @@ def _timed(
 
 
 def _worker(size: int, samples: int) -> None:
-    """Take samples on all ranks, and print what it took."""
+    """Process samples on all ranks, and print times and memory as JSON."""
     few, field = _models(round(np.sqrt(size)) - 1)
     start = few.interpolate(lambda x: 2.0)
     modes = number_modes(few.create_q(), [0.1, 0.5, 0.5])

@@ -1,14 +1,14 @@
-"""Environment of processes that are timed as a user starts them."""
+"""Environment of timed processes, as on the machine of a user."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
-UNUSUAL = ("PYTHONDONTWRITEBYTECODE", "EAGER_IMPORT")  # what some machines set, and users do not
+UNUSUAL = ("PYTHONDONTWRITEBYTECODE", "EAGER_IMPORT")  # set on some test machines, but not by users
 
 
 def usual_environment(cache: Path | str) -> dict[str, str]:
-    """Return the environment of a process that keeps its byte code, in a folder."""
+    """Return the environment of a process that caches its bytecode in a folder."""
     given = {name: value for name, value in os.environ.items() if name not in UNUSUAL}
     return {**given, "PYTHONPYCACHEPREFIX": str(cache)}
