@@ -1,14 +1,14 @@
-"""Cost of one sample of the filter law on rods, in forward steps, beside a lean reference.
+"""Cost of a sample of the sensitivity law on rods, in forward steps, and of a lean reference.
 
-A run takes the first samples of a stream, each timed by itself, and then as many forward steps of
-the same model with a known parameter; runs of all candidates are made in turns. The median of a run
-is that of usual samples, the mean has the first sample and the refits of the start in it. Both are
-divided by the median forward step, and the median over the runs is shown.
+A run times each of the first samples of a stream, and then as many forward steps of the same model
+with a known parameter. Runs of all candidates alternate. The median of a run describes usual
+samples; the mean includes the first sample and the refits of the start. Both are divided by the
+median forward step. The tables show medians over the runs.
 
-What is promised is promised in forward steps of an earlier version, so that a faster forward step
-does not make the promise harder. That version's forward step is known in forward steps of the lean
-reference (`EARLIER`), which depend on NumPy, SciPy and the processor only and are timed in the same
-runs: `python -m benchmarks.earlier` measures these factors.
+Bounds are in forward steps of an earlier version, so that a faster forward step does not tighten
+them. `EARLIER` lists the forward step of that version in forward steps of the lean reference. These
+depend only on NumPy, SciPy and the processor, and are timed in the same runs.
+`python -m benchmarks.earlier` measures `EARLIER`.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from livepde.runs import Outcome
 from livepde.stepping import Advance, ImplicitEuler, simulate
 
 SIZES = (31, 200, 1_000, 10_000)
-SQUARE = 10_000  # nodes, from which the process is a square
-FIRST = 100  # samples of a run, the first one included
+SQUARE = 10_000  # number of nodes from which the process is a square
+FIRST = 100  # samples of a run, including the first one
 RUNS = 5
 NOISE = 0.01
 COMMIT = "51ef98c"
@@ -52,7 +52,7 @@ BOUNDS: dict[tuple[int, int], float] = {
     (1_000, 10): 9.0,
     (SQUARE, 4): 5.0,
 }
-"""Nodes, unknowns -> forward steps of the earlier version that a sample may cost."""
+"""Nodes, unknowns -> bound on the cost of a sample, in forward steps of the earlier version."""
 
 EARLIER: dict[tuple[int, str], float] = {
     (31, "source"): 3.83,
@@ -63,9 +63,9 @@ EARLIER: dict[tuple[int, str], float] = {
     (1_000, "channels"): 1.37,
     (SQUARE, "source"): 0.925,
 }
-"""Nodes, ends -> a forward step of the earlier version in forward steps of the lean reference."""
+"""Nodes, ends -> forward step of the earlier version, in forward steps of the lean reference."""
 
-FLEET = 1.5  # times the lean reference that a fleet may cost
+FLEET = 1.5  # bound on the cost of a fleet relative to the lean reference
 MEMBERS, MEMBERS_NODES = 50, 31
 
 Row: TypeAlias = tuple[Any, ...]
@@ -73,12 +73,12 @@ Row: TypeAlias = tuple[Any, ...]
 
 @dataclass(frozen=True, eq=False)
 class Rod:
-    """A process of some size with a stream of samples.
+    """Rod or square with a stream of samples.
 
     Parameters
     ----------
     nodes, unknowns
-        Of the mesh; layers of a rod. A square has four quarters.
+        Number of nodes of the mesh, and of layers of the rod; a square has four quarters.
     ends
         "source" or "channels", see `benchmarks.layered`.
     """
@@ -89,25 +89,25 @@ class Rod:
 
     @cached_property
     def model(self) -> Model:
-        """The process."""
+        """Model of the process."""
         if self.nodes >= SQUARE:
             return plate(self.nodes)
         return rod(self.nodes, self.unknowns, self.ends)
 
     @cached_property
     def sensors(self) -> Points:
-        """Four point sensors; on a square nine."""
+        """Four point sensors on a rod, nine on a square."""
         square = [(x, y) for x in (0.2, 0.5, 0.8) for y in (0.2, 0.5, 0.8)]
         return Points(square if self.nodes >= SQUARE else list(POINTS), noise=NOISE)
 
     def forward(self, q: Array, count: int) -> Iterator[tuple[float, Array]]:
-        """Simulate: the initial state, and after each step."""
+        """Simulate, and yield times and states, starting with the initial state."""
         times = (STEP * np.arange(count + 1)).tolist()
         inputs = {t: ends_at(self.ends, t) for t in times}.__getitem__
         return simulate(self.model, q, 0.0, times, Advance(ImplicitEuler()), inputs)
 
     def samples(self, count: int, seed: int = 0) -> list[tuple[float, Array, dict[str, float]]]:
-        """Return time, measurements and channels of the start and of so many samples."""
+        """Return time, measurements and channels of the start and of `count` samples."""
         rng, latent = np.random.default_rng(seed), self.model.latent
         q = latent.prior + latent.deviations * rng.standard_normal(latent.dim)
         G = self.sensors.matrix(self.model.state_space)
@@ -119,16 +119,16 @@ class Rod:
     def samples_of_members(
         self, members: int, count: int
     ) -> list[tuple[float, Array, dict[str, float]]]:
-        """Return samples of a fleet, measurements of shape (members, sensors); channels common."""
+        """Return samples of a fleet with measurements of shape (members, sensors)."""
         streams = [self.samples(count, seed) for seed in range(members)]
         return [
-            (row[0][0], np.array([one[1] for one in row]), row[0][2])
+            (row[0][0], np.array([z for _, z, _ in row]), row[0][2])
             for row in zip(*streams, strict=True)
         ]
 
     @cached_property
     def matrices(self) -> lean.Matrices:
-        """The process as the lean reference has it."""
+        """Matrices of the lean reference for the process."""
         return lean.Matrices.of(self.model, np.diag(self.model.latent.deviations), STEP)
 
     @property
@@ -142,14 +142,14 @@ RODS: tuple[Rod, ...] = (
     *(Rod(nodes, m, ends) for nodes in SIZES[:3] for m in (2, 10) for ends in ENDS),
     Rod(SQUARE, 4, "source"),
 )
-"""The processes that are timed."""
+"""Timed processes."""
 
 
-# --- candidates: each is a function that returns the times of the samples of a run, in s ---------
+# --- candidates: functions that return the times of the samples of a run, in s -------------------
 
 
 def _law(given: Rod, samples: Sequence[Any]) -> list[float]:
-    """Time the law."""
+    """Time samples of the sensitivity law."""
     identifier = Identifier(given.model, given.sensors, SensitivityLaw(), u0=0.0)
     identifier.step(*samples[0])
     spent = []
@@ -172,7 +172,7 @@ def forward_times(given: Rod, count: int) -> list[float]:
 
 
 def _lean(given: Rod, samples: Sequence[Any]) -> list[float]:
-    """Time the lean reference."""
+    """Time samples of the lean reference."""
     spent, matrices = [], given.matrices
     G = given.sensors.matrix(given.model.state_space).toarray()[:, matrices.order] / NOISE
     start = given.model.initial(0.0, _moment(samples[0]))
@@ -190,7 +190,7 @@ def _moment(sample: Any) -> Moment:
 
 
 def lean_forward(given: Rod, count: int) -> list[float]:
-    """Time forward steps as NumPy and SciPy make them, matrix factorised once and source known."""
+    """Time forward steps in NumPy and SciPy, with a stored factorisation and a constant source."""
     solve, mass = _stepper(given)
     f, u, spent = given.model.F(), np.zeros(given.model.X.dim), []
     for _ in range(count):
@@ -201,7 +201,7 @@ def lean_forward(given: Rod, count: int) -> list[float]:
 
 
 def _stepper(given: Rod) -> tuple[Callable[[Array], Array], Any]:
-    """Return the solution of a step for its right-hand side, and the mass over the time step."""
+    """Return a solver for the right-hand side of a step, and the mass matrix over the time step."""
     if given.nodes < SQUARE:
         matrices = given.matrices
         lu = matrices.factorise(np.zeros((1, given.unknowns)))
@@ -219,9 +219,9 @@ def rods(only: Iterable[Rod] = RODS, *, runs: int = RUNS, first: int = FIRST) ->
     Parameters
     ----------
     only
-        The processes to take.
+        Timed processes.
     runs, first
-        How often each is run, and how many samples a run has.
+        Number of runs of each process, and of samples of a run.
     """
     rows: list[Row] = []
     checks: list[Check] = []
@@ -238,13 +238,13 @@ def rods(only: Iterable[Rod] = RODS, *, runs: int = RUNS, first: int = FIRST) ->
 
 
 def _timed(given: Rod, runs: int, first: int) -> Iterator[tuple[Row, Check | None]]:
-    """Yield a row and its check for each candidate."""
+    """Yield a row and a check, or None, for each candidate."""
     samples, large = given.samples(first), given.nodes >= SQUARE
     spent: dict[str, list[list[float]]] = {SENSITIVITY: [], LEAN: []}
     units, lean_units = [], []
     for _ in range(runs):
         spent[SENSITIVITY].append(_law(given, samples))
-        if not large:  # where a factorisation costs more than a correction it is no reference
+        if not large:  # the lean filter factorises at each step, which is slow on a large square
             spent[LEAN].append(_lean(given, samples))
         units.append(float(np.median(forward_times(given, first))))
         lean_units.append(float(np.median(lean_forward(given, first))))
@@ -272,7 +272,7 @@ def _timed(given: Rod, runs: int, first: int) -> Iterator[tuple[Row, Check | Non
 
 
 def fleet(members: int = MEMBERS, *, runs: int = RUNS, first: int = FIRST) -> Outcome:
-    """Time a fleet of rods of 31 nodes against the lean reference with a leading axis."""
+    """Time a fleet of rods of 31 nodes relative to the lean reference with as many members."""
     rows: list[Row] = []
     checks: list[Check] = []
     for ends in ENDS:
@@ -290,8 +290,8 @@ def fleet(members: int = MEMBERS, *, runs: int = RUNS, first: int = FIRST) -> Ou
 
 
 def _fleet_pair(given: Rod, members: int, samples: Sequence[Any]) -> tuple[float, float, float]:
-    """Return median and mean cost of a sample over the reference's, and how q differs."""
-    law = SensitivityLaw(guards=None, refit=None, shadows=None)  # as the reference
+    """Return median and mean cost relative to the reference, and the relative difference of q."""
+    law = SensitivityLaw(guards=None, refit=None, shadows=None)  # options of the lean reference
     together = Fleet(
         given.model, given.sensors, law, members, u0=0.0, scheme=ImplicitEuler(), halvings=0
     )
@@ -316,10 +316,10 @@ def _fleet_pair(given: Rod, members: int, samples: Sequence[Any]) -> tuple[float
 
 
 NOTES = (
-    "median, mean: of the samples of a run, in forward steps of this version (livepde.simulate, "
-    "matrix factorised once, processor time, median); the mean has the first sample in it.",
-    f"over {COMMIT}: the same in forward steps of that commit, which the bounds mean: the median "
-    "of a rod, the mean on the square.",
-    "ends: 'source' holds them at constant values beside a constant source, 'channels' reads both "
+    "median, mean: cost of the samples of a run, in forward steps of this version (median "
+    "processor time of livepde.simulate, with a stored factorisation). The mean includes the first "
+    f"sample. over {COMMIT}: cost in forward steps of that commit, for which the bounds are "
+    "defined: the median for rods, the mean for the square.",
+    "ends: 'source' has constant values at both ends and a constant source; 'channels' reads both "
     "temperatures from the stream.",
 )

@@ -1,14 +1,14 @@
-"""How a step of the gradient law scales to large fields.
+"""Scaling of a step of the gradient law to large fields.
 
-The process is heat conduction with an unknown reaction coefficient on a square or a cube, observed
-in a part of it and moved by its boundary values; u and q are fields of the same nodes. Sources are
-constant: a forward step is little more than one solve, and nothing else hides what the law costs.
+The process is heat conduction with an unknown reaction coefficient on a square or a cube. It is
+observed in a part of the domain and driven by its boundary values; u and q are fields on the same
+nodes. Sources are constant, so that a forward step costs little more than one solve.
 
-For each size and gain a process of its own takes forward steps and steps of the law in turns, with
-their factors kept, and reports the ratio of processor times. `million` is the large run: a million
-nodes, 100 steps from samples in a file, and the most memory that took. A second table counts the
-iterations of one system by blocks with new factors, to 1e-8: they grow with the gain, and with
-theta M_op, and hardly with the mesh.
+For each size and gain, a separate process alternates forward steps and steps of the law, both with
+stored factorisations, and reports the ratio of processor times. `million` runs 100 steps with a
+million nodes from samples in a file, and reports the peak memory. A second table counts the
+iterations of one block system with new factors to a tolerance of 1e-8. They grow with the gain and
+with theta M_op, and barely with the mesh.
 """
 
 from __future__ import annotations
@@ -58,19 +58,19 @@ __all__ = [
 SIZES = (10_000, 100_000)  # nodes of the square
 CUBE = 3  # dimensions
 GAINS = (1.0, 1e2, 1e4)
-RATIO = 2.5  # forward steps that a step of the law may cost
-EXPONENT = 1.15  # of the cost of a step from the smallest to the largest square
-MEMORY = 3.0  # kB for each coefficient of the state
+RATIO = 2.5  # bound on the cost of a step of the law, in forward steps
+EXPONENT = 1.15  # bound on the exponent of the cost, from the smallest to the largest square
+MEMORY = 3.0  # kB per coefficient of the state, bound on the peak memory
 HUGE = 1_000_000  # nodes of the large run
-WIDTH = 0.0625  # time step, a binary number
-FINDING, TIMED = 16, 24  # steps before those that are timed, and these
-MILLION = 100  # its steps
-ACCURACY = 0.1  # relative error of its q, at most
+WIDTH = 0.0625  # time step; a power of two, so that differences of times are exact
+FINDING, TIMED = 16, 24  # untimed initial steps, and timed steps
+MILLION = 100  # steps of the large run
+ACCURACY = 0.1  # bound on the relative error of q in the large run
 
-COUNTED = (2_500, 10_000)  # nodes where iterations are counted
+COUNTED = (2_500, 10_000)  # numbers of nodes for which iterations are counted
 TOLERANCE = 1e-8
 STEP = 0.05
-# (c_1, gain) -> iterations that the first system may take
+# (c_1, gain) -> bound on the iterations for the first system
 ITERATIONS = {
     (0.0, 1.0): 4,
     (0.0, 1e2): 5,
@@ -85,20 +85,20 @@ ITERATIONS = {
 
 @dataclass(frozen=True)
 class Cost:
-    """What one process measured.
+    """Measurement of one process.
 
     Attributes
     ----------
     nodes
-        Of the mesh: each has a value of u and one of q.
+        Nodes of the mesh; each has a value of u and a value of q.
     dimension, gain
-        Of the mesh, and of the law.
+        Dimension of the mesh, and gain of the law.
     ratio, low, high
-        Step over forward step: of all timed steps together, the least and the largest.
+        Step over forward step: for the sums of all timed steps, smallest and largest.
     step
-        Processor time of a step, in s.
+        Mean processor time of a step, in s.
     error
-        Relative error of q at the end; that of q = 0 is 1.
+        Relative error of q at the end; q = 0 has 1.
     """
 
     nodes: int
@@ -113,15 +113,15 @@ class Cost:
 
 @dataclass(frozen=True)
 class Need:
-    """What a process needed that only identifies.
+    """Error and memory of a process that only identifies.
 
     Attributes
     ----------
     error
         Relative error of q at the end.
     memory
-        The most memory it ever had, in kB for each coefficient of the state: with interpreter,
-        libraries, model and law.
+        Peak memory in kB per coefficient of the state, including interpreter, libraries, model and
+        law.
     """
 
     error: float
@@ -129,7 +129,7 @@ class Need:
 
 
 def problem(size: int, dimension: int = 2) -> Model:
-    """Return the process with about so many nodes."""
+    """Return the model on a mesh with approximately `size` nodes."""
     side = round(size ** (1.0 / dimension)) - 1
     if dimension == 2:
         mesh: Any = rectangle((0.0, 1.0), (0.0, 1.0), (side, side)).to_meshtri()
@@ -157,7 +157,7 @@ OMEGA = Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.87))
 
 
 def readings(model: Model, steps: int) -> Iterator[tuple[float, Array]]:
-    """Simulate the process, and return its exact samples."""
+    """Simulate the process, and yield times and exact readings."""
     G, truth = OMEGA.matrix(model.state_space), model.initial_parameter(q_true)
     times = (WIDTH * np.arange(steps + 1)).tolist()
     states = simulate(model, truth, 2.0, times, Advance(ImplicitEuler()))
@@ -165,7 +165,7 @@ def readings(model: Model, steps: int) -> Iterator[tuple[float, Array]]:
 
 
 def measure(size: int, dimension: int, gain: float, steps: int = FINDING + TIMED) -> Cost:
-    """Step the forward model and the law in turns, in this process."""
+    """Alternate forward steps and steps of the law in this process, and return their cost."""
     model = problem(size, dimension)
     samples = readings(model, steps)
     identifier = _identifier(model, gain)
@@ -196,7 +196,7 @@ def record(size: int, steps: int, path: str) -> None:
 
 
 def identify(size: int, gain: float, path: str) -> Need:
-    """Identify from a file what `record` has written."""
+    """Identify q from the file that `record` wrote."""
     model = problem(size)
     identifier = _identifier(model, gain)
     for k, z in enumerate(np.load(path, mmap_mode="r")):
@@ -221,12 +221,12 @@ def _error(model: Model, identifier: Identifier) -> float:
 
 def _timed(run: Callable[[], Any]) -> tuple[float, Any]:
     start = process_time()
-    found = run()
-    return process_time() - start, found
+    result = run()
+    return process_time() - start, result
 
 
 def _peak() -> float:
-    """Return the most memory this process ever had, in kB."""
+    """Return the peak memory of this process, in kB."""
     import resource
 
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -243,10 +243,10 @@ def scale(
     sizes, cubes
         Numbers of nodes of squares and of cubes.
     gains
-        Of the law.
+        Gains of the law.
     """
-    asked = [(size, 2) for size in sizes] + [(size, CUBE) for size in cubes]
-    costs = [_cost(size, dimension, gain) for size, dimension in asked for gain in gains]
+    meshes = [(size, 2) for size in sizes] + [(size, CUBE) for size in cubes]
+    costs = [_cost(size, dimension, gain) for size, dimension in meshes for gain in gains]
     checks = [_ratio(cost) for cost in costs]
     for gain in gains:
         squares = [cost for cost in costs if cost.dimension == 2 and cost.gain == gain]
@@ -258,14 +258,14 @@ def scale(
     counted = iterations()
     table = _table("One step over one forward step", costs)
     note = (
-        "Ratios of processor times taken in one process, step by step; the forward step is "
-        "livepde.simulate with the factor kept."
+        "Ratios of processor times measured in one process, step by step. The forward step is "
+        "livepde.simulate with a stored factorisation."
     )
     return Outcome(tables=[table, *counted.tables], checks=[*checks, *counted.checks], notes=[note])
 
 
 def million() -> Outcome:
-    """Identify a field of a square in a process of its own, from samples in a file."""
+    """Identify a field with a million nodes in a separate process, from samples in a file."""
     gain = GAINS[-1]
     with TemporaryDirectory() as folder:
         path = f"{folder}/samples.npy"
@@ -286,7 +286,7 @@ def _cost(size: int, dimension: int, gain: float) -> Cost:
 
 
 def _alone(expression: str) -> Any:
-    """Return the value of an expression with names of this module, in a process of its own."""
+    """Evaluate an expression with names of this module in a separate process."""
     program = (
         "import json; from dataclasses import asdict; from benchmarks.scale import *; "
         f"print(json.dumps({expression}))"
@@ -294,7 +294,7 @@ def _alone(expression: str) -> Any:
     command = [sys.executable, "-c", program]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     if done.returncode:
-        last = (done.stderr.strip().splitlines() or ["killed, for want of memory perhaps"])[-1]
+        last = (done.stderr.strip().splitlines() or ["killed, perhaps for lack of memory"])[-1]
         raise ConfigurationError(f"benchmark scale: {expression}: {last}")
     return json.loads(done.stdout)
 
@@ -311,12 +311,12 @@ def _table(title: str, costs: Sequence[Cost]) -> Table:
 
 
 def iterations(sizes: Sequence[int] = COUNTED) -> Outcome:
-    """Count iterations at several gains, u observed everywhere.
+    """Count iterations for several gains, with u observed everywhere.
 
     Parameters
     ----------
     sizes
-        Numbers of nodes of the square: each has a value of u and one of q.
+        Numbers of nodes of the square.
     """
     rows, checks = [], []
     for size in sizes:
@@ -336,13 +336,13 @@ def _bump(x: Any) -> Any:
 
 
 def _iterations(model: Model, c1: float, gain: float) -> tuple[int, tuple[str, str]]:
-    """Return the iterations of a stage's first system, and the names of the engines."""
+    """Return the number of iterations for a stage's first system, and the names of the engines."""
     split = Full().bind(model.state_space, model.X, model.parameter_space).split()
     forms = StageForms(model, split, h1_form, h1_form, 0.0)
     blocks = BlockSolver.of(StageTerms(forms, ResidualDamping(c1)))
     if blocks is None:
         raise ConfigurationError(
-            f"benchmark scale: {model.X.dim} nodes are too few for blocks; take more."
+            f"benchmark scale: {model.X.dim} nodes are too few for blocks; use more."
         )
     u = model.initial(_bump)
     c = np.concatenate([u, model.initial_parameter(0.5)])

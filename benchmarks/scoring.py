@@ -1,4 +1,4 @@
-"""How a contender is judged: against the truth, and by what its steps cost."""
+"""Scores of contenders: errors and coverage relative to the truth, and costs of steps."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from livepde.linalg import Array
 from livepde.plots import NORMAL_95
 from livepde.stepping import StepFailed
 
-QUICK = 1.0  # s
-TIMES = 11  # in the second half, at which a parameter that moves is scored
+QUICK = 1.0  # s; shorter runs are repeated
+TIMES = 11  # times in the second half at which a varying parameter is scored
 
 
 @dataclass(frozen=True)
 class Score:
-    """What one contender reached on one data set.
+    """Score of one contender on one data set.
 
     Attributes
     ----------
     error
-        Relative error of the parameter; of a real process, error of the validation sensor.
+        Relative error of the parameter, or for a real process the error of the validation sensor.
     covered
-        Share of values whose 95 % interval holds the truth; NaN without intervals or truth.
+        Share of values whose 95 % interval contains the truth; NaN without intervals or truth.
     step
-        Processor time of a step over that of a forward step, mean without the first samples.
+        Processor time of a step over a forward step, mean without the first samples.
     whole, median
-        The same as mean over all samples, the first included, and as median.
+        Processor time of a step over a forward step, mean and median over all samples.
     failed
-        Steps that could not be taken.
+        Number of failed steps.
     megabytes
-        Largest memory that was allocated at once, where it was measured.
+        Peak of allocated memory; NaN if it was not measured.
     note
-        Why there is nothing, or what to know.
+        Reason for missing values, or a remark.
     """
 
     error: float = math.nan
@@ -57,17 +57,17 @@ class Score:
 
 
 Contender: TypeAlias = Callable[[Data], Score | None]
-"""Runs on a data set; None where it does not apply."""
+"""Data set -> score, or None if the contender does not apply."""
 
 Known: TypeAlias = tuple[Array, Array | None]
-"""Latent coefficients of the parameter and a square root of their covariance, None: not known."""
+"""Latent coefficients of the parameter, and a square root of their covariance (None: unknown)."""
 
 Found: TypeAlias = dict[tuple[str, float | None, str], list[Score]]
 """Problem, noise level, row -> a score for each data set."""
 
 
 class Judge:
-    """Compares beliefs with the truth of a data set."""
+    """Scorer of beliefs relative to the truth of a data set."""
 
     def __init__(self, data: Data) -> None:
         self.data = data
@@ -78,7 +78,7 @@ class Judge:
 
     @cached_property
     def probe(self) -> Array:
-        """Rows that evaluate the latent coefficients: numbers, and fields at vertices."""
+        """Matrix that evaluates latent coefficients: constants, and fields at vertices."""
         latent = self.model.latent
         rows = []
         for part in latent.parts.values():
@@ -87,22 +87,22 @@ class Judge:
             local = local.toarray() if hasattr(local, "toarray") else np.asarray(local)
             row = np.zeros((len(local), latent.dim))
             row[:, part.part.start : part.part.start + size] = local
-            # Where a boundary value is known there is nothing to cover.
+            # Known boundary values have no interval.
             rows.append(row[(np.abs(np.delete(row, latent.fixed, axis=1)) > 0).any(axis=1)])
         return np.vstack(rows)
 
     @cached_property
     def rest(self) -> Array:
-        """Deviation of what `probe` evaluates in the modes that no estimator has, (rows,)."""
+        """Standard deviation of the probed values in modes beyond all estimators, shape (rows,)."""
         rest: Array = np.abs(self.probe) @ Trajectory(self.data).rest
         return rest
 
     def error(self, q: Array, at: int) -> float:
-        """Return the relative error of latent coefficients at a time."""
+        """Return the relative error of latent coefficients at a time index."""
         return self.data.problem.error(self.data.process, self.model.latent.value(q), at)
 
     def covered(self, q: Array, factor: Array | None, at: int) -> float:
-        """Return the share of 95 % intervals that hold the truth, NaN if there are none."""
+        """Return the coverage of the 95 % intervals at a time index; NaN without intervals."""
         true = self.data.process.q_true
         if factor is None or true is None:
             return math.nan
@@ -111,7 +111,7 @@ class Judge:
         return float(np.mean(distance <= NORMAL_95 * std))
 
     def judged(self, beliefs: Iterable[tuple[int, Array, Array | None]]) -> tuple[float, float]:
-        """Return error (root mean square over the scored times) and coverage."""
+        """Return the root mean square error and the mean coverage over the scored times."""
         errors, shares = [], []
         for at, q, factor in beliefs:
             errors.append(self.error(q, at))
@@ -120,33 +120,33 @@ class Judge:
 
 
 def measured(data: Data, step: Callable[[int], None], known: Callable[[], Known]) -> Score:
-    """Take all samples but the first and judge what is known then.
+    """Process all samples except the first, and return the score without failed steps.
 
     Parameters
     ----------
     step
-        Number of the sample -> takes it; only this is timed.
+        Function that processes the sample with an index; only its calls are timed.
     known
-        Returns what is known now.
+        Function that returns the current belief.
     """
-    judge, found = Judge(data), []
+    judge, beliefs = Judge(data), []
     seconds: list[float] = []
     for at in range(1, len(data)):
         start = process_time()
         step(at)
         seconds.append(process_time() - start)
         if at in judge.scored:
-            found.append((at, *known()))
-    error, covered = judge.judged(found)
+            beliefs.append((at, *known()))
+    error, covered = judge.judged(beliefs)
     costs = np.array(seconds) / data.forward
     settled, whole, median = costs[WARM_UP:].mean(), costs.mean(), np.median(costs)
     return Score(error, covered, float(settled), float(whole), float(median))
 
 
 def scored(contender: Contender, data: Data) -> Score | None:
-    """Run a contender; one that fails is a score with a reason.
+    """Run a contender, and return its score; a failure becomes the note of the score.
 
-    What is quick is run three times, and the median times count.
+    Quick contenders are run three times, and the median times count.
     """
     start = process_time()
     try:
@@ -164,12 +164,12 @@ def scored(contender: Contender, data: Data) -> Score | None:
 
 
 def error_ratio(found: Found, at: tuple[str, float | None], row: str, other: str) -> float:
-    """Return the median error of a row over that of another; NaN if one has none."""
+    """Return the ratio of the median errors of two rows; NaN if an error is unknown."""
     return _median(found, (*at, row)) / _median(found, (*at, other))
 
 
 def step_ratio(found: Found, at: tuple[str, float | None], row: str, other: str) -> float:
-    """Return the cost of a step of a row over that of another; NaN if one has none."""
+    """Return the ratio of the mean costs of two rows; NaN if a cost is unknown."""
     mine, others = ([score.step for score in found.get((*at, key), ())] for key in (row, other))
     return _mean(mine) / _mean(others)
 
@@ -180,12 +180,12 @@ def _median(found: Found, key: tuple[str, float | None, str]) -> float:
 
 
 def table_of(found: Found, limit: str) -> list[Table]:
-    """Return a table for each problem: rows are noise level and contender.
+    """Return a table for each problem, with a row for each noise level and contender.
 
     Parameters
     ----------
     limit
-        Row by whose error the others are divided.
+        Row whose error is the unit of the column `limit`.
     """
     tables = []
     for name in dict.fromkeys(key[0] for key in found):

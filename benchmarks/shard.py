@@ -1,4 +1,4 @@
-"""Shards of rods: memory and time of many live members, kills of workers, two workers over one."""
+"""Memory, times and throughput of shards of rods, and recovery of their killed workers."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from livepde.observation import Points
 from livepde.runs import Outcome
 from livepde.stepping import Advance, simulate
 
-SIZE = 250  # members of a shard: a step of more takes more memory at a time
-TRUTHS = 20  # rods of other coefficients; each member has noise of its own
+SIZE = 250  # members of a shard; the memory of a step grows with it
+TRUTHS = 20  # rods with different coefficients; each member has its own noise
 GROWN = "shard: memory of 10 000 members"
-WARM = 100  # samples of each member before time and memory are taken: logs are as long as they get
-TIMED = 10  # samples of each member that are timed
+WARM = 100  # untimed samples of each member, after which logs have reached their full length
+TIMED = 10  # timed samples of each member
 FEW = 100  # members of the shards whose workers are killed
-BATCHES, MORE, EVERY = 60, 20, 7  # of such a shard, for each kill, and from one dump to the next
-ASSETS = 10_000  # of the promises
-GIGABYTES, CORE, FASTER = 0.5, 1.0, 1.5  # the promises: at most, at most, at least
-PATIENCE = 600.0  # seconds for a worker
+BATCHES, MORE, EVERY = 60, 20, 7  # batches of such a shard, per kill, and between two dumps
+ASSETS = 10_000  # members for which the bounds are defined
+GIGABYTES, CORE, FASTER = 0.5, 1.0, 1.5  # largest memory, largest load, smallest speed-up
+PATIENCE = 600.0  # s, time limit of a worker
 STARTED = 10  # members whose first samples are timed
 LAWS = {
     "without shadows": SensitivityLaw(refit=None, shadows=None),
@@ -47,14 +47,14 @@ Found = TypeVar("Found")
 
 
 def shard(members: int = ASSETS, kills: int = 20) -> Outcome:
-    """Measure shards of rods of 100 nodes whose diffusivity is unknown, heated at one end.
+    """Measure shards of heated rods of 100 nodes with unknown diffusivity.
 
     Parameters
     ----------
     members
-        Rods whose memory and time of a step are measured, in shards of 250.
+        Number of rods whose memory and step time are measured, in shards of 250.
     kills
-        How often one of two workers is killed at a random moment.
+        Number of kills of one of two workers at random times.
     """
     lean, usual = (_in_process(_cost, members, name) for name in LAWS)
     start = _in_process(_started, STARTED, "start with refits")
@@ -69,28 +69,28 @@ def shard(members: int = ASSETS, kills: int = 20) -> Outcome:
             ("memory of the process without members, MB", "base", 1e-6),
             ("state of a member in a dump, kB", "dumped", 1e-3),
             ("time of a sample, µs", "step", 1e6),
-            ("dump, µs a member", "dump", 1e6),
-            ("load, µs a member", "load", 1e6),
+            ("dump, µs per member", "dump", 1e6),
+            ("load, µs per member", "load", 1e6),
         )
     ]
     more = [
-        ("samples a second of one worker", one),
-        ("samples a second of two workers", two),
-        ("start of a member with refits, seconds in all", start),
-        ("sample at a time of its own, µs", 1e6 * alone),
+        ("samples per second of one worker", one),
+        ("samples per second of two workers", two),
+        ("start of a member with refits, s in total", start),
+        ("sample at a time that no other member shares, µs", 1e6 * alone),
     ]
     return Outcome(
         tables=[
             Table(f"{members} rods of {NODES} nodes in shards of {SIZE}", ("", *LAWS), rows),
-            Table("Workers with a shard each, and the start", ("", "value"), more),
+            Table("Throughput of workers with a shard each, and the start", ("", "value"), more),
             Table(
-                "Workers that were killed and went on from their last dump",
+                "Killed workers that resumed from their last dump",
                 ("kills", "samples", "written twice", "different", "lost"),
                 [(done, 2 * FEW * (BATCHES + MORE * kills), taken, different, missing)],
             ),
         ],
         checks=[
-            # Of few members the largest memory is that of the start and of dumps.
+            # With few members, start and dumps dominate the peak memory.
             *([Check(f"{GROWN}, GB", memory / 1e9, GIGABYTES, "<=")] if members >= ASSETS else []),
             Check("shard: cores for 10 000 samples a second", usual.step * ASSETS, CORE, "<="),
             Check("shard: estimates that differ after kills", float(different), 0.0, "<="),
@@ -101,18 +101,17 @@ def shard(members: int = ASSETS, kills: int = 20) -> Outcome:
             ),
         ],
         notes=[
-            "Memory: the largest that a process has had, dumps of one shard after the other "
-            "included; that of fewer members is taken for 10 000 in proportion. Time: of the "
-            "processor, one thread, all members with samples at the same times, after the first "
-            f"{WARM} samples of each, by a law whose start is not iterated (refit=None). "
-            "Without shadows (shadows=None) errors of the discretisation do not widen what is "
-            "reported. Throughput: samples over processor time of each worker, while all run."
+            "Memory: peak memory of the process, including dumps of its shards in turn, and "
+            "extrapolated to 10 000 members. Times: processor times with one thread after the "
+            f"first {WARM} samples of each member, all members at the same times, without refits "
+            "(refit=None). Without shadows (shadows=None), discretisation errors do not widen "
+            "the intervals. Throughput: samples over processor time of each concurrent worker."
         ],
     )
 
 
 class Cost(NamedTuple):
-    """Memory in bytes (base: of the process without members) and time in seconds."""
+    """Memory in bytes (`base`: process without members; others per member), and times in s."""
 
     base: float
     each: float
@@ -123,7 +122,7 @@ class Cost(NamedTuple):
 
 
 def _cost(members: int, law: str) -> Cost:
-    """Return what members of this process cost."""
+    """Return memory and times of members in this process."""
     model = _rod()
     counts = [min(SIZE, members - first) for first in range(0, members, SIZE)]
     first = _shard(model, counts[0], law)
@@ -156,12 +155,12 @@ def _cost(members: int, law: str) -> Cost:
 
 
 def _peak() -> float:
-    """Return the largest memory that this process has had, in bytes."""
+    """Return the peak memory of this process, in bytes."""
     return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def _started(members: int, law: str) -> float:
-    """Return what the samples of the start take, in seconds of the processor a member."""
+    """Return the processor time per member of the first `WARM` samples, in s."""
     model = _rod()
     one, begun = _shard(model, members, law), process_time()
     for offset, batch in _batches(model, WARM, members):
@@ -170,7 +169,7 @@ def _started(members: int, law: str) -> float:
 
 
 def _alone(members: int, law: str) -> float:
-    """Return processor time of a sample where no two members have one at the same time."""
+    """Return the processor time of a sample if all members have samples at different times."""
     model = _rod()
     one, times = _shard(model, members, law), []
     for offset, batch in _batches(model, WARM, members):
@@ -182,7 +181,7 @@ def _alone(members: int, law: str) -> float:
 
 
 def _throughput(workers: int) -> float:
-    """Return samples a second of the processor of workers that have a shard each, all at once."""
+    """Return the total samples per second of processor time of concurrent workers."""
     context = multiprocessing.get_context("spawn")
     barrier, spent = context.Barrier(workers), context.SimpleQueue()
     started = [
@@ -197,11 +196,11 @@ def _throughput(workers: int) -> float:
 
 
 def _paced(barrier: Any, spent: Any, count: int) -> None:
-    """Take batches from a meeting with the others on, and tell the processor time."""
+    """Wait for the other workers, process batches, and send the processor time."""
     model = _rod()
     one, pieces = _shard(model, FEW), list(_batches(model, count, FEW))
     barrier.wait(PATIENCE)
-    with threadpool_limits(1):  # threads of BLAS that wait for each other are no work
+    with threadpool_limits(1):  # waiting BLAS threads would count as processor time
         begun = process_time()
         for offset, batch in pieces:
             one.step(offset, batch)
@@ -209,7 +208,7 @@ def _paced(barrier: Any, spent: Any, count: int) -> None:
 
 
 def _killed(kills: int) -> tuple[int, int, int, int]:
-    """Return estimates that differ, that are lost and that came twice, and how often was killed."""
+    """Return numbers of different, lost and repeated estimates, and of kills."""
     context = multiprocessing.get_context("spawn")
     rng, done = np.random.default_rng(0), 0
     with tempfile.TemporaryDirectory() as folder:
@@ -242,18 +241,19 @@ def _killed(kills: int) -> tuple[int, int, int, int]:
             elif done >= kills:
                 for worker in workers.values():
                     worker.join(PATIENCE)
-        wanted, different, missing, again = _written(homes[0]), 0, 0, 0
+        wanted, different, missing, repeated = _written(homes[0]), 0, 0, 0
         for home in homes[1:]:
-            found = _written(home)
-            missing += len(wanted.keys() - found.keys())
-            shared = wanted.keys() & found.keys()
-            different += sum(not np.array_equal(found[k], wanted[k]) for k in shared)
-            again += sum(len(path.read_bytes()) for path in home.glob("*.log")) - len(found) // FEW
-        return different, missing, FEW * again, done
+            written = _written(home)
+            missing += len(wanted.keys() - written.keys())
+            shared = wanted.keys() & written.keys()
+            different += sum(not np.array_equal(written[k], wanted[k]) for k in shared)
+            batches = sum(len(path.read_bytes()) for path in home.glob("*.log"))
+            repeated += batches - len(written) // FEW
+        return different, missing, FEW * repeated, done
 
 
 def _worker(home: Path, count: int, pause: float) -> None:
-    """Take the log from the last dump on: estimates by their offset, and a dump now and then."""
+    """Process batches from the last dump on, write each estimate, and dump periodically."""
     model = _rod()
     one, dump = _shard(model, FEW), home / "shard.bin"
     if dump.exists():
@@ -261,17 +261,17 @@ def _worker(home: Path, count: int, pause: float) -> None:
     for offset, batch in _batches(model, count, FEW):
         if offset < one.offset:
             continue
-        found = one.step(offset, batch)
+        estimate = one.step(offset, batch)
         with (home / "batches.log").open("ab") as log:
             log.write(b".")
-        write_bytes(home / f"{offset}.npy", found.q.tobytes())
+        write_bytes(home / f"{offset}.npy", estimate.q.tobytes())
         if offset // FEW % EVERY == EVERY - 1:
             write_bytes(dump, one.dump())
         sleep(pause)
 
 
 def _written(home: Path) -> dict[int, Array]:
-    """Return the estimates of a worker by offset."""
+    """Return the estimates that a worker wrote, by offset."""
     return {
         int(path.stem) + k: row
         for path in home.glob("*.npy")
@@ -280,15 +280,15 @@ def _written(home: Path) -> dict[int, Array]:
 
 
 def _in_process(what: Callable[[int, str], Found], count: int, law: str) -> Found:
-    """Return what a function gives in a fresh process."""
+    """Call a function in a new process, and return its result."""
     context = multiprocessing.get_context("spawn")
     mine, other = context.Pipe()
     worker = context.Process(target=_send, args=(other, what, count, law), daemon=True)
     worker.start()
     other.close()
-    found: Found = mine.recv()
+    result: Found = mine.recv()
     worker.join(PATIENCE)
-    return found
+    return result
 
 
 def _send(pipe: Connection, what: Callable[[int, str], Any], count: int, law: str) -> None:
@@ -311,7 +311,7 @@ def _heated(t: float) -> dict[str, float]:
 
 
 def _batches(model: Model, count: int, members: int) -> Iterator[tuple[int, list[Any]]]:
-    """Yield offsets and batches of a sample of every member."""
+    """Yield offsets and batches, each with a sample of every member."""
     rng, names = np.random.default_rng(0), [str(k) for k in range(members)]
     times = [STEP * k for k in range(count + 1)]
     sensors, control = Points(SENSORS).matrix(model.state_space), Advance(SensitivityLaw.scheme)

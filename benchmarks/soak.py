@@ -1,9 +1,9 @@
-"""A run of many months: memory, time of a step and size of the journal must not grow.
+"""Run of many months in which memory, step time and size of the journal must not grow.
 
-Diffusion on 31 nodes with an unknown that moves and one that does not, three sensors with noise, a
-boundary value that comes and goes; all as a live run has it: rows through the intake, samples into
-the journal, estimates out, checkpoints, retention, and a reader that has the journal open all the
-time. A row comes every minute, and each week has one fault of each kind.
+The process is diffusion on 31 nodes with a constant and a moving unknown, three noisy sensors, and
+a boundary value that is missing at times. It has all parts of a live run: intake of rows, journal,
+estimates, checkpoints, retention, and a reader that always has the journal open. A row arrives
+every minute, and each week has one fault of each kind.
 """
 
 from __future__ import annotations
@@ -52,18 +52,18 @@ from livepde.streams.intake import Intake, Policy
 from livepde.streams.sources import Rows
 from livepde.streams.table import Column
 
-MONTH = 43_830  # rows, one a minute
-WEEK = 7 * 1440  # its last fault ends 2500 rows before it does
-WARM = 10_000  # steps before memory is looked at
+MONTH = 43_830  # rows, one per minute
+WEEK = 7 * 1440  # rows; the last fault ends 2500 rows before the week does
+WARM = 10_000  # steps before memory is measured
 BLOCK = 1000  # steps of one measurement
-FRESH = 24  # steps of the one beside it, between two of its refits
-BEGUN = 36  # steps before them
-GROWTH = 5.0  # MiB of memory, at most
-SLOWER = 1.2  # last tenth of the steps over the first one, at most
-KEPT = 1.5  # times the estimates that stay, by which the journal may grow
-LOG = 32.0  # MiB of the write-ahead log, at most
-RETAINED = 20_000  # samples of which all is kept
-EVERY = 24  # of older estimates one in so many
+FRESH = 24  # timed steps of a new identifier, between two of its refits
+BEGUN = 36  # steps of the new identifier before the timed ones
+GROWTH = 5.0  # MiB, largest growth of memory
+SLOWER = 1.2  # largest step time of the last tenth over the first tenth
+KEPT = 1.5  # largest growth of the journal over the size of the retained estimates
+LOG = 32.0  # MiB, largest size of the write-ahead log
+RETAINED = 20_000  # latest samples, of which everything is retained
+EVERY = 24  # one of this many older estimates is retained
 DT = 0.05
 PERIOD = 200  # samples
 NOISE = 0.01
@@ -75,12 +75,12 @@ MIB = 2.0**20
 
 Row: TypeAlias = dict[str, Any]
 
-# Name -> its first minute in a week, the number of rows, and the rows that replace each of them.
+# Name -> first minute in the week, number of rows, and function that replaces each of these rows.
 FAULTS: Mapping[str, tuple[int, int, Callable[[Row], list[Row]]]] = {
     "ten years ahead": (500, 1, lambda row: [{**row, "t": row["t"] + 5_256_000}, row]),
     "three hours ahead": (1000, 8, lambda row: [{**row, "t": row["t"] + 180}, row]),
     "long ago": (1500, 1, lambda row: [{**row, "t": -1e7}, row]),
-    "again": (2000, 1, lambda row: [row]),  # with those before it: see `_Plant`
+    "again": (2000, 1, lambda row: [row]),  # `_Plant` also repeats the rows before it
     "set back by an hour": (2500, 60, lambda row: [{**row, "t": row["t"] - 60}]),
     "set ahead by an hour": (3000, 10, lambda row: [{**row, "t": row["t"] + 60}]),
     "a pause": (3500, 600, lambda row: []),
@@ -93,17 +93,17 @@ FAULTS: Mapping[str, tuple[int, int, Callable[[Row], list[Row]]]] = {
     "late by a day": (7500, 20, lambda row: [row, {**row, "t": row["t"] - 1440.5}]),
 }
 LOST = ("set back by an hour", "set ahead by an hour", "a pause")
-AGAIN = 100  # rows that come again
+AGAIN = 100  # repeated rows
 
 
 @dataclass
 class _Plant:
-    """Rows with the faults of each week, and how many of them are right.
+    """Rows with the faults of each week, and the number of correct rows.
 
     Attributes
     ----------
     right
-        Rows so far that have their time and some value.
+        Number of rows so far with their correct time and at least one value.
     """
 
     rows: Iterator[Row]
@@ -124,10 +124,10 @@ class _Plant:
 
 @dataclass(frozen=True)
 class Reading:
-    """What was measured after so many steps: CPU seconds of a step, MiB of memory and files.
+    """Measurement after `steps` steps: CPU seconds per step, and bytes of memory and files.
 
-    `fresh` has the CPU seconds of a step of an identifier that has just begun, at the same time: a
-    machine that others load slows both.
+    `fresh` is the CPU time per step of a new identifier, measured at the same time, because other
+    load on the machine slows both.
     """
 
     steps: int
@@ -141,7 +141,7 @@ class Reading:
 
 @dataclass
 class Meter:
-    """A sink that measures every `BLOCK` steps, and reads the journal as a page would."""
+    """Sink that measures every `BLOCK` steps, and reads the journal like the dashboard."""
 
     reader: Journal
     fresh: Callable[[], float]
@@ -152,7 +152,7 @@ class Meter:
     _since: float = field(default_factory=process_time)
 
     def put(self, estimate: Estimate) -> None:
-        """Take one estimate."""
+        """Count an estimate, and measure after every `BLOCK` of them."""
         self._steps += 1
         self.failed += not estimate.status.ok
         if self._steps % BLOCK:
@@ -166,16 +166,16 @@ class Meter:
         self._since = process_time()
 
     def close(self) -> None:
-        """The reader is closed by who opened it."""
+        """Do nothing: the owner of the reader closes it."""
 
 
 def soak(steps: int, *, share: float = 1.0, progress: bool = False) -> Outcome:
-    """Bring so many rows to a run, and hold its end against its beginning.
+    """Run `steps` rows, and compare the end of the run with its beginning.
 
     Parameters
     ----------
     share
-        Of `WARM` and `RETAINED`: runs of fewer steps have less time to warm up.
+        Factor on `WARM` and `RETAINED`, less than 1 for short runs.
     """
     warm, retained = round(share * WARM), round(share * RETAINED)
     if steps < 2 * warm:
@@ -208,8 +208,8 @@ def soak(steps: int, *, share: float = 1.0, progress: bool = False) -> Outcome:
     error = max(abs(last[name][0] / true - 1.0) for name, true in (("k", K), ("loss", LOSS)))
     lost = abs(plant.right - accepted)
     outcome = _outcome(meter, steps, kept - read, error, record=record, lost=lost, share=share)
-    told = [(kind, channel, number) for (kind, channel), number in sorted(counts.items())]
-    table = Table("What was counted", ("kind", "channel", "number"), told)
+    rows = [(kind, channel, number) for (kind, channel), number in sorted(counts.items())]
+    table = Table("Counts of the intake", ("kind", "channel", "number"), rows)
     return replace(outcome, tables=[*outcome.tables, table])
 
 
@@ -235,8 +235,8 @@ def _outcome(
     )
     shown = [*found[:: max(len(found) // 10, 1)][:10], last]
     table = Table(
-        f"{steps / MONTH:.3g} months on 31 nodes, all kept of {retained} samples, of older "
-        f"estimates 1 in {EVERY}",
+        f"{steps / MONTH:.3g} months on 31 nodes; the last {retained} samples and 1 of {EVERY} "
+        "older estimates are retained",
         (
             "steps",
             "ms of a step (CPU)",
@@ -291,7 +291,7 @@ def _identifier() -> Identifier:
 
 
 def _fresh() -> Callable[[], float]:
-    """Return what measures the CPU seconds of a step of an identifier that has just begun."""
+    """Return a function that measures the CPU time per step of a new identifier, in s."""
     identifier = _identifier()
     rows = list(islice(_rows(identifier.model), BEGUN + FRESH))
 
@@ -313,8 +313,8 @@ def _fresh() -> Callable[[], float]:
 
 
 def _rows(model: Model) -> Iterator[Row]:
-    """Yield rows without end: a periodic truth of the estimator's scheme, and noise."""
-    run_up = 6 * PERIOD  # after five periods nothing is left of the start
+    """Yield rows without end, from a periodic truth of the estimator's scheme with noise."""
+    run_up = 6 * PERIOD  # the effect of the initial state decays within five periods
     phase = 2 * np.pi * np.arange(run_up + 1) / PERIOD
     times, left = DT * np.arange(run_up + 1), 1.0 + np.sin(phase)
 
@@ -342,11 +342,11 @@ def _record_size(path: Path) -> float:
 
 
 def _memory() -> tuple[float, float]:
-    """Return bytes of memory: of this process alone, and with what it shares."""
+    """Return the private and the resident memory of this process, in bytes."""
     try:
         _, resident, shared, *_ = Path("/proc/self/statm").read_text().split()
     except OSError:
-        raise RunError("benchmark soak reads /proc/self/statm: it needs Linux.") from None
+        raise RunError("benchmark soak reads /proc/self/statm and requires Linux.") from None
     page = os.sysconf("SC_PAGE_SIZE")
     return page * (int(resident) - int(shared)), page * int(resident)
 

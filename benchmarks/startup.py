@@ -1,9 +1,8 @@
-"""What `import livepde` costs against the import of the libraries that it stands on.
+"""Cost of `import livepde` relative to the import of its main dependencies.
 
-Every import is timed in a fresh process, by the processor time of the statement alone: the start of
-the interpreter is not counted. In each round the imports follow each other, and the ratio is that
-of one round, so that a slow moment of the machine hits both. Bytecode is written once beforehand,
-as pip does for what it installs.
+Each import is timed in a new process, by the processor time of the statement without the start of
+the interpreter. Ratios are computed within a round of consecutive imports, so that other load on
+the machine affects both. Bytecode is written beforehand, as pip does for installed packages.
 """
 
 from __future__ import annotations
@@ -33,12 +32,12 @@ print(process_time() - begun)
 
 
 def startup(rounds: int = 15) -> Outcome:
-    """Time the import of livepde, and the import with what a short script uses of it.
+    """Time the import of livepde, without and with the names that a short script uses.
 
     Parameters
     ----------
     rounds
-        Fresh processes of each import.
+        Number of new processes for each import.
     """
     codes = (BASE, IMPORT, SCRIPT)
     with TemporaryDirectory() as cache:
@@ -51,7 +50,7 @@ def startup(rounds: int = 15) -> Outcome:
         rows.append((code, low, middle, high))
         checks.append(Check(code, middle, BOUND, "<="))
     table = Table(f"Time over that of: {BASE}", ("code", "min", "median", "max"), rows)
-    note = f"Ratios of processor times of {rounds} fresh processes of each, round by round."
+    note = f"Ratios of processor times in {rounds} rounds, each with a new process per import."
     return Outcome(tables=[table], checks=checks, notes=[note])
 
 

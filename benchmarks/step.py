@@ -1,11 +1,10 @@
-"""Cost of one step of each law against one forward step of the same model.
+"""Cost of one step of each law relative to one forward step of the same model.
 
-The gradient law is timed from the first sample on, in turns with steps of the same model and the
-same scheme with a known parameter, the matrix factorised once: the median is that of usual steps,
-the mean also holds the first ones and those that factorise. A run of the sensitivity law, without
-refits, is timed in stretches of steps, one right after the other, so that a slow moment of the
-machine hits both.
-Times are those of the processor: what else runs on the machine is not counted.
+The gradient law is timed from the first sample on. Its steps alternate with forward steps of the
+same model and scheme with a known parameter and a stored factorisation. The median describes usual
+steps; the mean includes the first steps and steps that factorise. The sensitivity law, without
+refits, is timed in stretches of steps that alternate with stretches of forward steps, so that other
+load on the machine affects both. All times are processor times.
 """
 
 from __future__ import annotations
@@ -28,13 +27,13 @@ from livepde.reproduce import seed
 from livepde.runs import Outcome
 from livepde.stepping import Advance, Scheme, simulate
 
-SIZES = (31, 1_000, 10_000, 100_000)  # nodes
-MODES = (1, 10, 50)  # reduced unknowns of the sensitivity law
+SIZES = (31, 1_000, 10_000, 100_000)  # numbers of nodes
+MODES = (1, 10, 50)  # modes of the sensitivity law
 QUICK_SIZES, QUICK_MODES = (31, 10_000), (1, 10)
-LONGEST_ROD = 1_000  # nodes of the rod; more are those of a square
+LONGEST_ROD = 1_000  # largest number of nodes of the rod; larger meshes are squares
 GAINS = ((1.0, 0.1), (1e2, 0.1), (1e4, 0.1), (1e4, 1.0))  # gain and c_1 of the gradient law
-FIRST = 100  # samples over which steps of the gradient law are timed, the first one included
-MEDIAN, MEAN = 2.5, 4.0  # forward steps that one of them may cost on a square
+FIRST = 100  # timed samples of the gradient law, including the first one
+MEDIAN, MEAN = 2.5, 4.0  # bounds on its cost on a square, in forward steps
 SENSORS = 25
 BESIDE: tuple[tuple[str, Shadows | None, bool | str], ...] = (
     (", no shadows, no verdict", None, False),
@@ -42,9 +41,9 @@ BESIDE: tuple[tuple[str, Shadows | None, bool | str], ...] = (
     (", no shadows", None, True),
     ("", Shadows(), True),
 )
-"""What the sensitivity law follows beside its estimates."""
+"""Suffix of the row, shadows and verdict of the sensitivity law."""
 
-SETTLED = 24  # steps after which one of some is shadowed
+SETTLED = 24  # untimed steps; the first 16 have shadows each, later only one in eight
 
 
 Row: TypeAlias = tuple[int, str, float, float, float, float, float | None, float | None]
@@ -52,24 +51,24 @@ Row: TypeAlias = tuple[int, str, float, float, float, float, float | None, float
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A process that is simulated and identified.
+    """Process that is simulated and identified.
 
     Attributes
     ----------
     model, omega
-        The process, and where it is observed for the gradient law.
+        Model, and the subdomain that the gradient law observes.
     points
-        What the sensitivity law observes.
+        Sensors of the sensitivity law.
     q_true, u_true
-        The exact parameter, and the exact state at (x, t).
+        Exact parameter, and exact state at (x, t).
     width
-        Time step, a binary number: the differences of all times are exactly this.
+        Time step; a multiple of a power of two, so that differences of times are exact.
     beginning
-        Steps that are not timed: the law has not found in yet.
+        Number of untimed initial steps, in which shadows are computed more often.
     steps, stretches
-        Steps that are timed at once, and how often that is done in a run.
+        Steps of a timed stretch, and number of stretches in a run.
     runs
-        How often the run is repeated.
+        Number of runs.
     """
 
     model: Model
@@ -90,7 +89,7 @@ class Problem:
     def forward(
         self, q: Any, count: int | None = None, scheme: Scheme = GradientLaw.scheme
     ) -> Iterator[tuple[float, Array]]:
-        """Simulate with a known parameter: the initial state, and after each step."""
+        """Simulate with a known parameter, and yield times and states from the start on."""
         known = self.model.initial_parameter(q)
         count = self.beginning + self.steps * self.stretches if count is None else count
         times = (self.width * np.arange(count + 1)).tolist()
@@ -98,8 +97,8 @@ class Problem:
 
 
 def problem(size: int) -> Problem:
-    """Return the paper's example with so many nodes, or the same on a square if there are many."""
-    # Stretches are long, or the forward steps would find the processor's caches without their data.
+    """Return the paper's example with `size` nodes, or a square beyond `LONGEST_ROD` nodes."""
+    # Stretches are long, so that the processor's caches contain the data of the forward steps.
     steps, stretches, runs = (90, 1, 15) if size <= 100 else (30, 3, 3)
     if size <= LONGEST_ROD:
         model, omega = seed.build(nodes=size)
@@ -136,14 +135,14 @@ def _source(x: Any, t: float) -> Any:
 
 
 def step(sizes: Sequence[int] = SIZES, modes: Sequence[int] = MODES) -> Outcome:
-    """Time both laws at several numbers of nodes.
+    """Time both laws for several numbers of nodes.
 
     Parameters
     ----------
     sizes
-        Numbers of nodes: of the paper's example up to 1000, beyond them of the same on a square.
+        Numbers of nodes: the paper's example up to 1000 nodes, and a square beyond.
     modes
-        Reduced unknowns of the sensitivity law, whose cost is bounded beyond 1000 nodes.
+        Numbers of modes of the sensitivity law. Bounds on its cost apply beyond 1000 nodes.
     """
     rows: list[Row] = []
     checks: list[Check] = []
@@ -160,7 +159,7 @@ def step(sizes: Sequence[int] = SIZES, modes: Sequence[int] = MODES) -> Outcome:
         for count in modes:
             if count > given.model.Q.free.sum():
                 continue
-            bare = np.inf  # of the law without shadows and verdict, which comes first
+            bare = np.inf  # median cost without shadows and verdict, measured first
             for beside, shadows, verdict in BESIDE:
                 name, bound = f"sensitivity, modes {count}{beside}", 2.0 + count / 3.0
                 law = SensitivityLaw(
@@ -180,18 +179,17 @@ def step(sizes: Sequence[int] = SIZES, modes: Sequence[int] = MODES) -> Outcome:
     columns = ("nodes", "law", "min", "median", "max", "mean", "more", "bound")
     table = Table("One step over one forward step", columns, rows)
     note = (
-        "Ratios of processor times taken in one process; the forward step is livepde.simulate with "
-        f"the factor kept. Gradient law: the first {FIRST} samples, each step over the median "
-        f"forward step; sensitivity law: stretches of steps after the first {SETTLED}, no "
-        "refits, with and without its shadows of the discretisation error and its verdict; more: "
-        "what these add to the step without both, by the medians. A forward step is one of the "
-        "law's own scheme."
+        "Ratios of processor times measured in one process. A forward step is livepde.simulate "
+        "with the law's scheme and a stored factorisation. Gradient law: each of the first "
+        f"{FIRST} samples over the median forward step. Sensitivity law: stretches of steps after "
+        f"the first {SETTLED}, without refits, with and without estimates of the discretisation "
+        "error (shadows) and verdict. more: relative increase of the median due to these."
     )
     return Outcome(tables=[table], checks=checks, notes=[note])
 
 
 def first_steps(given: Problem, law: GradientLaw) -> tuple[float, float, float, float]:
-    """Return least, median, largest and mean cost of the first steps, in forward steps."""
+    """Return smallest, median, largest and mean cost of the first steps, in forward steps."""
     G = given.omega.matrix(given.model.state_space)
     samples = [(t, G @ u) for t, u in given.forward(given.q_true, FIRST)]
     spent: list[float] = []

@@ -1,10 +1,10 @@
-"""Cost of a usual sample of `SensitivityLaw` with its defaults on rods, in forward steps.
+"""Cost of a usual sample of the default `SensitivityLaw` on rods, in forward steps.
 
-The samples 100 to 300 of a stream are timed one by one. Then follow forward steps of the same model
-by implicit Euler with a known parameter, its matrix factorised once. Between samples these steps
-would find the processor's caches without their data. A sample is the same work in each run.
-Therefore its least time over all runs counts, so that slow moments of the machine do not. A sample
-includes a refit if `Estimate.fit` has changed after it.
+Samples 100 to 300 of a stream are timed individually. Afterwards, forward steps of the same model
+are timed, with implicit Euler, a known parameter and a stored factorisation. Between samples, they
+would miss the processor's caches. A sample is the same work in each run. Therefore its shortest
+time over all runs counts, which excludes other load on the machine. A sample includes a refit if it
+changes `Estimate.fit`.
 """
 
 from __future__ import annotations
@@ -31,33 +31,33 @@ BOUNDS: dict[tuple[int, int], float] = {
     (200, 10): 14.0,
     (1_000, 10): 24.0,
 }
-"""Nodes, unknowns -> forward steps that the median sample may cost."""
+"""Nodes, unknowns -> bound on the median cost of a sample, in forward steps."""
 
-FIRST, LAST = 100, 300  # samples that count
-MEAN = 1.3  # times the median that the mean may be
-LARGEST = 60.0  # forward steps of a call without a refit
+FIRST, LAST = 100, 300  # first and last timed sample
+MEAN = 1.3  # bound on the mean over the median
+LARGEST = 60.0  # bound on the cost of a sample without a refit, in forward steps
 RUNS = 5
 MEMBERS, MEMBERS_NODES = 1_000, 31
-MEMBER = 3.0  # forward steps of a member of a fleet, in the mean
+MEMBER = 3.0  # bound on the mean cost of a sample of a fleet's member, in forward steps
 NOTE = (
-    "The default law: one forward step is livepde.simulate by implicit Euler, with the factor "
-    "kept. Of each sample the least time of all runs counts, since its work is the same in each. "
-    "mean: refits included; largest: without them."
+    "Default law: a forward step is livepde.simulate with implicit Euler and a stored "
+    "factorisation. The shortest time of each sample over all runs counts, since its work is the "
+    "same in each run. mean: with refits; largest: without refits."
 )
 
 Times: TypeAlias = tuple[Array, Mask, Array]
-"""Of each sample, whether each had a refit, and of each forward step."""
+"""Times of samples, whether each sample had a refit, and times of forward steps."""
 
 
 def usual_step(sizes: Sequence[int] = (), *, runs: int = RUNS, members: int = MEMBERS) -> Outcome:
-    """Time samples of the default law on rods of some sizes, and of a fleet.
+    """Time samples of the default law on rods, and on a fleet.
 
     Parameters
     ----------
     sizes
-        Numbers of nodes; empty: all of `BOUNDS`.
+        Numbers of nodes; empty: all numbers in `BOUNDS`.
     runs
-        How often each rod is run.
+        Number of runs of each rod.
     members
         Number of members of a fleet of rods with 31 nodes; 0: no fleet.
     """
@@ -92,7 +92,7 @@ def usual_step(sizes: Sequence[int] = (), *, runs: int = RUNS, members: int = ME
 
 
 def _timed(given: Rod, runs: int) -> Times:
-    """Return the least times of samples and forward steps over some runs."""
+    """Return the shortest times of samples and forward steps over all runs."""
     samples, spent, forward = given.samples(LAST), [], []
     refits = np.zeros(LAST - FIRST + 1, dtype=bool)
     for _ in range(runs):
@@ -111,7 +111,7 @@ def _timed(given: Rod, runs: int) -> Times:
 
 
 def _fleet(members: int) -> tuple[float, float]:
-    """Return median and mean cost of a sample of one member, in forward steps."""
+    """Return median and mean cost of a sample per member of a fleet, in forward steps."""
     given = Rod(MEMBERS_NODES, 2, "source")
     fleet = Fleet(given.model, given.sensors, SensitivityLaw(), members, u0=0.0)
     spent = []

@@ -1,6 +1,6 @@
-"""The walks of docs/first-hour.md with one channel that is wrong: late, scaled, exchanged, in °F.
+"""The walks of docs/first-hour.md with one wrong channel: late, scaled, exchanged or in °F.
 
-A run of such a table must not be trusted, and has to name the channel first.
+The run of such a table must not be trusted, and must name the channel first.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from livepde.runs import Outcome
 from livepde.verdict import Verdict
 
 Array = NDArray[Any]
-NAMED = 0.8  # of the runs
+NAMED = 0.8  # smallest share of runs that name the channel first
 SCALE = 1.15
 WITHOUT = """
-Left out are faults that other numbers explain as well: a scale of the rate of a pumping test, of
-the heat into a borehole or of a flux plate multiplies the unknowns. In a column with one probe, and
-in a pumping test with two wells, either channel may be named: only their ratio is known, as a
-factor on all readings is one on T and S.
+Faults that other unknowns explain equally well are excluded: a scale of the rate of a pumping test,
+of the heat into a borehole or of a flux plate multiplies the unknowns. In a column with one probe,
+and in a pumping test with two wells, either channel may be named, because the data determine only
+their ratio: a factor on all readings is equivalent to a factor on T and S.
 """
 
 
 class Fault(NamedTuple):
-    """A channel, or two, of a walk, and what is wrong with them.
+    """Fault of one or two channels of a walk.
 
     Attributes
     ----------
     walk, channels
-        The walk, and its channels; of several, either may be named.
+        Walk, and its faulty channels; if there are several, the run may name either.
     kind
         "late", "scaled", "fahrenheit", "exchanged" or "offset".
     amount
-        How late, in intervals of the sensors; by how much an "offset" is too high.
+        Delay in sampling intervals of "late", or shift of "offset".
     """
 
     walk: str
@@ -82,40 +82,40 @@ FAULTS = (
 
 
 def with_fault(fault: Fault, header: Sequence[str], table: Array, columns: dict[str, str]) -> Array:
-    """Return a table with a fault.
+    """Return a copy of a table with a fault.
 
     Parameters
     ----------
     columns
         Channel -> its column.
     """
-    found, t = table.copy(), table[:, 0]
+    faulty, t = table.copy(), table[:, 0]
     places = [list(header).index(columns[name]) for name in fault.channels]
     first = places[0]
     if fault.kind == "exchanged":
-        found[:, places] = table[:, places[::-1]]
+        faulty[:, places] = table[:, places[::-1]]
     elif fault.kind == "scaled":
-        found[:, first] *= SCALE
+        faulty[:, first] *= SCALE
     elif fault.kind == "offset":
-        found[:, first] += fault.amount
+        faulty[:, first] += fault.amount
     elif fault.kind == "fahrenheit":
-        found[:, first] = 1.8 * table[:, first] + 32.0
+        faulty[:, first] = 1.8 * table[:, first] + 32.0
     else:
         known = np.isfinite(table[:, first])
-        # An interval of the sensors: rows of inputs that are written at changes lie between.
+        # Sampling interval of the sensors: rows of inputs logged at changes lie in between.
         seen = np.isfinite(table[:, -1])
         delay = fault.amount * float(np.median(np.diff(t[seen])))
         late = t[known] + delay
         if known.all():
-            found[:, first] = np.interp(t, late, table[known, first])
-        else:  # values that are written at changes hold until the next one
+            faulty[:, first] = np.interp(t, late, table[known, first])
+        else:  # an input logged at changes is constant until the next change
             at = np.searchsorted(late, t, side="right") - 1
-            found[:, first] = table[known, first][np.maximum(at, 0)]
-    return found
+            faulty[:, first] = table[known, first][np.maximum(at, 0)]
+    return faulty
 
 
 def first_named(verdict: Verdict) -> str:
-    """Return the channel that the first finding with causes names first; empty if none does."""
+    """Return the channel that the first finding with a cause or a channel names; default empty."""
     for finding in verdict.findings:
         if finding.causes:
             return finding.causes[0].subject
@@ -125,12 +125,12 @@ def first_named(verdict: Verdict) -> str:
 
 
 def wrong_channels(faults: Sequence[Fault], *, seeds: int, progress: bool = False) -> Outcome:
-    """Run the walks with one wrong channel each.
+    """Run walks with one wrong channel each.
 
     Parameters
     ----------
     seeds
-        Truths of each.
+        Number of truths for each fault.
     """
     todo = [(fault, seed) for fault in faults for seed in range(seeds)]
     rows, trusted, named = [], 0, 0
@@ -149,7 +149,7 @@ def wrong_channels(faults: Sequence[Fault], *, seeds: int, progress: bool = Fals
 
 
 def _judged(fault: Fault, seed: int) -> tuple[str, str, str]:
-    """Return the level of the verdict, the first channel that it names, and its cause."""
+    """Return the level of the verdict, the channel that it names first, and the first cause."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / FOLDER.relative_to(ROOT)
         shutil.copytree(FOLDER, folder)
@@ -160,7 +160,7 @@ def _judged(fault: Fault, seed: int) -> tuple[str, str, str]:
         prepared = load(folder / f"{fault.walk}.toml").prepare()
         last = prepared.identifier.run(prepared.stream).last
         if last is None:
-            raise RuntimeError(f"{fault}: no sample was taken")
+            raise RuntimeError(f"{fault}: the run has no samples")
         verdict = last.verdict
         texts = [cause.text for finding in verdict.findings for cause in finding.causes]
         return verdict.level, first_named(verdict), (texts or ["–"])[0]
