@@ -1,6 +1,6 @@
-"""Census of verdicts: runs with and without something wrong, and what each run says of itself.
+"""Census of verdicts on runs with and without faults.
 
-Truths come from the codes of `benchmarks.honest`, which share nothing with livepde.
+Truths come from the codes of `benchmarks.honest`, which are independent of livepde.
 """
 
 from benchmarks.census.faults import FAULTS

@@ -1,4 +1,4 @@
-"""What can be wrong with sensors, channels, process, model and settings of a run."""
+"""Faults of sensors, channels, process, model and settings of a run."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from benchmarks.honest.problem import Problem
 from benchmarks.honest.problems import PROBLEMS
 
 Array = NDArray[Any]
-HALF = 0.5  # of the run, when what is sudden begins
+HALF = 0.5  # share of the run after which sudden faults begin
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The data of a run, and what livepde is told.
+    """Data of a run, and the configuration of livepde.
 
     Attributes
     ----------
     problem, theta
-        The process, and the coordinates of its truth.
+        Process, and coordinates of its truth.
     z
         Readings without noise, shape (samples, sensors).
     errors
-        What noise does to them, of the same shape, in units of the noise.
+        Noise of the readings in units of `noise`, shape (samples, sensors).
     inputs
         Channels as livepde reads them, shape (samples, channels).
     noise
         True standard deviation of the sensors.
     sensor
-        Which sensor is the faulty one.
+        Index of the faulty sensor.
     rng
-        For what is drawn.
+        Generator of random numbers.
     points, model, u0, scheme, held
-        What livepde is told.
+        Configuration of livepde; `held` means piecewise constant inputs.
     subject
-        What is wrong, by name; empty for the process.
-    told
-        Problem whose process livepde is told; None for that of the truth.
+        Name of the faulty part; empty for the process.
+    believed
+        Problem whose process livepde uses; None for the problem of the truth.
     """
 
     problem: Problem
@@ -61,11 +61,11 @@ class Scene:
     scheme: Any = None
     held: bool = False
     subject: str = ""
-    told: Problem | None = None
+    believed: Problem | None = None
 
     @property
     def name(self) -> str:
-        """The name of the faulty sensor."""
+        """Name of the faulty sensor."""
         return list(self.points)[self.sensor]
 
     @property
@@ -74,19 +74,19 @@ class Scene:
         return len(self.z)
 
     def like(self, other: Problem) -> Problem:
-        """Return another problem with as many samples and sensors as this one."""
+        """Return another problem, shortened to the samples and sensors of this scene."""
         return shortened(other, self.length - 1, self.z.shape[1])
 
 
 def shortened(problem: Problem, intervals: int, sensors: int) -> Problem:
-    """Return the first intervals of a problem with the first sensors."""
+    """Return a problem with only its first intervals and its first sensors."""
     if intervals >= problem.intervals and sensors >= len(problem.points):
         return problem
-    found = copy.copy(problem)
-    found.length = problem.length * intervals / problem.intervals
-    found.intervals = intervals
-    found.points = dict(list(problem.points.items())[:sensors])
-    return found
+    short = copy.copy(problem)
+    short.length = problem.length * intervals / problem.intervals
+    short.intervals = intervals
+    short.points = dict(list(problem.points.items())[:sensors])
+    return short
 
 
 Change = Callable[[Scene], Scene]
@@ -94,26 +94,26 @@ Change = Callable[[Scene], Scene]
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that is wrong.
+    """Fault of a run.
 
     Attributes
     ----------
     text
-        What it is.
+        Description of the fault.
     change
-        Makes it so.
+        Function that adds the fault to a scene.
     kinds
-        Causes of a verdict that name it; empty where none can.
+        Kinds of causes of a verdict that name the fault correctly; empty if there are none.
     only
-        Problems that it is for; empty for all that have what it needs.
+        Problems with this fault; empty for all problems that meet its requirements.
     channels
-        Whether it needs a channel.
+        Whether the fault requires a channel.
     late
-        Whether it begins in the middle of the run.
+        Whether the fault begins in the middle of the run.
     own_state
-        Whether it needs an initial state that is told.
+        Whether the fault requires a problem with a given initial state.
     traced
-        Whether it is one of readings, channels or process: not of noise, start or settings.
+        Whether it is a fault of readings, channels or process, not of noise, start or settings.
     """
 
     text: str
@@ -127,7 +127,7 @@ class Fault:
 
 
 def _sensor(change: Callable[[Scene, Array], Array]) -> Change:
-    """Return the change of the readings of one sensor."""
+    """Return a change of the readings of the faulty sensor."""
 
     def changed(scene: Scene) -> Scene:
         z = scene.z.copy()
@@ -152,7 +152,7 @@ def _scaled(values: Array, factor: float) -> Array:
 
 
 def _errors(change: Callable[[Scene, Array], Array]) -> Change:
-    """Return the change of the errors of one sensor."""
+    """Return a change of the noise of the faulty sensor."""
 
     def changed(scene: Scene) -> Scene:
         errors = scene.errors.copy()
@@ -162,14 +162,14 @@ def _errors(change: Callable[[Scene, Array], Array]) -> Change:
     return changed
 
 
-def _following(scene: Scene, errors: Array) -> Array:
-    rho, found = 0.95, errors.copy()
+def _autoregressive(scene: Scene, errors: Array) -> Array:
+    rho, noise = 0.95, errors.copy()
     for k in range(1, len(errors)):
-        found[k] = rho * found[k - 1] + np.sqrt(1.0 - rho**2) * errors[k]
-    return found
+        noise[k] = rho * noise[k - 1] + np.sqrt(1.0 - rho**2) * errors[k]
+    return noise
 
 
-def _stands(scene: Scene) -> Scene:
+def _stuck(scene: Scene) -> Scene:
     z, errors, half = scene.z.copy(), scene.errors.copy(), int(HALF * scene.length)
     z[half:, scene.sensor], errors[half:, scene.sensor] = z[half, scene.sensor], 0.0
     return replace(scene, z=z, errors=errors, subject=scene.name)
@@ -190,34 +190,34 @@ def _moved(scene: Scene) -> Scene:
 
 
 def _slow(scene: Scene, values: Array) -> Array:
-    """Return a sensor that follows its surroundings with a time constant of four samples."""
-    found, share = values.copy(), 1.0 - np.exp(-1.0 / 4.0)
+    """Return readings of a sensor with a time constant of four samples."""
+    lagged, share = values.copy(), 1.0 - np.exp(-1.0 / 4.0)
     for k in range(1, len(values)):
-        found[k] = found[k - 1] + share * (values[k] - found[k - 1])
-    return np.asarray(found)
+        lagged[k] = lagged[k - 1] + share * (values[k] - lagged[k - 1])
+    return np.asarray(lagged)
 
 
 def _means(scene: Scene) -> Scene:
-    """Return the scene in which a reading is the mean of the last eight."""
+    """Return a scene in which each reading is the mean of the last eight."""
     z = np.cumsum(np.concatenate([np.repeat(scene.z[:1], 8, axis=0), scene.z]), axis=0)
     return replace(scene, z=(z[8:] - z[:-8]) / 8.0)
 
 
 def _common(scene: Scene) -> Scene:
-    """Return the scene with an error that all sensors share and that fades slowly."""
-    shared = _following(scene, scene.rng.standard_normal(scene.length))
+    """Return a scene with an autoregressive error that all sensors share."""
+    shared = _autoregressive(scene, scene.rng.standard_normal(scene.length))
     return replace(scene, errors=scene.errors + 1.5 * shared[:, None])
 
 
 def _rounded(scene: Scene) -> Scene:
-    """Return the scene whose readings have steps of three standard deviations."""
+    """Return a scene with readings rounded to steps of three standard deviations."""
     step = 3.0 * scene.noise
     shown = np.round((scene.z + scene.noise * scene.errors) / step) * step
     return replace(scene, errors=(shown - scene.z) / scene.noise)
 
 
 def _depths(scene: Scene) -> Scene:
-    """Return the scene in which all places are 5 % too deep, as far as the process reaches."""
+    """Return a scene in which livepde uses positions that are 5 % too deep."""
     points = {
         name: 1.05 * place if np.ndim(place) == 0 else tuple(1.05 * np.asarray(place))
         for name, place in scene.points.items()
@@ -231,7 +231,7 @@ def _saturated(scene: Scene, values: Array) -> Array:
 
 
 def _rod(truth: Callable[[Problem, float], Array]) -> Change:
-    """Return the change by which the readings are those of another rod with the same k."""
+    """Return a change that replaces the readings by those of another rod with the same k."""
 
     def changed(scene: Scene) -> Scene:
         k = float(np.exp(scene.problem.latents["k"].value(scene.theta, 0)).item())
@@ -260,7 +260,7 @@ def _channels_swapped(scene: Scene) -> Scene:
 
 
 def _other(scene: Scene, share: Array) -> Scene:
-    """Return the scene whose first coordinate moves by 1.5 prior deviations, as share says."""
+    """Return a scene whose first coordinate moves by 1.5, with weight `share` at each sample."""
     theta = scene.theta.copy()
     theta[0] += 1.5 if theta[0] < 0.0 else -1.5
     z = scene.problem.predict(theta)
@@ -277,7 +277,7 @@ def _ramp(scene: Scene) -> Scene:
 
 
 def _lacks(of: str, **other: float) -> Change:
-    """Return the change by which the truth is that of another problem with the same sensors."""
+    """Return a change that uses the truth of another problem with the same sensors."""
 
     def changed(scene: Scene) -> Scene:
         truth = scene.like(PROBLEMS[of])
@@ -306,7 +306,7 @@ def _bent(scene: Scene) -> Scene:
     theta[1] = 1.5
     rod = scene.like(PROBLEMS["rod"])
     z = scene.problem.predict(theta)
-    return replace(scene, z=z, theta=theta, model=rod.model, told=rod)
+    return replace(scene, z=z, theta=theta, model=rod.model, believed=rod)
 
 
 def _with_u0(scene: Scene) -> Scene:
@@ -315,23 +315,23 @@ def _with_u0(scene: Scene) -> Scene:
 
 FAULTS: Mapping[str, Fault] = {
     "offset": Fault(
-        "a sensor reads 4 sigma too much",
+        "a sensor reads 4 sigma too high",
         _sensor(lambda s, v: v + 4.0 * s.noise),
         ("offset", "drift"),
     ),
     "offset, late": Fault(
-        "the same from the middle on",
+        "a sensor reads 4 sigma too high from the middle on",
         _sensor(lambda s, v: _late(s, v, v + 4.0 * s.noise)),
         ("offset", "drift"),
         late=True,
     ),
     "drift": Fault(
-        "a sensor drifts by 8 sigma in all",
+        "a sensor drifts by 8 sigma in total",
         _sensor(lambda s, v: v + 8.0 * s.noise * np.linspace(0.0, 1.0, len(v))),
         ("drift", "offset"),
     ),
     "scale": Fault(
-        "a sensor's scale is off by 20 %", _sensor(lambda s, v: _scaled(v, 1.2)), ("gain",)
+        "a sensor's scale is 20 % too large", _sensor(lambda s, v: _scaled(v, 1.2)), ("gain",)
     ),
     "unit": Fault(
         "a sensor in degrees Fahrenheit",
@@ -341,15 +341,15 @@ FAULTS: Mapping[str, Fault] = {
     "sign": Fault("a sensor with the wrong sign", _sensor(lambda s, v: -v), ("gain",)),
     "lag": Fault("a sensor is 4 samples late", _sensor(lambda s, v: _shifted(v, 4.0)), ("lag",)),
     "lag, late": Fault(
-        "the same from the middle on",
+        "a sensor is 4 samples late from the middle on",
         _sensor(lambda s, v: _late(s, v, _shifted(v, 4.0))),
         ("lag",),
         late=True,
     ),
     "lead": Fault("a sensor is 4 samples early", _sensor(lambda s, v: _shifted(v, -4.0)), ("lag",)),
-    "position": Fault("a sensor sits 5 % of the length away", _moved, ("position",)),
+    "position": Fault("a sensor's position is 0.05 too large", _moved, ("position",)),
     "swapped": Fault("two sensors are swapped", _swapped, ("exchange",)),
-    "stands": Fault("a sensor stands still", _stands, ("stuck", "offset", "gain"), late=True),
+    "stands": Fault("a sensor is stuck", _stuck, ("stuck", "offset", "gain"), late=True),
     "noisy": Fault("a sensor is four times as noisy", _errors(lambda s, e: 4.0 * e), traced=False),
     "burst": Fault(
         "a sensor is five times as noisy for a tenth of the run",
@@ -357,7 +357,7 @@ FAULTS: Mapping[str, Fault] = {
         traced=False,
     ),
     "following": Fault(
-        "errors of a sensor that follow each other, 0.95", _errors(_following), traced=False
+        "errors of a sensor are AR(1) with coefficient 0.95", _errors(_autoregressive), traced=False
     ),
     "heavy tails": Fault(
         "Student errors with 3 degrees of freedom",
@@ -365,13 +365,13 @@ FAULTS: Mapping[str, Fault] = {
         traced=False,
     ),
     "channel offset": Fault(
-        "a channel reads 6 sigma too much",
+        "a channel reads 6 sigma too high",
         _channel(lambda s, v: v + 6.0 * s.noise),
         ("boundary", "channel", "source", "flux", "offset"),
         channels=True,
     ),
     "channel scale": Fault(
-        "a channel's scale is off by 20 %",
+        "a channel's scale is 20 % too large",
         _channel(lambda s, v: 1.2 * v),
         ("boundary", "channel", "gain"),
         channels=True,
@@ -382,7 +382,7 @@ FAULTS: Mapping[str, Fault] = {
         ("boundary", "channel", "lag"),
         channels=True,
     ),
-    "channel gaps": Fault("30 % of a channel missing", _channel(_gaps), channels=True),
+    "channel gaps": Fault("30 % of a channel are missing", _channel(_gaps), channels=True),
     "channels swapped": Fault(
         "two channels are swapped",
         _channels_swapped,
@@ -394,7 +394,7 @@ FAULTS: Mapping[str, Fault] = {
         "the initial state is 15 sigma off", _with_u0, ("initial",), own_state=True, traced=False
     ),
     "jump": Fault("the first unknown jumps", _jump, ("jump",), late=True),
-    "ramp": Fault("the first unknown moves all along", _ramp, ("jump",)),
+    "ramp": Fault("the first unknown moves during the whole run", _ramp, ("jump",)),
     "loss": Fault(
         "a loss is missing in the model",
         _lacks("lossy-rod", t1=1.0, t2=-0.67),
@@ -409,15 +409,15 @@ FAULTS: Mapping[str, Fault] = {
     ),
     "layers": Fault("layers are missing in the model", _layers, only=("rod",)),
     "bend": Fault(
-        "the conductivity depends on the temperature, in the model it does not",
+        "the conductivity depends on the temperature, but not in the model",
         _bent,
         only=("warm-rod",),
     ),
     "slow": Fault("a sensor with a time constant of 4 samples", _sensor(_slow), ("lag",)),
     "means": Fault("readings are means of the last 8 samples", _means, ("lag",)),
     "saturates": Fault("a sensor saturates at 80 % of its range", _sensor(_saturated)),
-    "common noise": Fault("an error of all sensors that fades slowly", _common, traced=False),
-    "rounded": Fault("readings have steps of three sigma", _rounded, traced=False),
+    "common noise": Fault("all sensors share an AR(1) error", _common, traced=False),
+    "rounded": Fault("readings are rounded to steps of 3 sigma", _rounded, traced=False),
     "depths": Fault("all depths are 5 % too large", _depths, only=("rod", "profile", "wall")),
     "advection": Fault("a flow is missing in the model", _rod(rods.advected), only=("rod",)),
     "contact": Fault("a contact resistance is missing", _rod(rods.contact), only=("rod",)),
@@ -430,12 +430,12 @@ FAULTS: Mapping[str, Fault] = {
     ),
     "nonlinear sink": Fault("a sink of 0.5 u |u| is missing", _rod(rods.nonlinear), only=("rod",)),
     "steps": Fault(
-        "implicit Euler, one step a sample",
+        "implicit Euler with one step per sample",
         lambda s: replace(s, scheme=lp.ImplicitEuler()),
         traced=False,
     ),
     "held": Fault(
-        "channels are held, not straight",
+        "channels are piecewise constant, not linear, between samples",
         lambda s: replace(s, held=True),
         channels=True,
         traced=False,

@@ -16,21 +16,21 @@ from livepde.runs import Outcome
 if TYPE_CHECKING:
     from benchmarks.census.run import Score
 
-WRONG = 3.0  # standard deviations
-SILENT = 0.01  # share of all runs that are wrong and trusted, at most
-SILENT_WRONG = 0.03  # share of wrong runs that are trusted and off, at most
-GRAVE = 0.2  # relative error that may be trusted in `FALSE` of the wrong runs
-NEAR, REFUSED = 0.05, 0.2  # of runs with a smaller error, at most this share are not to be trusted
-FALSE = 0.02  # share of sound runs that are doubted, at most
-COVERED = 0.90  # share of numbers of wrong runs in the interval that allows for model errors
-COVERED_CAUTION = 0.95  # the same of runs with a caution
-WIDER = 1.1, 1.15, 1.5  # median, mean and 95 % quantile of its width where nothing is wrong
-RANKED = 0.6  # rank correlation of the stated effect with the error made
-NAMED = 0.70  # share of doubted runs with a cause that can be named in which it is, at least
+WRONG = 3.0  # standard deviations from which an estimate counts as wrong
+SILENT = 0.01  # largest share of all runs that are trusted although an estimate is wrong
+SILENT_WRONG = 0.03  # largest share of faulty runs that are trusted although an estimate is wrong
+GRAVE = 0.2  # relative error that may be trusted in `FALSE` of the faulty runs
+NEAR, REFUSED = 0.05, 0.2  # largest share of "do not trust" among runs with a smaller error
+FALSE = 0.02  # largest share of correct runs that are doubted
+COVERED = 0.90  # smallest coverage of intervals with model errors in usable faulty runs
+COVERED_CAUTION = 0.95  # smallest coverage of these intervals in faulty runs with a caution
+WIDER = 1.1, 1.15, 1.5  # largest median, mean and 95 % quantile of their relative widths, no fault
+RANKED = 0.6  # smallest rank correlation of reported effect and actual error
+NAMED = 0.70  # smallest share of doubted runs that name the cause, if it can be named
 
 
 def outcome(scores: Sequence[Score]) -> Outcome:
-    """Return tables and checks."""
+    """Return tables, checks and notes of all runs."""
     whole = [score for score in scores if not score.failure]
     sound = [score for score in whole if not score.fault]
     silent = [s for s in whole if s.verdict == "trusted" and s.off > WRONG]
@@ -38,7 +38,8 @@ def outcome(scores: Sequence[Score]) -> Outcome:
     false = [s for s in sound if s.verdict != "trusted"]
     hidden = [s for s in whole if s.trace < VISIBLE]
     shown = [s for s in whole if not s.trace < VISIBLE]
-    told = [s for s in shown if s.named is not None and s.verdict != "trusted"]
+    doubted = [s for s in shown if s.named is not None and s.verdict != "trusted"]
+    named = [s for s in doubted if s.named]
     delays = [s.delay for s in whole if s.delay is not None and s.delay >= 0 and not s.early]
     wrong = [score for score in whole if score.fault]
     grave = [s for s in wrong if s.verdict == "trusted" and s.error > GRAVE]
@@ -58,16 +59,16 @@ def outcome(scores: Sequence[Score]) -> Outcome:
         Check("error below 5 % and do not trust", _share(refused, near), REFUSED, "<="),
         Check("the same of those with a trace", _share(shown_silent, shown), SILENT, "<="),
         Check("nothing wrong and doubted", _share(false, sound), FALSE, "<="),
-        Check("cause among the first two", _share([s for s in told if s.named], told), NAMED, ">="),
+        Check("cause among the first two", _share(named, doubted), NAMED, ">="),
         Check("runs that ended early", len(scores) - len(whole), 0, "<="),
     ]
-    allowed, found = _intervals(wrong, sound)
-    checks += found
+    allowed, more = _intervals(wrong, sound)
+    checks += more
     rows = []
     for fault in dict.fromkeys(score.fault for score in scores):
-        some = [score for score in whole if score.fault == fault]
-        if some:
-            rows.append(_row(fault, some))
+        runs = [score for score in whole if score.fault == fault]
+        if runs:
+            rows.append(_row(fault, runs))
     columns = [
         "wrong",
         "runs",
@@ -80,11 +81,10 @@ def outcome(scores: Sequence[Score]) -> Outcome:
         "delay",
         "90 %",
     ]
-    tables = [Table("What runs say of themselves", columns, rows), allowed]
-    told_of = [*silent, *false]
+    tables = [Table("Verdicts by fault", columns, rows), allowed]
     tables.append(
         Table(
-            "Silent wrong answers and false alarms",
+            "Trusted wrong results and false alarms",
             ["wrong", "problem", "seed", "stated", "level", "trace", "off", "verdict", "said"],
             [
                 [
@@ -96,23 +96,23 @@ def outcome(scores: Sequence[Score]) -> Outcome:
                     round(s.trace, 1) if np.isfinite(s.trace) else None,
                     round(s.off, 1),
                     s.verdict,
-                    s.said[:160],
+                    s.sentence[:160],
                 ]
-                for s in told_of
+                for s in [*silent, *false]
             ],
         )
     )
     notes = [
-        "off: runs with an unknown more than three reported standard deviations off; told: share "
-        "with a verdict of caution or do not trust; silent: off and trusted; named: share of those "
-        "told whose cause is among the first two; delay: median and 90 % quantile of the samples "
-        "from a fault in the middle of the run to the verdict.",
-        "trace: norm of what is left of readings without noise after the best fit of the truth's "
-        "own code, over the noise, median (none for noise, start and settings); hidden: runs in "
-        f"which it is below {VISIBLE:g}, so that the unknowns take the fault up and no test of the "
-        f"readings can tell ({len(hidden)} runs in all).",
-        f"{len(whole)} runs, {len(sound)} with nothing wrong; delays of all late faults: median "
-        f"{_quantile(delays, 0.5)}, 90 % {_quantile(delays, 0.9)}.",
+        "off: runs with an error of more than three reported standard deviations; told: share of "
+        "runs with caution or do not trust; silent: runs that are off and trusted; named: share of "
+        "doubted runs with the right cause among the first two; delay: median and 90 % quantile of "
+        "the samples from a fault in the middle of the run to the verdict.",
+        "trace: median norm of the residuals of a best fit of noise-free readings by the truth's "
+        "own code, relative to the noise (none for noise, start and settings); hidden: runs with a "
+        f"trace below {VISIBLE:g}, where the unknowns absorb the fault and no test of the readings "
+        f"can detect it ({len(hidden)} runs in total).",
+        f"{len(whole)} runs, {len(sound)} without a fault; delays of all late faults: median "
+        f"{_quantile(delays, 0.5)}, 90 % quantile {_quantile(delays, 0.9)}.",
     ]
     return Outcome(
         tables,
@@ -122,7 +122,7 @@ def outcome(scores: Sequence[Score]) -> Outcome:
 
 
 def _intervals(wrong: Sequence[Score], sound: Sequence[Score]) -> tuple[Table, list[Check]]:
-    """Return the table of intervals that allow for errors of the model, and its checks."""
+    """Return a table and checks of intervals with model errors."""
     usable = [s for s in wrong if s.verdict in ("trusted", "caution")]
     parts = {
         "wrong, trusted or caution": usable,
@@ -131,8 +131,8 @@ def _intervals(wrong: Sequence[Score], sound: Sequence[Score]) -> tuple[Table, l
         "nothing": sound,
     }
     rows, numbers = [], {}
-    for name, some in parts.items():
-        each = np.array([row for score in some for row in score.allowed], dtype=float)
+    for name, scores in parts.items():
+        each = np.array([row for score in scores for row in score.allowed], dtype=float)
         if not len(each):
             continue
         plain, wide, wider, *_ = each.T
@@ -155,39 +155,39 @@ def _intervals(wrong: Sequence[Score], sound: Sequence[Score]) -> tuple[Table, l
         Check("the same of runs with few data", _rank(weak), RANKED, ">="),
         Check("the same of the others", _rank(strong), RANKED, ">="),
     ]
-    title = "Intervals that allow for errors of the model (width over that of the noise alone)"
+    title = "Intervals with model errors (width relative to intervals without them)"
     return Table(title, columns, rows), checks
 
 
 def _rank(scores: Sequence[Score]) -> float:
-    """Return the rank correlation of the stated effects with the errors made."""
+    """Return the rank correlation of the reported effects and the actual errors."""
     every = np.array([row for score in scores for row in score.allowed], dtype=float)
     if len(every) < 3:
         return float("nan")
     return float(spearmanr(every[:, 3], every[:, 4]).statistic)
 
 
-def _share(some: Sequence[Score], of: Sequence[Score]) -> float:
-    return len(some) / len(of) if of else float("nan")
+def _share(subset: Sequence[Score], of: Sequence[Score]) -> float:
+    return len(subset) / len(of) if of else float("nan")
 
 
 def _quantile(values: Sequence[int], share: float) -> str:
     return f"{np.quantile(values, share):.0f}" if values else "–"
 
 
-def _row(fault: str, some: Sequence[Score]) -> list[object]:
-    off = [s for s in some if s.off > WRONG]
-    traces = [s.trace for s in some if np.isfinite(s.trace)]
-    told = [s for s in some if s.verdict != "trusted"]
-    known = [s.named for s in told if s.named is not None]
-    delays = [s.delay for s in some if s.delay is not None and s.delay >= 0 and not s.early]
+def _row(fault: str, runs: Sequence[Score]) -> list[object]:
+    off = [s for s in runs if s.off > WRONG]
+    traces = [s.trace for s in runs if np.isfinite(s.trace)]
+    doubted = [s for s in runs if s.verdict != "trusted"]
+    known = [s.named for s in doubted if s.named is not None]
+    delays = [s.delay for s in runs if s.delay is not None and s.delay >= 0 and not s.early]
     return [
         FAULTS[fault].text if fault else "nothing",
-        len(some),
+        len(runs),
         round(float(np.median(traces)), 1) if traces else None,
-        sum(s.trace < VISIBLE for s in some),
+        sum(s.trace < VISIBLE for s in runs),
         len(off),
-        round(len(told) / len(some), 2),
+        round(len(doubted) / len(runs), 2),
         sum(s.verdict == "trusted" for s in off),
         round(float(np.mean(known)), 2) if known else None,
         _quantile(delays, 0.5),

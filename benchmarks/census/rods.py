@@ -1,4 +1,4 @@
-"""Rods with what the model of the rod lacks; the truths are collocation in Chebyshev points."""
+"""Rods with effects that the model of the rod lacks; truths use Chebyshev collocation."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ DEGREE = 40
 SPACE = Chebyshev(DEGREE)
 NODES = len(SPACE.x)
 ENDS = np.eye(NODES)[[0, -1]]
-GIVEN = np.column_stack([np.eye(2), np.zeros(2)])  # the ends are the two channels
-SLICES = 9  # points of which a reading is the mean
+GIVEN = np.column_stack([np.eye(2), np.zeros(2)])  # the two channels are the end temperatures
+SLICES = 9  # points whose mean is a reading
 
 
 def _inputs(problem: Problem) -> Array:
-    """Return the channels and a one at the substeps, (substeps, 3)."""
+    """Return the channels and a column of ones at the substeps, shape (substeps, 3)."""
     fine = fine_times(problem.times)
     return np.column_stack([problem.inputs(fine), np.ones(len(fine))])
 
@@ -41,7 +41,7 @@ def advected(problem: Problem, k: float) -> Array:
 
 
 def contact(problem: Problem, k: float) -> Array:
-    """Return those with a resistance at the left end that is a tenth of the rod's."""
+    """Return readings with a contact resistance of a tenth of the rod's at the left end."""
     ends, given = ENDS.copy(), GIVEN.copy()
     ends[0] = 0.1 * SPACE.D1[0] - ENDS[0]
     given[0] = -GIVEN[0]
@@ -49,7 +49,7 @@ def contact(problem: Problem, k: float) -> Array:
 
 
 def averaged(problem: Problem, k: float) -> Array:
-    """Return those of sensors that average over a fifth of the length."""
+    """Return readings of sensors that average over a fifth of the length."""
     z = np.zeros((len(problem.times), len(problem.points)))
     for offset in np.linspace(-0.1, 0.1, SLICES):
         places = [place + float(offset) for place in _places(problem)]
@@ -60,7 +60,7 @@ def averaged(problem: Problem, k: float) -> Array:
 
 
 def heated_late(problem: Problem, k: float) -> Array:
-    """Return those with a source of 0.4 in the second half of the run."""
+    """Return readings with a source of 0.4 in the second half of the run."""
     g = _inputs(problem)
     g[: len(g) // 2, 2] = 0.0
     source = np.zeros((NODES, 3))
@@ -70,7 +70,7 @@ def heated_late(problem: Problem, k: float) -> Array:
 
 
 def cooled_late(problem: Problem, k: float) -> Array:
-    """Return those with a loss of 0.4 / s in the second half of the run."""
+    """Return readings with a loss of 0.4 / s in the second half of the run."""
     step, half = problem.length / problem.intervals, problem.intervals // 2
     g, places = _inputs(problem), _places(problem)
     middle = half * ((len(g) - 1) // problem.intervals)
@@ -85,7 +85,7 @@ def cooled_late(problem: Problem, k: float) -> Array:
 
 
 def nonlinear(problem: Problem, k: float) -> Array:
-    """Return those with a sink of 0.5 u |u|."""
+    """Return readings with a sink of 0.5 u |u|."""
     system = SPACE.system(k * SPACE.D2, ENDS, GIVEN, np.zeros((NODES, 3)), _places(problem))
     fine, g = fine_times(problem.times), _inputs(problem)
 

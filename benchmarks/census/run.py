@@ -1,4 +1,4 @@
-"""Runs of the census, in several processes."""
+"""Runs of the census, and their scores."""
 
 from __future__ import annotations
 
@@ -23,47 +23,46 @@ from livepde.verdict import Finding, Verdict
 PROBLEMS = ("rod", "column", "wall", "profile", "plate", "flux", "warm-rod", "borehole")
 QUICK = ("rod", "column", "profile", "plate", "warm-rod")
 STATED = (1.0, 3.0, 1.0 / 3.0)
-"""Stated over true noise."""
+"""Ratios of configured to true noise."""
 LEVELS = (0.25, 1.0, 4.0)
-"""True noise over that of the problem, about 2 % of the signal."""
+"""Ratios of the true noise to the problem's noise, which is about 2 % of the signal."""
 WEAK = 90, 2, 1.5
-"""Intervals, sensors and level of the noise of each fourth run: few data."""
-LOOKED = 10  # samples between two looks at the verdict after a fault
-NAMED = 2  # causes among which the right one has to be
+"""Intervals, sensors and noise level of every fourth run, which has few data."""
+LOOKED = 10  # samples between two evaluations of the verdict after a fault
+NAMED = 2  # number of first causes that must include the right one
 
 
 @dataclass(frozen=True)
 class Score:
-    """What one run said of itself.
+    """Verdict and errors of one run.
 
     Attributes
     ----------
     problem, fault, stated, level, seed
-        Which run; no fault: nothing is wrong.
+        Identification of the run; an empty fault means no fault.
     weak
-        Whether it has few data.
+        Whether the run has few data.
     verdict
-        At the end.
+        Level of the verdict at the end.
     off
-        Largest error of an unknown in its reported standard deviations.
+        Largest error of an unknown, in reported standard deviations.
     named
-        Whether the cause is among the first two; None where none is expected.
+        Whether the right cause is among the first two; None if no cause is expected.
     delay
-        Samples from a fault that begins late to the first verdict that is not "trusted"; -1: never,
-        None: does not apply.
+        Samples from a late fault to the first verdict other than "trusted"; -1 if there is none,
+        None if the fault is not late.
     early
-        Whether such a run was doubted before its fault began.
-    said
-        The first sentence.
+        Whether a run with a late fault was doubted before the fault began.
+    sentence
+        First sentence of the verdict.
     trace
-        What the fault leaves of the readings that no unknowns explain, over the noise; NaN where
-        the truth's code cannot tell: of noise, initial states and settings.
+        Norm of the residuals that no unknowns explain, over the noise; NaN for faults of noise,
+        initial state and settings.
     failure
-        What ended the run, if anything did.
+        Error that ended the run; empty without one.
     allowed
-        A row for each number that is unknown: whether its plain interval, and the one that allows
-        for errors of the model, hold the truth; width of the latter over that of the noise alone;
-        its effect; and the error that was made, relative to the value.
+        A row for each unknown constant: whether its intervals without and with model errors contain
+        the truth; ratio of their widths; its effect; and the actual error relative to the value.
     """
 
     problem: str
@@ -76,7 +75,7 @@ class Score:
     named: bool | None = None
     delay: int | None = None
     early: bool = False
-    said: str = ""
+    sentence: str = ""
     trace: float = np.nan
     failure: str = ""
     weak: bool = False
@@ -84,7 +83,7 @@ class Score:
 
     @property
     def error(self) -> float:
-        """Largest error of a number, relative to its value; NaN without numbers."""
+        """Largest relative error of a constant; NaN without constants."""
         return max((row[4] for row in self.allowed), default=np.nan)
 
 
@@ -97,17 +96,17 @@ def census(
     workers: int | None = None,
     progress: bool = False,
 ) -> Outcome:
-    """Run all faults of problems, and sound runs.
+    """Run problems with all faults, and without faults.
 
     Parameters
     ----------
     faults
-        Some of `FAULTS`; default all.
+        Names in `FAULTS`; default all.
     seeds
-        Runs of each fault and problem; statements of the noise and its level take turns, and each
-        fourth has few data.
+        Runs of each fault and problem. Configured noise and noise level alternate, and every fourth
+        run has few data.
     sound
-        Runs of each problem with nothing wrong.
+        Runs of each problem without a fault.
     """
     todo = [
         (name, fault, seed)
@@ -132,7 +131,7 @@ def _fits(name: str, fault: str) -> bool:
 
 
 def scored(name: str, fault: str, seed: int) -> Score:
-    """Return the score of one run; the same arguments give the same numbers."""
+    """Return the score of one run; the arguments determine all numbers."""
     problem = TRUTHS[name]
     rng = np.random.default_rng([zlib.crc32(f"{name} {fault}".encode()), seed])
     stated, level, weak = STATED[seed % 3], LEVELS[(seed // 3 + 1) % 3], seed % 4 == 3
@@ -154,7 +153,7 @@ def scored(name: str, fault: str, seed: int) -> Score:
 def scene_of(
     problem: Problem, theta: np.ndarray, shown: np.ndarray, noise: float, rng: np.random.Generator
 ) -> Scene:
-    """Return the data of a run in which nothing is wrong."""
+    """Return the scene of a run without a fault."""
     return Scene(
         problem=problem,
         theta=theta,
@@ -194,7 +193,7 @@ def _judged(scene: Scene, score: Score) -> Score:
             delay = k - half if estimate.verdict.level != "trusted" else -1
     if estimate is None:
         raise ValueError("a run of the census has no samples.")
-    estimate = identifier._settled(estimate)  # as at the end of a run
+    estimate = identifier._settled(estimate)  # final refit, as in `Identifier.run`
     verdict = estimate.verdict
     kinds = about.kinds if about else ()
     return replace(
@@ -204,7 +203,7 @@ def _judged(scene: Scene, score: Score) -> Score:
         named=_names(verdict, kinds, scene.subject) if kinds else None,
         delay=delay if late else None,
         early=early,
-        said=verdict.sentences[0] if verdict.sentences else "",
+        sentence=verdict.sentences[0] if verdict.sentences else "",
         trace=trace(scene) if about and about.traced else np.nan,
         allowed=tuple(_allowed(problem, scene, estimate)),
     )
@@ -213,7 +212,7 @@ def _judged(scene: Scene, score: Score) -> Score:
 def _allowed(
     problem: Problem, scene: Scene, estimate: lp.Estimate
 ) -> Iterator[tuple[bool, bool, float, float, float]]:
-    """Iterate over the numbers, with what their intervals hold."""
+    """Yield the row of `Score.allowed` for each unknown constant."""
     errors = estimate.verdict.errors
     if errors is None:
         return
@@ -231,8 +230,8 @@ def _allowed(
 
 
 def _off(problem: Problem, scene: Scene, estimate: lp.Estimate) -> float:
-    """Return the largest error of an unknown in its standard deviations; of a field its mean."""
-    last, found = scene.length - 1, [0.0]
+    """Return the largest error of an unknown, in standard deviations; RMS over a field."""
+    last, errors = scene.length - 1, [0.0]
     for label, latent in problem.latents.items():
         space = estimate.space
         if label not in space.labels and label not in space.fields:
@@ -244,12 +243,12 @@ def _off(problem: Problem, scene: Scene, estimate: lp.Estimate) -> float:
         half = 0.5 * (high - low) / 1.96
         with np.errstate(invalid="ignore", divide="ignore"):
             score = (centre - latent.value(scene.theta, last)) / half
-        found.append(float(np.sqrt(np.mean(score**2))))
-    return max(np.inf if np.isnan(score) else score for score in found)
+        errors.append(float(np.sqrt(np.mean(score**2))))
+    return max(np.inf if np.isnan(error) else error for error in errors)
 
 
 def _names(verdict: Verdict, kinds: Sequence[str], subject: str) -> bool:
-    """Return whether the right cause is among the first two of a finding."""
+    """Return whether the right cause is among the first `NAMED` causes of a finding."""
 
     def right(finding: Finding) -> bool:
         return any(
@@ -261,5 +260,5 @@ def _names(verdict: Verdict, kinds: Sequence[str], subject: str) -> bool:
 
 
 def _same(named: str, subject: str) -> bool:
-    """Return whether a cause is of the subject; one of the whole process has none."""
+    """Return whether a cause names the subject; an empty name or subject is the process."""
     return not subject or not named or named.split(",")[0].split("[")[0] == subject.split("[")[0]

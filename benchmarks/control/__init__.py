@@ -1,4 +1,4 @@
-"""Identified models in control loops, against the true model, a wrong one, and a moving horizon."""
+"""Control loops with identified models, true and wrong models, and moving-horizon estimators."""
 
 from __future__ import annotations
 

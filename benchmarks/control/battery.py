@@ -1,16 +1,16 @@
-"""A battery particle that is charged as fast as its surface allows, while its diffusivity drifts.
+"""Battery particle that is charged as fast as its surface allows, with a drifting diffusivity.
 
-Charging fills a particle of graphite from its surface. Where the surface is too full, lithium metal
-is deposited, which ruins the cell: the filling there has a limit. How much fuller the surface is
-than the mean is what the diffusivity says. It is not known, and it drifts, with the temperature and
-as the cell ages. What is measured is a voltage, a known curve of the filling at the surface, which
-is flat just where the limit lies: there a model has to say what the voltage does not. Who believes
-in too fast a diffusion goes over the limit; who believes in too slow a one charges slowly; and in
-both cases the filter mends its state with what is wrong with its diffusivity, so that the mean
-filling, which is the charge that the cell is said to hold, is wrong, too.
+Charging fills a particle of graphite from its surface. If the surface is too full, lithium metal is
+deposited, which ruins the cell. Therefore the filling at the surface has a limit. Its difference
+from the mean filling depends on the diffusivity, which is unknown and drifts with temperature and
+age. The measured voltage is a known function of the filling at the surface. It is flat near the
+limit, where only a model determines the filling. If the assumed diffusivity is too large, the
+surface exceeds the limit; if it is too small, charging is slow. In both cases the filter corrects
+its state for the error of the diffusivity, so that the mean filling, and with it the state of
+charge, is wrong, too.
 
-The cell is charged and discharged in turn, as on a test bench; the limit of the current is lower
-when it is discharged. The diffusivity is a random walk, drawn for each seed.
+The cell is charged and discharged in turn, as on a test bench, with a lower limit of the current
+for discharging. The diffusivity is a random walk, drawn for each seed.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from livepde.observation import Functionals, Points, Transformed
 from livepde.stepping import Alexander2
 
 RADIUS, AREA, FULL = 5e-6, 1.0, 30555.0  # m, m^2, mol/m^3
-CAPACITY = FARADAY * FULL * AREA * RADIUS / 3  # C, of the particle from empty to full
-ONE = CAPACITY / 3600.0  # A, that fills it in an hour
-D, SPREAD = 3e-15, 0.5  # m^2/s, prior and deviation of its logarithm
-DRIFT = 0.3 / np.sqrt(3600.0)  # deviation that the logarithm gains, per square root of a second
+CAPACITY = FARADAY * FULL * AREA * RADIUS / 3  # C, charge of the full particle
+ONE = CAPACITY / 3600.0  # A, fills the particle in an hour
+D, SPREAD = 3e-15, 0.5  # m^2/s, prior and standard deviation of its logarithm
+DRIFT = 0.3 / np.sqrt(3600.0)  # s**-0.5, rate of the random walk of the logarithm
 NOISE = 2e-3  # V
-FASTEST = (-3.0 * ONE, 1.0 * ONE)  # A: charge, discharge
-LIMITS = (0.05, 0.85)  # of the filling at the surface
+FASTEST = (-3.0 * ONE, 1.0 * ONE)  # A, charge and discharge
+LIMITS = (0.05, 0.85)  # limits of the filling at the surface
 LOW, HIGH = 0.3, 0.8  # mean filling
 CYCLE, CHARGING = 5400.0, 2700.0  # s
 CYCLES = 2
 PERIOD, HORIZON = 30.0, 12
-CELLS, FINE = 24, (72, 3.0)  # of model and truth; s
+CELLS, FINE = 24, (72, 3.0)  # cells of the model; cells, and time step in s, of the truth
 
 
 def process(cells: int) -> Model:
-    """Return the particle, on a mesh that is finer towards the surface."""
+    """Return the model of the particle on a mesh that is finer towards the surface."""
     inward = np.linspace(1.0, 0.0, cells + 1)
     mesh = line((RADIUS * (1.0 - inward**2)).tolist())
     walk = RandomWalk(DRIFT)
@@ -56,7 +56,7 @@ def process(cells: int) -> Model:
 
 
 def graphite(x: Any) -> Any:
-    """Return the open-circuit voltage for a filling, Safari and Delacourt (2011)."""
+    """Return the open-circuit voltage for a filling (Safari and Delacourt, 2011)."""
     return (
         0.6379
         + 0.5416 * np.exp(-305.5309 * x)
@@ -68,7 +68,7 @@ def graphite(x: Any) -> Any:
 
 
 def fillings() -> Functionals:
-    """Return mean filling and filling at the surface: exact in the weights of the model."""
+    """Return observations of mean filling and filling at the surface, exact in the model."""
     return Functionals(
         {
             "mean": lambda q, c, x: 3.0 / RADIUS * c / FULL,
@@ -78,7 +78,7 @@ def fillings() -> Functionals:
 
 
 def drawn(seed: int) -> tuple[list[float], list[float]]:
-    """Return times and diffusivities of a truth."""
+    """Draw a truth, and return its times and diffusivities."""
     rng = np.random.default_rng([seed, 0])
     times = PERIOD * np.arange(round(CYCLES * CYCLE / PERIOD) + 1)
     gained = DRIFT * np.sqrt(PERIOD) * rng.standard_normal(len(times))
@@ -87,7 +87,7 @@ def drawn(seed: int) -> tuple[list[float], list[float]]:
 
 
 def battery(seed: int = 0) -> Problem:
-    """Return the task of a seed."""
+    """Return the problem of a seed."""
     voltage = Transformed(Points({"V": RADIUS}), lambda c: graphite(c / FULL), noise=NOISE)
     model, fine = process(CELLS), process(FINE[0])
     times, path = drawn(seed)

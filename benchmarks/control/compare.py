@@ -1,4 +1,4 @@
-"""Four runs of a problem on the same disturbances and seeds, and what is made of them."""
+"""Comparison of estimators and controllers on a problem, with equal disturbances and seeds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from benchmarks.control.horizon import MovingHorizon, Setting
 from benchmarks.control.problem import Problem
-from benchmarks.control.runs import Run, closed_loop, learned, nominal, offset_free, told
+from benchmarks.control.runs import Run, closed_loop, informed, learned, nominal, offset_free
 from livepde import plots
 from livepde.control import LQ, MPC, Controller, Estimator
 from livepde.diagnostics.check_report import Table
@@ -24,9 +24,9 @@ TRUE = "true model"
 FIXED = "wrong fixed model"
 OFFSET = "wrong fixed model, offset-free"
 LEARNED = "livepde"
-HORIZONS = {False: "moving horizon, reduced model", True: "moving horizon, full model"}  # do-mpc's
+HORIZONS = {False: "moving horizon, reduced model", True: "moving horizon, full model"}  # by do-mpc
 ROWS: Mapping[str, Callable[[Problem], Estimator]] = {
-    TRUE: told,
+    TRUE: informed,
     FIXED: nominal,
     OFFSET: offset_free,
     LEARNED: learned,
@@ -37,7 +37,7 @@ CONTROLLERS: Mapping[str, Callable[[Problem], Controller]] = {
 }
 BoolArray: TypeAlias = NDArray[np.bool_]
 
-LEARNING = 10  # samples after the alarm that still count as learning
+LEARNING = 10  # samples after the alarm that count as learning
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +47,11 @@ class Comparison:
     Attributes
     ----------
     problems
-        One for each seed.
+        The problem for each seed.
     runs
         (controller, row) -> a run for each seed.
     settings
-        Row of a moving horizon -> its setting, that which did best on the first seed.
+        Row of a moving horizon -> its setting, which has the least cost on the first seed.
     """
 
     problems: Sequence[Problem]
@@ -60,23 +60,23 @@ class Comparison:
 
     @property
     def rows(self) -> list[tuple[str, str]]:
-        """All (controller, row)."""
+        """All pairs (controller, row)."""
         return list(self.runs)
 
     def learned_at(self, seed: int, controller: str = "MPC") -> float:
-        """Return until when livepde learns after the jump: `LEARNING` samples from its alarm on.
+        """Return the time at which livepde has learned, `LEARNING` samples after its alarm.
 
-        A rule that does not look at the result. Without a jump: what the problem says, or the first
-        sample at which the estimate was trusted; infinite where there is none, or no alarm.
+        This rule does not depend on the errors of the run. Without a jump, the time is
+        `Problem.settled` or the first trusted sample. Infinite without an alarm or such a sample.
         """
         problem, run = self.problems[seed], self.runs[controller, LEARNED][seed]
         if not math.isnan(problem.settled):
             return problem.settled
         if math.isnan(problem.jump):
-            found = run.t[run.trusted]
-            return float(found[0]) if len(found) else math.inf
-        found = run.t[np.logical_and(run.alarms, run.t > problem.jump)]
-        return float(found[0]) + LEARNING * problem.period if len(found) else math.inf
+            trusted = run.t[run.trusted]
+            return float(trusted[0]) if len(trusted) else math.inf
+        alarms = run.t[np.logical_and(run.alarms, run.t > problem.jump)]
+        return float(alarms[0]) + LEARNING * problem.period if len(alarms) else math.inf
 
     def learning(self, seed: int, controller: str = "MPC") -> BoolArray:
         """Return which samples of a seed count as learning: at the start, and after the jump."""
@@ -85,10 +85,10 @@ class Comparison:
             return np.asarray(run.t <= problem.settled)
         trusted = run.t[run.trusted]
         first = float(trusted[0]) if len(trusted) else math.inf
-        found: BoolArray = np.asarray(run.t <= first)
+        learning: BoolArray = np.asarray(run.t <= first)
         if not math.isnan(problem.jump):
-            found = found | (run.t > problem.jump) & (run.t <= self.learned_at(seed, controller))
-        return found
+            learning |= (run.t > problem.jump) & (run.t <= self.learned_at(seed, controller))
+        return learning
 
     def costs(
         self, controller: str, row: str, *, late: bool = False, paid: bool | None = None
@@ -98,42 +98,42 @@ class Comparison:
         Parameters
         ----------
         late
-            Only after livepde has learned the jump.
+            Include only samples after livepde has learned the jump.
         paid
-            With what violations cost; default for `MPC`, as `LQ` does not know limits.
+            Include penalties of violations; default only for `MPC`, since `LQ` has no limits.
         """
         charged = controller == "MPC" if paid is None else paid
-        found = []
+        costs = []
         for k, run in enumerate(self.runs[controller, row]):
             since = self.learned_at(k, controller) if late else -math.inf
-            found.append(run.cost(self.problems[k], since, paid=charged))
-        return np.array(found)
+            costs.append(run.cost(self.problems[k], since, paid=charged))
+        return np.array(costs)
 
     def violations(self, controller: str, row: str, *, learning: bool | None = None) -> int:
-        """Return at how many samples of all seeds a limit was violated.
+        """Return the number of samples of all seeds at which a limit is violated.
 
         Parameters
         ----------
         learning
-            Only while livepde learns, or only while it does not.
+            Count only samples while livepde learns (True), or only the others (False).
         """
         total = 0
         for k, (problem, run) in enumerate(
             zip(self.problems, self.runs[controller, row], strict=True)
         ):
-            found = run.violations(problem, problem.tolerance)
+            violated = run.violations(problem, problem.tolerance)
             if learning is not None:
-                found &= self.learning(k, controller) == learning
-            total += int(found.sum())
+                violated &= self.learning(k, controller) == learning
+            total += int(violated.sum())
         return total
 
     def times(self, controller: str, row: str, *, whole: bool = False) -> float:
-        """Return the processor time of a sample over livepde's: the median of the seeds' ratios.
+        """Return the processor time of a sample over livepde's, as the median over seeds.
 
         Parameters
         ----------
         whole
-            Of all, not of the estimator alone.
+            Time estimator and controller, not the estimator alone.
         """
         both = zip(self.runs[controller, row], self.runs[controller, LEARNED], strict=True)
         pairs = [
@@ -143,7 +143,7 @@ class Comparison:
         return float(np.median([one.mean() / mine.mean() for one, mine in pairs]))
 
     def table(self) -> Table:
-        """Return cost, violations and time of every row."""
+        """Return a table with cost, violations and time of every row."""
         columns = ["controller", "model", "cost", "least", "largest", "learned"]
         columns += ["over true", "without penalties", "violations", "learning", "largest excess"]
         columns += ["estimator", "sample", "fallback", "failed"]
@@ -202,12 +202,12 @@ def compare(
     make
         Seed -> problem.
     seeds
-        How many.
+        Number of seeds.
     settings
-        Of the moving horizon, on the reduced model and on the full one; of each the one with the
-        least cost on the first seed is taken for all, which favours it. Empty: it is not run.
+        Settings of the moving horizons on the reduced and on the full model. For each model, the
+        setting with the least cost on the first seed is used for all seeds, which favours it.
     linear
-        Whether to run `LQ` besides, without the moving horizon.
+        Whether to run `LQ`, too, without the moving horizons.
     progress
         Show a bar.
     """
@@ -225,10 +225,10 @@ def compare(
     for setting in watched(settings, len(settings), "settings") if progress else settings:
         cost = run("MPC", 0, MovingHorizon(problems[0], setting)).cost(problems[0])
         tried.setdefault(HORIZONS[setting.full], []).append((cost, setting))
-    for name, found in tried.items():
-        best[name] = min(found, key=lambda pair: pair[0])[1]
+    for name, costs in tried.items():
+        best[name] = min(costs, key=lambda pair: pair[0])[1]
         rows[name] = partial(MovingHorizon, setting=best[name])
-    # Those of a seed right after each other: their times are compared.
+    # All rows of a seed run consecutively, because their times are compared.
     jobs = [
         (controller, seed, row)
         for controller in used

@@ -1,4 +1,4 @@
-"""What a moving horizon estimates as the state: few coordinates, or all coefficients."""
+"""State of a moving-horizon estimator: coordinates of the reduced model, or all coefficients."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from benchmarks.control.problem import Problem
 from livepde.control import ReducedModel
 from livepde.linalg import Array
 
-FLOOR = 1e-3  # process noise of each coordinate, relative to the largest
+FLOOR = 1e-3  # additional process noise of each coordinate, relative to the total
 
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """The coordinates of the reduced model.
+    """Coordinates x of the reduced model as the state, shape (r,).
 
     Attributes
     ----------
     model
-        K, E and f of mass x' = -K(q) x + E(q) c + f(q) for its state x, shape (r,).
+        K, E and f of mass x' = -K(q) x + E(q) c + f(q).
     mass
-        Shape (r, r).
+        Mass matrix, shape (r, r).
     scale
-        Deviation of each in the steady filter, shape (r,): units of the state.
+        Standard deviation of each coordinate in the steady-state filter, shape (r,).
     """
 
     model: ReducedModel
@@ -37,22 +37,22 @@ class Coordinates:
 
     @classmethod
     def of(cls, problem: Problem) -> Coordinates:
-        """Return those of a problem."""
+        """Return the coordinates of a problem."""
         reduced = problem.reduced
         return cls(reduced, sp.csc_array(sp.eye_array(reduced.size)), _scale(problem))
 
     def here(self, x: Array, inputs: Mapping[str, float]) -> Array:
-        """Return in these what is x in the reduced model."""
+        """Transform a state of the reduced model to these coordinates."""
         return x
 
     def back(self, x: Array, inputs: Mapping[str, float]) -> Array:
-        """Return in the reduced model what is x in these."""
+        """Transform a state in these coordinates to the reduced model."""
         return x
 
 
 @dataclass(frozen=True, eq=False)
 class Coefficients(Coordinates):
-    """The free coefficients of the finite elements, with their mass matrix M_ff."""
+    """Free finite element coefficients as the state, with their mass matrix M_ff."""
 
     reduced: ReducedModel
 
@@ -78,7 +78,7 @@ class Coefficients(Coordinates):
 
 
 def _scale(problem: Problem) -> Array:
-    """Return the deviation of each coordinate of the reduced model in the steady filter."""
+    """Return the standard deviations of the reduced coordinates in the steady-state filter."""
     model = problem.reduced
     drive = np.array([problem.drive.get(name, 0.0) for name in model.channels])
     step = model.matrices(model.prior, problem.period)

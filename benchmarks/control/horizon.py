@@ -1,4 +1,4 @@
-"""do-mpc's moving-horizon estimator in the loop: on all coefficients, or on the reduced model."""
+"""Moving-horizon estimator of do-mpc in the loop, on the full or on the reduced model."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from livepde.fem import LogNormal
 from livepde.linalg import Array
 from livepde.observation import Transformed
 
-RADAU = ((5 / 12, -1 / 12), (3 / 4, 1 / 4))  # of two stages, the second at the end
+RADAU = ((5 / 12, -1 / 12), (3 / 4, 1 / 4))  # Radau IIA with two stages, the second at the end
 QUIET = {
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
@@ -26,25 +26,25 @@ QUIET = {
     "ipopt.max_iter": 100,
     "show_eval_warnings": False,
 }
-ROUNDING = 1e-12  # relative size of entries of a matrix that are none
-FARTHEST = 6.0  # prior deviations that an unknown number moves at most: exp must not overflow
+ROUNDING = 1e-12  # relative size below which entries of a matrix are rounding errors
+FARTHEST = 6.0  # prior standard deviations, bound on unknowns so that exp does not overflow
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What a user of the estimator chooses.
+    """Settings of the estimator.
 
     Parameters
     ----------
     samples
         Length of the window.
     state, unknowns
-        Weight of the arrival cost: of the state at the start of the window against the last
-        solution, in deviations of the steady filter, and of the unknown numbers against their last
-        estimate, in prior deviations.
+        Weights of the arrival cost: distance of the initial state of the window from the last
+        solution, in standard deviations of the steady-state filter, and distance of the unknowns
+        from their last estimate, in prior standard deviations.
     full
-        Whether it estimates all coefficients of the finite elements, as whoever writes the equation
-        into do-mpc does; else the few coordinates of our reduced model.
+        True: estimate all finite element coefficients, as in a direct implementation with do-mpc.
+        False: estimate the coordinates of our reduced model.
     """
 
     samples: int
@@ -57,22 +57,22 @@ class Setting:
 
 
 class MovingHorizon:
-    """State and unknown numbers by do-mpc's `MHE`: least squares over the last samples.
+    """Estimator of state and unknown constants by least squares over a window, do-mpc's `MHE`.
 
-    Until the window is full, and where Ipopt finds no solution, it hands over what the nominal
-    model says. It has no covariance, so that a controller takes its estimate for the truth.
+    Until the window is full, and if Ipopt finds no solution, it returns the estimate of the nominal
+    model. It has no covariance, so that a controller treats its estimate as exact.
 
     Parameters
     ----------
     problem
-        The task; its periods are steps of Radau's method, do-mpc's default.
+        Control problem; each period is a step of the Radau method, do-mpc's default.
     setting
         Window and weights.
 
     Attributes
     ----------
     mhe
-        do-mpc's object.
+        Estimator object of do-mpc.
     """
 
     def __init__(self, problem: Problem, setting: Setting) -> None:
@@ -86,10 +86,10 @@ class MovingHorizon:
         self._c = np.zeros((count, len(model.channels)))
         self._x = np.zeros((count + 1, model.size))
         self._taken = 0
-        self.mhe = self._built()  # here: a sample is not charged for it
+        self.mhe = self._built()  # built here, so that it does not count as time of a sample
 
     def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
-        """Take a sample, as an `Estimator` does; the first one describes the start."""
+        """Process a sample, as in `Estimator.step`; the first sample is the initial state."""
         known = self.nominal.step(t, z, inputs)
         model = self.coordinates.model
         noise, x = np.asarray(model.sensors.noise), self.coordinates.here(known.x, inputs)
@@ -98,7 +98,7 @@ class MovingHorizon:
         self._x = np.vstack([self._x[1:], x])
         self._taken += 1
         count = self.setting.samples
-        if self._taken <= count:  # the first sample describes the start
+        if self._taken <= count:  # the first sample is the initial state
             why = f"the window of {count} samples is not full"
             return Known(known.x, known.q, known.factor, "fallback", why)
         mhe = self.mhe
@@ -123,7 +123,7 @@ class MovingHorizon:
         return Known(x, np.asarray(q), np.zeros((len(q), 0)))
 
     def dump(self) -> bytes:
-        """Return its state."""
+        """Return the state of the estimator."""
         leaves = {
             "nominal": np.frombuffer(self.nominal.dump(), dtype=np.uint8),
             "z": self._z,
@@ -143,7 +143,7 @@ class MovingHorizon:
         self.mhe.opt_x_num.master = packages()[1].DM(leaves["solution"])
 
     def _begin(self) -> None:
-        """Start from the nominal model's states."""
+        """Initialise the solver with the states of the nominal model."""
         mhe, scaled = self.mhe, self._x / self.coordinates.scale
         for k, x in enumerate(scaled):
             mhe.opt_x_num["_x", k, -1] = x
@@ -153,19 +153,19 @@ class MovingHorizon:
         mhe.opt_p_num["_x_prev"] = mhe.opt_x_num["_x", 0, -1]
 
     def _numbers(self, p: Any, exp: Any) -> list[Any]:
-        """Return the unknown numbers for multiples of their prior deviations."""
+        """Return the unknowns for coordinates p in prior standard deviations."""
         model = self.coordinates.model
         space = model.frame.model.parameter_space
-        found = []
+        values = []
         for k, (label, prior, std) in enumerate(
             zip(model.unknowns, model.prior, model.std, strict=True)
         ):
             positive = isinstance(space.unknown_of(label).prior, LogNormal)
-            found.append(prior * exp(std / prior * p[k]) if positive else prior + std * p[k])
-        return found
+            values.append(prior * exp(std / prior * p[k]) if positive else prior + std * p[k])
+        return values
 
     def _built(self) -> Any:
-        """Return do-mpc's object."""
+        """Return do-mpc's estimator for the problem and the setting."""
         do_mpc, casadi = packages()
         period, setting = self.problem.period, self.setting
         model, scale = self.coordinates.model, self.coordinates.scale
@@ -219,17 +219,17 @@ class MovingHorizon:
 
 
 def _sparse(matrix: Array) -> Any:
-    """Return a matrix without what is rounding, for CasADi."""
+    """Return a sparse CasADi matrix without entries that are rounding errors."""
     small = np.abs(matrix) <= ROUNDING * np.abs(matrix).max()
     return packages()[1].sparsify(packages()[1].DM(np.where(small, 0.0, matrix)))
 
 
 def _reading(model: ReducedModel, x: Any, c: Any) -> Any:
-    """Return what the sensors show, as a CasADi expression."""
+    """Return the predicted readings as a CasADi expression."""
     casadi = packages()[1]
     seen, sensors = model.sensors, model.frame.sensors.observation
     if not isinstance(sensors, Transformed):
         return casadi.DM(seen.C) @ x + casadi.DM(seen.D) @ c + casadi.DM(seen.d)
-    # What it transforms is linear: on the basis, without boundary values.
+    # The argument of the transformation is linear in x, without boundary values.
     linear = np.asarray(model.frame.sensors.G @ model.frame.V)
     return sensors.function(casadi.DM(linear) @ x)

@@ -1,4 +1,4 @@
-"""What `python -m benchmarks control` prints: tables, and the promises with their bounds."""
+"""Tables and checks of `python -m benchmarks control`."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from livepde.errors import ConfigurationError
 from livepde.linalg import Array
 from livepde.runs import Outcome
 
-OF_TRUE = 1.10  # cost over that of the true model, after the jump has been learned
-OF_FIXED = 0.70  # cost over that of the wrong fixed model, then
-WORST = 1.05  # total cost over that of the wrong fixed model, in any seed
-SHORT = 0.6  # share of the samples in a short run: the rod's jump is at 0.42
-CHEAPER = 20.0  # times less processor time than the moving horizon takes for a sample
+OF_TRUE = 1.10  # largest cost relative to the true model, after the jump has been learned
+OF_FIXED = 0.70  # largest cost relative to the wrong fixed model, after the jump has been learned
+WORST = 1.05  # largest total cost of any seed, relative to the wrong fixed model
+SHORT = 0.6  # share of the samples in a short run; the rod's jump is at 0.42
+CHEAPER = 20.0  # smallest processor time of the moving horizon relative to livepde
 
 
 @dataclass(frozen=True)
 class Contest:
-    """A problem of the benchmark.
+    """Problem with the options of its comparison.
 
     Attributes
     ----------
     make
         Seed -> problem.
     settings
-        Of the moving horizon.
+        Settings of the moving horizons.
     quantities
-        What its figure shows.
+        Quantities in the figure.
     linear
-        Whether `LQ` is run besides: it knows no limits.
+        Whether to run `LQ`, too, which ignores limits.
     shown
-        Which seed its figure shows, if there are so many.
+        Seed of the figure; the last seed if there are fewer.
     """
 
     make: Callable[[int], Problem]
@@ -54,7 +54,7 @@ class Contest:
     shown: int = 0
 
     def compare(self, seeds: int, short: bool, progress: bool) -> Comparison:
-        """Return its runs, or short ones, and the moving horizon with its first setting only."""
+        """Run the comparison; `short` uses fewer samples and only the first setting."""
         settings = self.settings[:1] if short else self.settings
         make = self._short if short else self.make
         return compare(make, seeds, settings, linear=self.linear, progress=progress)
@@ -75,16 +75,16 @@ def control(
     short: bool = False,
     progress: bool = False,
 ) -> Outcome:
-    """Compare true model, wrong fixed model, livepde and do-mpc's moving horizon in the loop.
+    """Compare control by true model, wrong fixed model, livepde and do-mpc's moving horizon.
 
     Parameters
     ----------
     only
         Names of problems; default all.
     seeds
-        How many of each.
+        Number of seeds of each problem.
     short
-        Shorter runs, and the moving horizon with its first setting only, on the reduced model.
+        Shorter runs, and only the first setting of the moving horizon, on the reduced model.
     progress
         Show a bar.
 
@@ -102,14 +102,14 @@ def control(
         tables=[comparison.table() for comparison in found.values()],
         checks=[check for name in found for check in promises(found[name])],
         notes=[
-            "cost, least, largest: over the seeds; for MPC with what violations cost, LQ does not "
-            "know limits. learned: the cost from 10 samples after livepde's alarm on, or where "
-            "nothing jumps from the first trusted sample on; over true: that over the true "
-            "model's. violations: samples of all seeds; learning: those while livepde learned. "
-            "estimator, sample: processor time of a sample over livepde's, of the estimator and "
-            "of all, median of the seeds. do-mpc's moving horizon estimates all coefficients of "
-            "the finite elements, as livepde does, or those of livepde's reduced model; it has "
-            "the setting that did best, with the truth, on the first seed."
+            "cost, least, largest: mean, minimum and maximum over seeds, for MPC with penalties of "
+            "violations (LQ has no limits). learned: cost after livepde has learned, 10 samples "
+            "after its alarm, or without a jump from the first trusted sample on; over true: "
+            "this cost relative to the true model. violations: samples of all seeds; learning: "
+            "violations while livepde learns. estimator, sample: processor time relative to "
+            "livepde, median over seeds. do-mpc's moving horizon estimates all finite element "
+            "coefficients or the state of livepde's reduced model, with the setting that has the "
+            "least cost on the first seed."
         ],
         figures={
             name: partial(PROBLEMS[name].figure, comparison) for name, comparison in found.items()
@@ -118,8 +118,8 @@ def control(
 
 
 def promises(comparison: Comparison) -> list[Check]:
-    """Return the checks of a problem; `LQ` does not know limits and is not charged for them."""
-    found, problem = [], comparison.problems[0]
+    """Return the checks of a problem; costs of `LQ` exclude violations, since it has no limits."""
+    checks, problem = [], comparison.problems[0]
     for controller in dict.fromkeys(controller for controller, _ in comparison.rows):
         what = f"{problem.name}, {controller}"
 
@@ -132,33 +132,33 @@ def promises(comparison: Comparison) -> list[Check]:
             return np.array([mine.mean() / others.mean(), (mine / others).max()])
 
         true, total = over(TRUE, True)[0], over(FIXED, False)[1]
-        found += [
+        checks += [
             Check(f"{what}: learned cost over true model's", true, OF_TRUE, "<="),
             Check(f"{what}: total cost over wrong model's, worst seed", total, WORST, "<="),
         ]
         if not math.isnan(problem.jump):
             name, fixed = f"{what}: learned cost over wrong model's", over(FIXED, True)[0]
-            found.append(Check(name, fixed, OF_FIXED, "<="))
+            checks.append(Check(name, fixed, OF_FIXED, "<="))
             if controller == "MPC":
                 plain = over(FIXED, True, False)[0]
-                found.append(Check(f"{name}, without penalties", plain, OF_FIXED, "<="))
+                checks.append(Check(f"{name}, without penalties", plain, OF_FIXED, "<="))
     allowed = comparison.violations("MPC", TRUE)
     allowed += comparison.violations("MPC", LEARNED, learning=True)
     violations = comparison.violations("MPC", LEARNED)
-    found.append(Check(f"{problem.name}, MPC: violations", violations, allowed, "<="))
+    checks.append(Check(f"{problem.name}, MPC: violations", violations, allowed, "<="))
     for row in comparison.settings:
         cost = comparison.costs("MPC", LEARNED).mean() / comparison.costs("MPC", row).mean()
         what = f"{problem.name}, {row}"
         ratio = comparison.times("MPC", row)
-        found += [
+        checks += [
             Check(f"{what}: its processor time over livepde's", ratio, CHEAPER, ">="),
             Check(f"{what}: livepde's cost over that with it", float(cost), 1.0, "<="),
         ]
-    return found
+    return checks
 
 
 def both(*settings: Setting) -> list[Setting]:
-    """Return settings of the moving horizon on the reduced and on the full model."""
+    """Return settings of the moving horizon for the reduced and for the full model."""
     return [replace(setting, full=full) for full in (False, True) for setting in settings]
 
 
@@ -173,7 +173,7 @@ PROBLEMS: Mapping[str, Contest] = {
         both(Setting(24, 1.0, 1.0), Setting(48, 1.0, 10.0)),
         ["air", "heater", "k[masonry]", "k[insulation]"],
         linear=False,
-        shown=1,  # the first one has nearly the wall that is believed in
+        shown=1,  # the wall of seed 0 is almost equal to the prior
     ),
     "battery": Contest(
         battery,

@@ -1,4 +1,4 @@
-"""What a closed-loop benchmark is: a plant, the model that a controller is given, and a task."""
+"""Closed-loop problem: a plant, the model of the controller, and its goal."""
 
 from __future__ import annotations
 
@@ -21,60 +21,59 @@ Values = Callable[[float], Mapping[str, float]]
 
 
 class Plant(Protocol):
-    """The truth. No estimator and no controller sees more of it than what it measures."""
+    """True process, of which estimators and controllers see only the measurements."""
 
     def advance(self, t: float, inputs: Mapping[str, float]) -> None:
-        """Go on to t with inputs that are held."""
+        """Advance to t with constant inputs."""
 
     def measure(self) -> Array:
-        """Return what the sensors show now, with noise, shape (sensors,)."""
+        """Return the current noisy readings of the sensors, shape (sensors,)."""
 
     def outputs(self) -> Array:
-        """Return what the outputs are now, shape (outputs,)."""
+        """Return the current outputs, shape (outputs,)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Problem:
-    """A task that several controllers are held against.
+    """Control problem for the comparison of estimators and controllers.
 
     Attributes
     ----------
     name, title
-        Short name, and a line about it.
+        Short name, and description.
     reduced
-        The reduced model that every controller acts on; its sensors and outputs are those of the
-        plant, in this order.
+        Reduced model of all controllers; sensors and outputs have the order of the plant's.
     identifier
-        Returns livepde's identifier, as it stands before the first sample.
+        Function that returns livepde's identifier before the first sample.
     goal, period, horizon
-        As for `livepde.control.MPC`.
+        Arguments of `livepde.control.MPC`.
     samples
-        Length of a run.
+        Number of samples of a run.
     plant
-        Seed -> the truth at the first sample.
+        Seed -> plant at the first sample.
     truth
-        t -> unknown numbers of the plant by label: for the run that knows them, and for figures.
+        t -> true values of the unknowns by label, for the true model and for figures.
     drive
-        As for `livepde.control.Kalman`.
+        Argument of `livepde.control.Kalman`.
     reference
-        t -> what the tracked outputs should be.
+        t -> target values of the tracked outputs.
     disturbances
-        t -> measured disturbances, held over the period that ends at t.
+        t -> measured disturbances, constant over the period that ends at t.
     before
         Inputs before the first sample.
     limits
-        t -> limits of outputs that change with time, output -> (least, largest); None: the goal's.
+        t -> time-dependent limits of outputs, output -> (low, high); None: the limits of the goal.
     tolerance
-        By how much a limit may be missed without counting as violated.
+        Excess over a limit that does not count as a violation.
     jump
         Time of a sudden change; NaN if there is none.
     foreseen
-        Whether disturbances are known beforehand; else their forecast is what they are now.
+        Whether future disturbances are known; otherwise the forecast is their current value.
     trust
-        When livepde's estimate is used.
+        Conditions for the use of livepde's estimate.
     settled
-        Time from which it should have learned, where nothing jumps; NaN: from the first sample at
-        which the estimate was trusted.
+        Time at which livepde should have learned if there is no jump; NaN: the first trusted
+        sample.
     """
 
     name: str
@@ -104,13 +103,13 @@ class Problem:
         return [self.period * k for k in range(self.samples + 1)]
 
     def limits_at(self, t: float) -> Mapping[str, tuple[float, float]]:
-        """Return the limits of outputs at a time."""
+        """Return the limits of outputs at time t."""
         return self.goal.limits if self.limits is None else self.limits(t)
 
     def ahead(self, t: float) -> dict[str, Any]:
-        """Return what `Loop.step` is told of the future: references and limits are known.
+        """Return the arguments of `Loop.step` about the future: references and limits.
 
-        So are disturbances, if they are foreseen.
+        Disturbances are included if they are foreseen.
         """
         coming = [t + self.period * (k + 1) for k in range(self.horizon)]
         reference = [self.reference(now) for now in coming]
@@ -127,22 +126,22 @@ class Problem:
 
 
 class Simulated:
-    """A plant that livepde simulates, on a finer mesh and with shorter steps than the model.
+    """Plant simulated by livepde, with a finer mesh and shorter steps than the model.
 
     Parameters
     ----------
     model
-        The process.
+        Model of the process.
     sensors, outputs
-        What is measured, with its noise, and what is controlled.
+        Measured quantities with their noise, and controlled quantities.
     truth
-        t -> unknown numbers by label.
+        t -> true values of the unknowns by label.
     u0
         Initial state.
     step
-        Longest step.
+        Longest time step.
     seed
-        Of the noise.
+        Seed of the noise.
     start
         Inputs at the start.
     """
@@ -171,7 +170,7 @@ class Simulated:
         self.u = model.initial(u0, Moment(0.0, self.inputs))
 
     def advance(self, t: float, inputs: Mapping[str, float]) -> None:
-        """Go on to t with inputs that are held."""
+        """Advance to t with constant inputs."""
         self.inputs = Inputs(inputs)
         count = int(np.ceil((t - self.t) / self.dt * (1.0 - 1e-12)))
         h = (t - self.t) / count
@@ -183,13 +182,13 @@ class Simulated:
         self.t = t
 
     def measure(self) -> Array:
-        """Return what the sensors show now, with noise, shape (sensors,)."""
+        """Return the current noisy readings of the sensors, shape (sensors,)."""
         exact = self.sensors.predict(self.u, self._q(self.t), Moment(self.t, self.inputs))
         noise = self.sensors.noise
         return exact if noise is None else exact + noise * self.rng.standard_normal(len(exact))
 
     def outputs(self) -> Array:
-        """Return what the outputs are now, shape (outputs,)."""
+        """Return the current outputs, shape (outputs,)."""
         return self.seen.predict(self.u, self._q(self.t), Moment(self.t, self.inputs))
 
     def _q(self, t: float) -> Array:

@@ -1,10 +1,10 @@
-"""A heated rod whose conductivity is unknown and jumps.
+"""Heated rod with an unknown conductivity that jumps.
 
-A rod is heated at one end by a heater of limited power and loses heat to the room along its side.
-Its tip is to follow a temperature program; the hot face must not become hotter than the material
-bears. Neither is measured: two thermocouples stick in the rod. So all three things for which a
-controller needs the conductivity matter: the gain from the heater to the tip, how much hotter than
-the thermocouples the face is, and how early the heater has to act before the program moves.
+A heater of limited power heats a rod at one end. The rod loses heat to the room along its side. Its
+tip should follow a temperature program, and the hot face must not exceed the limit of the material.
+Only two thermocouples inside the rod are measured. A controller needs the conductivity for three
+quantities: the gain from the heater to the tip, the difference between the face and the
+thermocouples, and the time by which the heater must act before the program changes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SENSORS = {"T_5": 0.05, "T_10": 0.10}
 NOISE = 0.2  # K
 OUTPUTS = {"face": 0.0, "tip": LENGTH}
 HOTTEST = 180.0  # degC
-TOLERANCE = 1.0  # K: about what a thermocouple there would tell
+TOLERANCE = 1.0  # K, approximate accuracy of a thermocouple
 LEVELS, HOLD = (45.0, 60.0), 3600.0  # degC, s
 PERIOD, SAMPLES, HORIZON = 60.0, 360, 30
 ROOM = 20.0  # degC
@@ -41,7 +41,7 @@ FINE = 150, 5.0  # cells, s
 
 
 def process(cells: int) -> Model:
-    """Return the rod on a mesh of equal cells."""
+    """Return the model of the rod on a uniform mesh."""
     mesh = interval(0.0, LENGTH, cells)
     return Model(
         Field(mesh, linear(mesh), unit="degC"),
@@ -59,22 +59,22 @@ def process(cells: int) -> Model:
 
 
 def truth(t: float) -> Mapping[str, float]:
-    """Return the conductivity, which jumps."""
+    """Return the true conductivity at time t, with its jump."""
     return {"k": BEFORE if t <= JUMP else AFTER}
 
 
 def program(t: float) -> Mapping[str, float]:
-    """Return the temperature that the tip should have."""
+    """Return the target temperature of the tip at time t."""
     return {"tip": LEVELS[int(t // HOLD) % 2]}
 
 
 def room(t: float) -> Mapping[str, float]:
-    """Return the temperature of the room, which is measured."""
+    """Return the measured room temperature at time t."""
     return {"room": ROOM + 2.0 * float(np.sin(2.0 * np.pi * t / 7200.0))}
 
 
 def rod(seed: int = 0) -> Problem:
-    """Return the task; the same for all seeds, which draw the noise."""
+    """Return the problem, which does not depend on the seed: seeds only draw the noise."""
     sensors, outputs = Points(SENSORS, noise=NOISE), Points(OUTPUTS, unit="degC")
     model, fine = process(CELLS), process(FINE[0])
     law = SensitivityLaw(jumps=Jumps())

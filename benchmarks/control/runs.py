@@ -1,4 +1,4 @@
-"""One closed loop: a plant, an estimator, a controller; and what it cost."""
+"""Closed loops of a plant, an estimator and a controller, and their costs."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from livepde.linalg import Array
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A closed loop, sample by sample.
+    """Record of a closed loop.
 
     Attributes
     ----------
     t
         Times, shape (samples,).
     outputs, reference, inputs, q, std
-        What outputs and references were, what was set, and what was known of the unknown numbers,
+        Outputs, references, inputs, and estimates of the unknowns with their standard deviations,
         shapes (samples, ...).
     trusted
         Whether the estimate was used, shape (samples,).
     alarms
         Whether the law flagged a jump, shape (samples,).
     failed
-        Samples at which the controller had no solution.
+        Number of samples at which the controller had no solution.
     estimating, whole
-        Processor time of the estimator and of all, in each sample, shapes (samples,).
+        Processor time of the estimator, and of estimator and controller, shapes (samples,).
     """
 
     t: Array
@@ -50,7 +50,7 @@ class Run:
     whole: Array
 
     def to_xarray(self, problem: Problem) -> xr.Dataset:
-        """Return it as `livepde.plots.loops` draws it."""
+        """Return the dataset for `livepde.plots.loops`."""
         model, times = problem.reduced, self.t.tolist()
         found: dict[str, Any] = dict(zip(model.outputs.names, self.outputs.T, strict=True))
         found |= dict(zip(model.controls, self.inputs.T, strict=True))
@@ -87,7 +87,7 @@ class Run:
         Parameters
         ----------
         paid
-            With the penalties for what lies beyond limits.
+            Include penalties for values beyond limits.
         """
         model, goal = problem.reduced, problem.goal
         rows = [model.outputs.names.index(name) for name in goal.track]
@@ -100,21 +100,21 @@ class Run:
         return float((missed + moved + beyond)[self.t > since].sum())
 
     def beyond(self, problem: Problem) -> Array:
-        """Return by how much each limited output was beyond its limits, (samples, limited)."""
-        found = np.zeros((len(self.t), len(problem.goal.limits)))
+        """Return the excess of each limited output over its limits, shape (samples, limited)."""
+        excess = np.zeros((len(self.t), len(problem.goal.limits)))
         for k, name in enumerate(problem.goal.limits):
             low, high = np.array([problem.limits_at(t)[name] for t in self.t.tolist()]).T
             y = self.outputs[:, problem.reduced.outputs.names.index(name)]
-            found[:, k] = np.maximum(np.maximum(low - y, y - high), 0.0)
-        return found
+            excess[:, k] = np.maximum(np.maximum(low - y, y - high), 0.0)
+        return excess
 
     def violations(self, problem: Problem, tolerance: float = 0.0) -> NDArray[np.bool_]:
-        """Return at which samples an output was beyond its limits by more than a tolerance."""
+        """Return whether each sample has an excess over a limit of more than `tolerance`."""
         return np.asarray((self.beyond(problem) > tolerance).any(axis=1))
 
 
 class Timed:
-    """An estimator whose processor time is taken."""
+    """Wrapper of an estimator that records the processor time of its last step."""
 
     def __init__(self, inner: Estimator) -> None:
         self.inner = inner
@@ -133,15 +133,15 @@ class Timed:
         self.inner.restore(content, where)
 
 
-class Told:
-    """The filter of a model whose unknown numbers are known at all times."""
+class Informed:
+    """Filter of the true model, which receives the true values of the unknowns at each sample."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.filter = nominal(problem)
 
     def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
-        # Those over the period that ends now: they are held in it.
+        # The values at t are constant over the period that ends at t.
         truth = self.problem.truth(t)
         now = [truth[label] for label in self.problem.reduced.unknowns]
         if now != self.filter.q.tolist():
@@ -156,29 +156,29 @@ class Told:
 
 
 def nominal(problem: Problem) -> Kalman:
-    """Return the filter of the wrong fixed model: unknown numbers at the prior."""
+    """Return the filter of the wrong fixed model, with the unknowns at their prior."""
     return Kalman(problem.reduced, problem.period, drive=problem.drive)
 
 
 def offset_free(problem: Problem) -> Kalman:
-    """Return the same with an unknown offset of each control that its filter finds."""
+    """Return the filter of the wrong fixed model that also estimates an offset of each control."""
     model, walk = problem.reduced, problem.drive
     offset = {name: walk[name] for name in model.controls if name in walk}
     return Kalman(model, problem.period, drive=walk, offset=offset)
 
 
-def told(problem: Problem) -> Told:
+def informed(problem: Problem) -> Informed:
     """Return the filter of the true model."""
-    return Told(problem)
+    return Informed(problem)
 
 
 def learned(problem: Problem) -> Learned:
-    """Return livepde in the loop."""
+    """Return the estimator by livepde, with the filter of the wrong fixed model as fallback."""
     return Learned(problem.identifier(), nominal(problem), problem.trust)
 
 
 def closed_loop(problem: Problem, estimator: Estimator, controller: Controller, seed: int) -> Run:
-    """Return what a loop does with the plant of a seed."""
+    """Run a loop with the plant of a seed, and return its record."""
     timed = Timed(estimator)
     loop = Loop(timed, controller, before=problem.before)
     plant, rows, inputs = problem.plant(seed), [], dict(problem.before)

@@ -1,17 +1,17 @@
-"""A room behind a wall whose layers are unknown, kept comfortable by a weak heater.
+"""Room behind a wall with unknown layers, heated by a weak heater.
 
-An old building: nobody knows what is inside of its wall. By day the air must be warm, by night it
-may cool down, heat has a price, and the heater is not much stronger than the losses on a cold day.
-So a controller has to begin in time, and how long the wall takes to warm up is what its
-conductivities say. Who believes in a better wall than there is begins too late, and the room is
-cold in the morning; who believes in a worse one begins too early, and pays.
+The layers in the wall of an old building are unknown. By day the air must be warm, by night it may
+cool down, heat has a price, and the heater barely exceeds the losses of a cold day. Therefore a
+controller must start heating in time. The conductivities determine how long the wall takes to warm
+up. If the assumed wall insulates too well, heating starts too late and the room is cold in the
+morning; in the opposite case it starts too early, which is expensive.
 
-The room is a lumped node: air and furniture are a layer that conducts so well that it has one
-temperature, and the film of air at the wall is a layer without heat capacity worth the name.
+The room is a lumped node: air and furniture are a layer with so large a conductivity that it has a
+uniform temperature. The film of air at the wall is a layer with a negligible heat capacity.
 
-The temperature outside is a record of `LIVEPDE_DATA` (soil_temperature, air temperature of March
-and April, hourly), another week for each seed; its forecast is right. The conductivities are drawn
-for each seed from the prior.
+The outside temperature is a record in `LIVEPDE_DATA` (soil_temperature, hourly air temperature of
+March and April), with a different week for each seed and an exact forecast. The conductivities are
+drawn from the prior for each seed.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from livepde.observation import Points
 from livepde.stepping import Alexander2
 
 HOUR, DAY = 3600.0, 86400.0
-# Name -> end in m, conductivity of the data sheet in W/(m K), heat capacity in J/(m^3 K), cells.
+# Name -> end in m, data-sheet conductivity in W/(m K), heat capacity in J/(m^3 K), number of cells.
 ROOM: dict[str, tuple[float, float, float, int]] = {
     "room": (0.02, 10.0, 6e5, 1),
     "film": (0.03, 0.08, 1.2e3, 1),
@@ -49,25 +49,25 @@ WALL: dict[str, tuple[float, float, float, int]] = {
 }
 LAYERS = ROOM | WALL
 DEEP = ROOM["room"][0]
-SPREAD = 0.6  # prior deviation of the logarithm of a conductivity over that of the data sheet
-AIRING, OUTSIDE = 0.6, 20.0  # W/(m^2 K): fresh air, film outside
-POWER = 40.0  # W of the heater for each m^2 of wall
+SPREAD = 0.6  # prior standard deviation of the factor on a data-sheet conductivity
+AIRING, OUTSIDE = 0.6, 20.0  # W/(m^2 K), ventilation and outer air film
+POWER = 40.0  # W/m^2, power of the heater per area of the wall
 NOISE = 0.1  # K
-COLD = 8.0  # degC, at the start: nobody was there for a week
-WARM, NIGHT = 20.0, 15.0  # degC, least by day and by night
+COLD = 8.0  # degC, initial temperature of the unheated building
+WARM, NIGHT = 20.0, 15.0  # degC, lower limits by day and by night
 MORNING, EVENING = 6.0, 18.0  # h
 HOTTEST = 24.0  # degC
-PRICE = 1.0 / POWER  # of a sample with full power: 1
-LEARNT = 2.0 * DAY  # the first day warms the building up, for everybody
-PENALTY = 5.0  # of a kelvin too cold in a sample, in samples of full power
+PRICE = 1.0 / POWER  # a sample with full power costs 1
+LEARNT = 2.0 * DAY  # s, end of the learning phase; every controller heats up on the first day
+PENALTY = 5.0  # cost of one kelvin below the limit in a sample
 PERIOD, HORIZON, DAYS = 1800.0, 20, 5
-FINE = 4, 300.0  # cells for each of the model's, s
-WEEKS = (0, 1, 2, 4, 5)  # of the record, those with frost
+FINE = 4, 300.0  # cells of the truth per cell of the model, and its time step in s
+WEEKS = (0, 1, 2, 4, 5)  # weeks of the record with frost
 RECORD = Path("soil_temperature") / "soil_2025_mar_jun.csv"
 
 
 def process(fine: int = 1) -> Model:
-    """Return room and wall, per square metre of wall."""
+    """Return the model of room and wall, per square metre of wall."""
     nodes, begin = [0.0], {}
     for name, (end, _, _, cells) in LAYERS.items():
         begin[name] = nodes[-1]
@@ -103,13 +103,13 @@ def process(fine: int = 1) -> Model:
 
 
 def comfort(t: float) -> dict[str, tuple[float, float]]:
-    """Return the limits of the air's temperature."""
+    """Return the limits of the air temperature at time t."""
     occupied = MORNING <= t / HOUR % 24.0 < EVENING
     return {"air": (WARM if occupied else NIGHT, HOTTEST)}
 
 
 def wall(seed: int = 0) -> Problem:
-    """Return the task of a seed."""
+    """Return the problem of a seed."""
     sensors, outputs = Points({"air": 0.0, "face": 0.03}, noise=NOISE), Points({"air": 0.0})
     model, fine = process(), process(FINE[0])
     rng = np.random.default_rng([seed, 0])
@@ -161,19 +161,19 @@ def wall(seed: int = 0) -> Problem:
         foreseen=True,
         settled=LEARNT,
         tolerance=0.2,
-        # What nobody can tell of the outer layer does not matter inside.
+        # The outer layer is barely identifiable, and does not affect the room.
         trust=Trust(spread=2.0),
     )
 
 
 @cache
 def weather() -> Array:
-    """Return the temperatures outside, hour by hour, in degC."""
+    """Return the hourly outside temperatures, in degC."""
     folder = os.environ.get("LIVEPDE_DATA")
     if not folder:
         raise ConfigurationError(
-            f"wall: the weather is read from {RECORD}, and LIVEPDE_DATA is not set; set it to the "
-            "folder that holds the measurements, or leave this problem out."
+            f"wall: reading the weather from {RECORD} requires LIVEPDE_DATA. Set it to the folder "
+            "of the measurements, or select other problems with --only."
         )
     with (Path(folder) / RECORD).open(newline="") as file:
         return np.array([float(row["TA_1_1_1"]) for row in csv.DictReader(file)])
