@@ -1,9 +1,9 @@
-"""Honest twins: whether intervals hold when the truth comes from elsewhere.
+"""Honest twins: coverage of intervals for truths from independent codes.
 
-Each truth has a code of its own, another scheme on another mesh (collocation, cosine series, finite
-volumes with exponentials or TR-BDF2), which shares nothing with livepde but the prior that it is
-drawn from. livepde has its defaults: no scheme, gate, refit or law is chosen. The data are white,
-autoregressive, heavy-tailed, have a spike, gaps in their channels, or a sensor that is off.
+Each truth has its own code with another scheme on another mesh (collocation, cosine series, finite
+volumes with exponentials or TR-BDF2), which shares only the prior with livepde. livepde uses its
+defaults for scheme, gate, refit and law. The noise is white, autoregressive or heavy-tailed, or the
+data have a spike, gaps in their channels, or a sensor with an offset.
 """
 
 from benchmarks.honest.noise import KINDS

@@ -1,4 +1,4 @@
-"""What all data together can tell: the most probable theta, with the truth's own code as model."""
+"""Batch fit of all data: the maximum a posteriori theta, with the truth's own code as model."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from numpy.typing import NDArray
 from benchmarks.honest.problem import Latent, Problem
 
 Array = NDArray[Any]
-MOST = 8  # Gauss-Newton steps
+MOST = 8  # largest number of Gauss-Newton steps
 HALVINGS = 6
 SMALL = 1e-3  # length of the last step, in standard deviations of the posterior
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """The posterior of theta, linear about the truth.
+    """Posterior of theta, linearised about the truth.
 
     Attributes
     ----------
     problem, theta
-        And the truth.
+        Problem, and its true theta.
     shown, J
-        What the sensors show at the truth by the batch's own model, (samples, sensors), and its
-        derivative in standard deviations of the noise, shape (samples, sensors, coordinates).
+        Readings predicted for the truth, shape (samples, sensors), and their derivative in standard
+        deviations of the noise, shape (samples, sensors, coordinates).
     """
 
     problem: Problem
@@ -36,24 +36,24 @@ class Batch:
 
     @classmethod
     def of(cls, problem: Problem, theta: Array) -> Batch:
-        """Return the posterior about a truth."""
+        """Return the posterior, linearised about a truth."""
         J = problem.jacobian(theta) / problem.noise
         return cls(problem, theta, problem.predict(theta), J)
 
     def std(self, latent: Latent, at: int) -> Array:
-        """Return the standard deviations of an unknown, from the samples up to one."""
+        """Return the standard deviations of an unknown, given the samples up to index `at`."""
         rows = self.J[: at + 1].reshape(-1, self.J.shape[-1])
         R = np.asarray(np.linalg.qr(np.vstack([rows, np.eye(rows.shape[1])]), mode="r"))
         factor = np.linalg.solve(R.T, latent.directions(at).T)
-        found: Array = np.linalg.norm(factor, axis=0)
-        return found
+        std: Array = np.linalg.norm(factor, axis=0)
+        return std
 
     def linear(self, z: Array) -> Array:
-        """Return the most probable theta of a model that is linear about the truth."""
+        """Return the maximum a posteriori theta of the linearised model."""
         return self.theta + _step(self.J, (z - self.shown) / self.problem.noise, self.theta)
 
     def fit(self, z: Array) -> Array:
-        """Return the most probable theta: damped Gauss-Newton steps, the first from the truth."""
+        """Return the maximum a posteriori theta by damped Gauss-Newton steps from the truth."""
         theta, shown, J = self.theta, self.shown, self.J
         misfit = self._misfit(theta, shown, z)
         for _ in range(MOST):
@@ -78,8 +78,8 @@ class Batch:
 
 
 def _step(J: Array, residual: Array, theta: Array) -> Array:
-    """Return the Gauss-Newton step of |residual - J step|^2 + |theta + step|^2."""
+    """Return the step that minimises |residual - J step|^2 + |theta + step|^2."""
     rows = np.vstack([J.reshape(-1, len(theta)), np.eye(len(theta))])
     right = np.concatenate([residual.ravel(), -theta])
-    found: Array = np.linalg.lstsq(rows, right, rcond=None)[0]
-    return found
+    step: Array = np.linalg.lstsq(rows, right, rcond=None)[0]
+    return step

@@ -1,8 +1,8 @@
-"""Linear systems y' = A y + B g(t), solved by exponentials: no time step, no scheme.
+"""Linear systems y' = A y + B g(t), solved by matrix exponentials without a time scheme.
 
-The inputs g are sampled at substeps and straight between them. The response to them is exact, of
-Van Loan (1978), so that the only errors are those of the substeps, which are far shorter than the
-samples, and of the space that A stands for.
+The inputs g are linear between substeps. The response to them is exact (Van Loan 1978). The only
+errors are the interpolation of g on substeps, which are much shorter than the sampling interval,
+and the space discretisation of A.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ import scipy.linalg as sla
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
-SUBSTEPS = 8  # of an interval between two samples
-SMALL = 1e-3  # |z| below which exp(z) - 1 - z is a series
+SUBSTEPS = 8  # substeps between two samples
+SMALL = 1e-3  # |z| below which exp(z) - 1 - z is evaluated by its series
 
 
 def fine_times(times: Array, substeps: int = SUBSTEPS) -> Array:
-    """Return the times of the substeps between evenly spaced samples."""
+    """Return the times of the substeps of evenly spaced samples."""
     return np.linspace(times[0], times[-1], substeps * (len(times) - 1) + 1)
 
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """The system y' = A y + B g, z = C y + D g.
+    """Linear system y' = A y + B g, z = C y + D g.
 
     Parameters
     ----------
     A
-        Shape (n, n), or (n,) where it is diagonal.
+        Shape (n, n), or (n,) if A is diagonal.
     B, C, D
         Shapes (n, inputs), (sensors, n) and (sensors, inputs).
     """
@@ -44,12 +44,12 @@ class Linear:
 
     @classmethod
     def symmetric(cls, main: Array, off: Array, B: Array, C: Array, D: Array) -> Linear:
-        """Return the system with a symmetric tridiagonal A in the coordinates of its modes."""
+        """Diagonalise a system with a symmetric tridiagonal A."""
         values, V = sla.eigh_tridiagonal(main, off)
         return cls(values, V.T @ B, C @ V, D)
 
     def respond(self, g: Array, step: float, start: Array | None = None) -> Array:
-        """Return z at the samples, shape (samples, sensors).
+        """Return the outputs z at the samples, shape (samples, sensors).
 
         Parameters
         ----------
@@ -63,7 +63,7 @@ class Linear:
         delta, intervals = step / SUBSTEPS, (len(g) - 1) // SUBSTEPS
         diagonal = self.A.ndim == 1
         once, B0, B1 = self._diagonal_step(delta) if diagonal else self._dense_step(delta)
-        # The inputs of one interval act on its end by B0 and B1 and what follows of the interval.
+        # B0 and B1 act at the ends of a substep, followed by the rest of the sampling interval.
         weights = np.zeros((SUBSTEPS + 1, *self.B.shape))
         power = np.ones_like(once) if diagonal else np.eye(len(once))
         for j in reversed(range(SUBSTEPS)):
@@ -103,14 +103,14 @@ class Linear:
 
 
 class Chebyshev:
-    """Collocation in the Chebyshev points of (0, length), and interpolation between them.
+    """Collocation and interpolation with the Chebyshev points of (0, length).
 
     Parameters
     ----------
     count
         Polynomial degree.
     length
-        Of the interval.
+        Length of the interval.
     """
 
     def __init__(self, count: int, length: float = 1.0) -> None:
@@ -125,7 +125,7 @@ class Chebyshev:
         self.D2 = D @ D
 
     def rows(self, points: Sequence[float]) -> Array:
-        """Return the matrix that interpolates to points, barycentric, shape (points, nodes)."""
+        """Return the matrix of barycentric interpolation to points, shape (points, nodes)."""
         found = np.zeros((len(points), len(self.x)))
         for row, point in zip(found, points, strict=True):
             gap = point - self.x
@@ -140,20 +140,20 @@ class Chebyshev:
     def system(
         self, operator: Array, ends: Array, given: Array, source: Array, points: Sequence[float]
     ) -> Linear:
-        """Return u_t = operator u + source g inside, with ends u = given g at the two end nodes.
+        """Return the system u_t = operator u + source g with boundary conditions ends u = given g.
 
         Parameters
         ----------
         operator
-            On all nodes, shape (nodes, nodes).
+            Operator on all nodes, shape (nodes, nodes).
         ends
-            The two boundary conditions as rows, shape (2, nodes).
+            Rows of the two boundary conditions, shape (2, nodes).
         given
-            Their right-hand sides, shape (2, inputs).
+            Right-hand sides of the boundary conditions, shape (2, inputs).
         source
             Shape (nodes, inputs).
         points
-            Of the sensors.
+            Positions of the sensors.
         """
         outer, inner = [0, -1], slice(1, -1)
         inverse = np.linalg.inv(ends[:, outer])
@@ -170,14 +170,14 @@ class Chebyshev:
 def diffusion(
     conductance: Array, capacity: Array, loss: Array, B: Array, C: Array, D: Array
 ) -> Linear:
-    """Return finite volumes: capacity y' = differences of conductance times differences of y + B g.
+    """Return the finite-volume system capacity y' = -(differences of fluxes) - loss y + B g.
 
     Parameters
     ----------
     conductance
-        Between a volume and the next, shape (volumes - 1,).
+        Conductance between neighbouring volumes, shape (volumes - 1,).
     capacity, loss
-        Of the volumes; loss is what else acts on the diagonal, such as a conductance to an input.
+        Capacity of each volume, and its conductance to inputs, shape (volumes,).
     """
     root = np.sqrt(capacity)
     main = -loss.astype(float)

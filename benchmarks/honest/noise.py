@@ -1,4 +1,4 @@
-"""What is wrong with the data: kinds of noise, a spike, gaps in channels, an offset."""
+"""Disturbances of data: kinds of noise, a spike, gaps in channels, and an offset."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from numpy.typing import NDArray
 from benchmarks.honest.problem import Problem
 
 Array = NDArray[Any]
-MISSING = 0.3  # share of the readings of each channel that gaps take
-SPIKES = (9999.0, 50.0)  # a value, and a distance in standard deviations, in turns
-SPIKE_AT = (0.2, 0.8)  # of the run
+MISSING = 0.3  # share of missing readings of each channel
+SPIKES = (9999.0, 50.0)  # value, or distance in standard deviations, with equal probability
+SPIKE_AT = (0.2, 0.8)  # range of the spike, in shares of the run
 OFFSET = 2.0  # standard deviations
 
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """What the identifier gets.
+    """Data of a run.
 
     Attributes
     ----------
     z
         Readings, shape (samples, sensors).
     right
-        The same without a spike, for the batch fit, which knows which reading it is.
+        Readings without the spike, for the batch fit, shape (samples, sensors).
     inputs
-        Channels, shape (samples, channels); NaN is missing.
+        Channels, shape (samples, channels); NaN if missing.
     spike
-        Number of the sample with the spike; None without.
+        Index of the sample with the spike, or None.
     biased
-        Name of the sensor with an offset; None without.
+        Name of the sensor with an offset, or None.
     """
 
     z: Array
@@ -45,20 +45,20 @@ class Data:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of disturbance.
+    """Kind of disturbance.
 
     Attributes
     ----------
     title
-        What it is.
+        Description.
     coverage
-        The share of truths that 95 % intervals have to hold, least and most; None: not promised.
+        Bounds on the coverage of 95 % intervals; None: no bounds.
     freed
         Whether the offset of the sensor is an unknown of the identifier.
     right
-        Whether nothing is wrong: the noise is as stated, white and Gaussian.
+        Whether the noise is white and Gaussian, as the estimator assumes.
     channels
-        Whether it needs channels.
+        Whether the kind requires channels.
     """
 
     title: str
@@ -74,23 +74,23 @@ KINDS: Mapping[str, Kind] = {
     "white": Kind("white Gaussian noise", USUAL, right=True),
     "ar100": Kind("AR(1), time constant a hundredth of the run", USUAL),
     "ar10": Kind("AR(1), time constant a tenth of the run", (0.88, 1.0)),
-    "student": Kind("Student t_3 with the stated standard deviation", USUAL),
-    "spike": Kind("white, one reading 9999 or 50 standard deviations off", USUAL),
+    "student": Kind("Student t_3 with the configured standard deviation", USUAL),
+    "spike": Kind("white, one reading of 9999 or 50 standard deviations off", USUAL),
     "gaps": Kind("white, 30 % of the readings of channels missing", USUAL, channels=True),
-    "bias": Kind("white, a sensor two standard deviations off", None),
-    "bias-freed": Kind("the same, the offset of that sensor unknown", (0.90, 1.0), freed=True),
+    "bias": Kind("white, one sensor two standard deviations off", None),
+    "bias-freed": Kind("white, one sensor off, its offset unknown", (0.90, 1.0), freed=True),
 }
 
 
 def disturbed(name: str, problem: Problem, shown: Array, rng: np.random.Generator) -> Data:
-    """Return the data of a kind.
+    """Return data with a kind of disturbance.
 
-    The same generator state gives the same white noise in all kinds that have it.
+    All kinds with white noise draw the same noise from the same generator state.
 
     Parameters
     ----------
     shown
-        What the sensors show without noise, shape (samples, sensors).
+        Readings without noise, shape (samples, sensors).
     """
     white = rng.standard_normal(shown.shape)
     inputs = problem.inputs(problem.times)
@@ -104,7 +104,7 @@ def disturbed(name: str, problem: Problem, shown: Array, rng: np.random.Generato
         return Data(z, right, inputs, spike=at)
     if name == "gaps":
         gone = rng.random(inputs.shape) < MISSING
-        gone[0] = False  # a run begins where every channel has a value
+        gone[0] = False  # all channels have a value at the start
         return Data(z, z, np.where(gone, np.nan, inputs))
     if name in ("bias", "bias-freed"):
         z[:, sensor] += OFFSET * problem.noise * rng.choice([-1.0, 1.0])
@@ -117,7 +117,7 @@ def _as_drawn(white: Array, rng: np.random.Generator) -> Array:
 
 
 def _autoregressive(share: float) -> Callable[[Array, np.random.Generator], Array]:
-    """Return AR(1) noise of unit variance with a time constant in shares of the run."""
+    """Return AR(1) noise of unit variance; `share` is its time constant over the run's length."""
 
     def noise(white: Array, rng: np.random.Generator) -> Array:
         rho = np.exp(-1.0 / (share * (len(white) - 1)))

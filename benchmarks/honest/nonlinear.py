@@ -1,7 +1,7 @@
-"""Stiff nonlinear systems with tridiagonal Jacobians and their tangents, by TR-BDF2.
+"""Stiff nonlinear systems with tridiagonal Jacobians, and their tangents, by TR-BDF2.
 
-Bank, Coughran, Fichtner, Grosse, Rose, Smith (1985): half a step of the trapezoidal rule and one of
-BDF2, of second order and L-stable, with several steps between two samples. The tangents are the
+TR-BDF2 (Bank, Coughran, Fichtner, Grosse, Rose, Smith 1985) combines the trapezoidal rule and BDF2.
+It is L-stable and of second order. Several steps are taken between two samples. The tangents are
 exact derivatives of the discrete solution.
 """
 
@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_banded
 
 Array = NDArray[Any]
-SUBSTEPS = 4  # of an interval between two samples
+SUBSTEPS = 4  # steps between two samples
 GAMMA = 2.0 - np.sqrt(2.0)
-TOLERANCE = 1e-5  # of an update, relative to the state; the error left is about its square
-MOST = 12  # Newton steps
+TOLERANCE = 1e-5  # Newton update relative to the state; the remaining error is about its square
+MOST = 12  # largest number of Newton steps
 
 
 class Stiff(ABC):
-    """The system y' = f(t, y) whose parameters depend on coordinates theta."""
+    """System y' = f(t, y) whose parameters depend on coordinates theta."""
 
     @abstractmethod
     def rate(self, t: float, y: Array) -> Array:
@@ -30,7 +30,7 @@ class Stiff(ABC):
 
     @abstractmethod
     def jacobian(self, t: float, y: Array) -> Array:
-        """Return df/dy as three bands, as `scipy.linalg.solve_banded` has them."""
+        """Return df/dy as three bands in the format of `scipy.linalg.solve_banded`."""
 
     @abstractmethod
     def forcing(self, t: float, y: Array) -> Array:
@@ -39,7 +39,7 @@ class Stiff(ABC):
     def solve(self, start: Array, times: Array, tangents: bool) -> tuple[Array, Array]:
         """Return y at the samples, (samples, n), and dy/dtheta, (samples, n, coordinates).
 
-        The start does not depend on theta. Without tangents there are none, shape (samples, n, 0).
+        The start does not depend on theta. Without tangents, dy/dtheta has shape (samples, n, 0).
         """
         y = np.asarray(start, dtype=float)
         width = self.forcing(float(times[0]), y).shape[1] if tangents else 0
@@ -75,7 +75,7 @@ class Stiff(ABC):
             y = y + update
             if np.abs(update).max() <= TOLERANCE * (1.0 + np.abs(y).max()):
                 return y
-        raise ArithmeticError(f"Newton's method does not converge at t = {t:g}.")
+        raise ArithmeticError(f"Newton's method did not converge at t = {t:g}.")
 
     def _matrix(self, y: Array, a: float, t: float) -> Array:
         bands = -a * self.jacobian(t, y)

@@ -1,4 +1,4 @@
-"""Abstract problem of the benchmark: a truth with a code of its own, and what livepde is told."""
+"""Abstract problem of the benchmark: a truth with its own code, and the model for livepde."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ import livepde as lp
 
 Array = NDArray[Any]
 Signal = Callable[[Array], Array]
-"""An input channel as a smooth function of the time; it is read at the samples only."""
+"""Input channel as a smooth function of time, which is read only at the samples."""
 
 DIFFERENCE = 1e-5  # step of finite differences, in standard deviations of the prior
 
 
 @dataclass(frozen=True, eq=False)
 class Latent:
-    """One unknown in terms of standard normal coordinates theta.
+    """Unknown as a function of standard normal coordinates theta.
 
     Attributes
     ----------
     mean
-        Of its Gaussian: of the logarithm where `log`.
+        Mean of the Gaussian, which is the logarithm of the unknown if `log` is true.
     directions
-        Number of a sample -> derivative in theta of the value then, shape (values, coordinates).
-        A field has a value at each vertex of livepde's mesh.
+        Index of a sample -> derivative of the Gaussian by theta, shape (values, coordinates). A
+        field has a value at each vertex of livepde's mesh.
     log
         Whether the unknown is the exponential of the Gaussian.
     """
@@ -40,11 +40,11 @@ class Latent:
     log: bool = True
 
     def value(self, theta: Array, at: int) -> Array:
-        """Return the Gaussian, shape (values,)."""
+        """Return the Gaussian at a sample, shape (values,)."""
         return np.asarray(self.mean + self.directions(at) @ theta)
 
     def inverse(self, q: Any) -> Array:
-        """Return the Gaussian of a physical value; -inf for what is not positive."""
+        """Return the Gaussian of a physical value; with `log`, -inf if it is not positive."""
         q = np.atleast_1d(np.asarray(q, dtype=float))
         if not self.log:
             return np.asarray(q)
@@ -55,7 +55,7 @@ class Latent:
 def constant(
     prior: float, std: float, number: int, coordinates: int, *, log: bool = True
 ) -> Latent:
-    """Return a number that is one of the coordinates; its prior is that of a `Scalar`."""
+    """Return a constant unknown that depends on one coordinate, with the prior of a `Scalar`."""
     row = np.zeros((1, coordinates))
     row[0, number] = std / prior if log else std
     return Latent(float(np.log(prior)) if log else prior, lambda at: row, log)
@@ -67,36 +67,36 @@ def waves(length: float, *parts: tuple[float, float]) -> Signal:
     Parameters
     ----------
     length
-        Of the run.
+        Length of the run.
     parts
-        Amplitude and number of periods in the run.
+        Amplitude, and number of periods in the run.
     """
     return lambda t: np.asarray(sum(a * np.sin(2 * np.pi * n * t / length) for a, n in parts))
 
 
 class Problem(ABC):
-    """A process, its sensors, and a truth that shares no code with livepde.
+    """Process, its sensors, and a truth that shares no code with livepde.
 
     Attributes
     ----------
     title
-        The process in a few words.
+        Description of the process.
     length, intervals
-        Of the run; samples are evenly spaced, the first at 0.
+        Length of the run, and number of intervals between evenly spaced samples from 0 on.
     points
-        Sensors and where they are.
+        Name -> position of each sensor.
     noise
         Standard deviation of the sensors.
     latents
-        The unknowns by the label that livepde gives them.
+        livepde's label -> unknown.
     coordinates
         Number of coordinates theta.
     channels
-        Input channels.
+        Input channels by name.
     moving
-        Unknowns that move.
+        Labels of unknowns that move.
     u0
-        Initial state, a number.
+        Constant initial state.
     """
 
     title: str
@@ -117,17 +117,17 @@ class Problem(ABC):
         return np.linspace(0.0, self.length, self.intervals + 1)
 
     def inputs(self, times: Array) -> Array:
-        """Return the channels at some times, shape (times, channels)."""
+        """Return the channels at given times, shape (times, channels)."""
         if not self.channels:
             return np.zeros((len(times), 0))
         return np.column_stack([signal(times) for signal in self.channels.values()])
 
     @abstractmethod
     def predict(self, theta: Array) -> Array:
-        """Return what the sensors show without noise, shape (samples, sensors)."""
+        """Return the readings without noise, shape (samples, sensors)."""
 
     def draw(self, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return coordinates from the prior and what the sensors show without noise."""
+        """Draw coordinates from the prior, and return them with the readings without noise."""
         theta = rng.standard_normal(self.coordinates)
         return theta, self.predict(theta)
 
@@ -142,21 +142,21 @@ class Problem(ABC):
 
     @abstractmethod
     def model(self, refine: int = 1) -> lp.Model:
-        """Return the process as a user of livepde writes it, mesh included.
+        """Return the model with its mesh, as a user of livepde would write it.
 
         Parameters
         ----------
         refine
-            Into so many each cell is divided, to compare with the truth.
+            Number of parts of each cell in each direction, for comparisons with the truth.
         """
 
     def identifier(self, freed: str | None = None) -> lp.Identifier:
-        """Return the identifier with its defaults.
+        """Return the identifier with default options.
 
         Parameters
         ----------
         freed
-            Sensor whose offset is an unknown, of two noise levels.
+            Sensor with an unknown offset, whose prior standard deviation is twice the noise.
         """
         model, direct = self.model(), dict(self.direct)
         if freed is not None:

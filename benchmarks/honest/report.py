@@ -1,4 +1,4 @@
-"""Scores of many twins as tables and checks."""
+"""Tables and checks of the scores of many twins."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from livepde.runs import Outcome
 Array = NDArray[Any]
 Found: TypeAlias = Mapping[tuple[str, str], Sequence[Run]]
 
-ENOUGH = 40  # twins from which the bounds of coverage hold as they stand
-CHANCE = 0.005  # probability that chance alone breaks the bound of fewer twins, on each side
-SINGLE = 1e-4  # the same for one unknown at one time, of which there are hundreds
-WIDTH = 1.3  # median width over that of the batch posterior, at most
+ENOUGH = 40  # number of twins from which the bounds on coverage are used unchanged
+CHANCE = 0.005  # probability that chance breaks the bound for fewer twins, on each side
+SINGLE = 1e-4  # this probability for a single unknown and time; there are hundreds of them
+WIDTH = 1.3  # largest median width over the width of the batch posterior
 SMOOTHED_COVERAGE = (0.90, 0.98)
-ERROR = 1.2  # error over that of the batch fit, at most
-SMOOTHED = 1.1  # error of the smoother over that of the batch fit, at most
-WIDEST = 1.5  # width over that of the prior, at most
-SHIFT = 0.5  # that a spike may move an estimate, in standard deviations
-CONSTANT = 0.90  # least coverage of a constant beside a moving unknown
+ERROR = 1.2  # largest error over the error of the batch fit
+SMOOTHED = 1.1  # largest error of the smoother over the error of the batch fit
+WIDEST = 1.5  # largest width over the width of the prior
+SHIFT = 0.5  # largest shift of an estimate by a spike, in standard deviations
+CONSTANT = 0.90  # smallest coverage of a constant in a problem with a moving unknown
 MOVING = {"flux": "k", "warm-flux": "k"}
-"""Problem with a moving unknown -> the constant beside it."""
+"""Problem with a moving unknown -> its constant unknown."""
 
 
 def outcome(runs: Iterable[Run]) -> Outcome:
@@ -54,15 +54,15 @@ def outcome(runs: Iterable[Run]) -> Outcome:
 
 
 NOTES = (
-    "Coverage: share of truths in their 95 % interval, for a field of vertices; the columns 10 % "
-    "to 100 % are shares of the run. Widths and errors are those of the Gaussian coordinates of "
-    "the prior (the logarithm of what is positive). width/batch: median over that of the posterior "
-    "of a batch fit of the same samples, whose model is the code of the truth. error/fit: root "
-    "mean square at the end over that of the batch fit of all data, of which the spike is left "
-    "out. widest/prior: the widest interval over the prior's. mean z: mean error at the end in "
-    "standard deviations of the estimate; of a field it has no sign.",
-    f"With fewer than {ENOUGH} twins the bounds of coverage are those that chance breaks with a "
-    f"probability of {CHANCE:g} on each side if the promised bound just holds.",
+    "Coverage: share of truths in their 95 % interval, for a field the share of vertices; columns "
+    "10 % to 100 % are shares of the run. Widths and errors are in the Gaussian coordinates of the "
+    "prior (the logarithm of positive unknowns). width/batch: median width over the width of a "
+    "batch posterior of the same samples, with the code of the truth as model. error/fit: root "
+    "mean square error at the end over the error of the batch fit of all data without the spike. "
+    "widest/prior: width of the widest interval over the prior's. mean z: mean error at the end in "
+    "standard deviations of the estimate, unsigned for a field.",
+    f"With fewer than {ENOUGH} twins, bounds on coverage are relaxed. If the true coverage equals "
+    f"the bound, chance breaks the relaxed bound with probability {CHANCE:g} on each side.",
 )
 
 
@@ -106,7 +106,7 @@ def _smoother_checks(name: str, problem: str, several: Sequence[Run]) -> Iterato
 def _smoothed_scores(
     problem: str, label: str, several: Sequence[Run]
 ) -> tuple[float, float, float]:
-    """Return coverage and root mean square errors of smoother and batch fit of an unknown."""
+    """Return coverage and RMS error of the smoother for an unknown, and RMS error of the fit."""
     j = list(PROBLEMS[problem].latents).index(label)
     scores = [run.smoothed for run in several if run.smoothed is not None]
     covered = float(np.mean([one.covered[j] for one in scores]))
@@ -118,7 +118,7 @@ def _smoothed_scores(
 
 
 def _smoothed(found: Found) -> Iterator[Table]:
-    """Yield the table of the smoother, if it was run."""
+    """Yield the table of the smoother, if it was run for any twin."""
     rows = []
     for (problem, kind), several in found.items():
         if any(run.smoothed for run in several):
@@ -142,7 +142,7 @@ def _coverage(name: str, covered: Array, bounds: tuple[float, float], twins: int
 
 
 def _pooled_checks(found: Found) -> Iterator[Check]:
-    """Yield the coverage of each kind at each time, over all problems."""
+    """Yield checks of the coverage of each kind at each time, over all problems."""
     for kind, about in KINDS.items():
         several = [runs for (_, k), runs in found.items() if k == kind]
         if about.coverage is None or not several:
@@ -190,7 +190,7 @@ def _overview(found: Found) -> Table:
         "missed",
         "failed",
     ]
-    return Table("Coverage of 95 % intervals, defaults alone", columns, rows)
+    return Table("Coverage of 95 % intervals with default options", columns, rows)
 
 
 def _details(found: Found) -> Table:
@@ -244,5 +244,5 @@ def _error_ratio(several: Sequence[Run]) -> float:
 
 
 def _largest(values: Array) -> float:
-    """Return the largest of the values; one that is missing beside others is ignored."""
+    """Return the largest value except NaN; NaN if no value is finite."""
     return float(np.nanmax(values)) if np.isfinite(values).any() else float("nan")

@@ -1,4 +1,4 @@
-"""All twins, in several processes."""
+"""Runs of all twins, in several processes."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def honest(
     Parameters
     ----------
     seeds
-        Twins of each problem.
+        Number of twins of each problem.
     workers
-        Processes; default one for each processor. One runs in this process.
+        Processes; default one for each processor. With 1, twins run in this process.
     """
     kinds = [kind for kind in KINDS if kind in (kinds or KINDS)]
     todo = [(name, seed, kinds) for seed in range(seeds) for name in (only or PROBLEMS)]

@@ -1,4 +1,4 @@
-"""One twin: a truth from the prior, its data in several kinds, and what livepde makes of them."""
+"""Twin experiment: a truth from the prior, data with several kinds of noise, and their scores."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from livepde.streams import FillGaps
 
 Array = NDArray[Any]
 SHARES = (0.10, 0.25, 0.50, 0.75, 1.00)
-"""Of the run, after which intervals are looked at."""
+"""Shares of the run after which intervals are scored."""
 
 
 @dataclass(eq=False)
@@ -32,7 +32,7 @@ class Smoothed:
     Attributes
     ----------
     covered
-        Share of the samples at which the 95 % interval holds the truth.
+        Share of the samples at which the 95 % interval contains the truth.
     error, fit
         Root mean square of the errors of the smoother and of the batch fit, in standard deviations
         of the prior.
@@ -47,32 +47,32 @@ class Smoothed:
 class Run:
     """Scores of one run; arrays have the shape (shares, unknowns).
 
-    All but `covered` are in the latent coordinates of the prior, where it is Gaussian. A field has
-    a value at each vertex of livepde's mesh.
+    All scores except `covered` are in the Gaussian coordinates of the prior. A field has a value at
+    each vertex of livepde's mesh.
 
     Attributes
     ----------
     covered
-        Share of the values whose 95 % interval holds the truth.
+        Share of the values whose 95 % interval contains the truth.
     width
-        Median width over that of the batch posterior from the same samples.
+        Median width over the width of the batch posterior from the same samples.
     widest
-        Largest width over that of the prior.
+        Largest width over the width of the prior.
     error, fit
-        Root mean square of the errors, in standard deviations of the batch posterior; of the
-        estimate and of the batch fit of all data, this one of shape (unknowns,).
+        Root mean square errors of the estimate, and of the batch fit of all data with shape
+        (unknowns,), in standard deviations of the batch posterior.
     z
-        Error in the estimate's own standard deviations, of a number with its sign, of a field the
-        root mean square.
+        Error in standard deviations of the estimate: signed for a constant, root mean square for a
+        field.
     shift
-        Of a run with a spike: root mean square distance to the run without, in that one's own
-        standard deviations; NaN before the spike.
+        Root mean square distance between the runs with and without the spike, in standard
+        deviations of the latter; NaN before the spike and for other kinds.
     missed
-        Steps that were not taken.
+        Number of samples that were not taken.
     failure
-        What ended the run, if anything did.
+        Error that ended the run; empty without one.
     smoothed
-        Where an unknown moves and nothing is wrong with the data.
+        Scores of the smoother, for a moving unknown and undisturbed data; otherwise None.
     """
 
     problem: str
@@ -92,9 +92,9 @@ class Run:
 
 @dataclass(eq=False)
 class _Seen:
-    """Latent estimate and interval of each unknown: (share, label) -> centre, low, high.
+    """Latent estimates and intervals: `values` maps (share, label) to centre, low and high.
 
-    `smoothed` holds those of numbers at all samples, label -> centre, low, high.
+    `smoothed` maps the label of a constant to centre, low and high at all samples.
     """
 
     smoothed: dict[str, tuple[Array, Array, Array]] = field(default_factory=dict)
@@ -104,7 +104,7 @@ class _Seen:
 
 
 def twins(name: str, seed: int, kinds: Sequence[str]) -> list[Run]:
-    """Return the scores of one truth in several kinds; the same seed gives the same numbers."""
+    """Return the scores of one truth for several kinds; a seed determines all numbers."""
     problem = PROBLEMS[name]
     with threadpool_limits(1):
         rng = np.random.default_rng([zlib.crc32(name.encode()), seed])
@@ -137,9 +137,9 @@ def twins(name: str, seed: int, kinds: Sequence[str]) -> list[Run]:
 
 
 def _identified(problem: Problem, data: Data, freed: bool, smooths: bool = False) -> _Seen:
-    """Run the identifier with its defaults and keep what it says after each share of the run.
+    """Run the identifier with default options, and return its intervals after each share.
 
-    With `smooths` also what it says of all samples at the end.
+    With `smooths`, the intervals of the smoother at all samples are included.
     """
     times, seen = problem.times, _Seen()
     at = {round(share * problem.intervals): k for k, share in enumerate(SHARES)}
@@ -153,8 +153,8 @@ def _identified(problem: Problem, data: Data, freed: bool, smooths: bool = False
         space = estimate.space
         for label, latent in problem.latents.items():
             part = space.labels[label] if label in space.labels else space.part(label)
-            found = (estimate.q[part], *estimate[label].interval())
-            seen.values[k, label] = tuple(latent.inverse(item) for item in found)  # type: ignore[assignment]
+            ends = (estimate.q[part], *estimate[label].interval())
+            seen.values[k, label] = tuple(latent.inverse(item) for item in ends)  # type: ignore[assignment]
 
     names = tuple(problem.channels)
     rows = zip(times.tolist(), data.z, data.inputs.tolist(), strict=True)
@@ -173,7 +173,7 @@ def _identified(problem: Problem, data: Data, freed: bool, smooths: bool = False
 
 
 def _intervals(data: Any, label: str, latent: Latent) -> tuple[Array, Array, Array]:
-    """Return latent centre and interval of a number at all samples of a dataset."""
+    """Return latent centres and intervals of a constant at all samples of a dataset."""
     low, high = interval_95(data, label)
     centre, low, high = (latent.inverse(item) for item in (data[label].values, low, high))
     return centre, low, high
@@ -215,18 +215,18 @@ def _scored(problem: Problem, theta: Array, batch: Batch, seen: _Seen, fit: Arra
                 score = (centre - truth) / half
                 z[k, j] = score.item() if len(score) == 1 else _rms(score)
     shift = np.full(shape, np.nan)
-    found = Run("", "", 0, covered, width, widest, error, z, fitted, shift)
-    found.missed, found.failure = seen.missed, seen.failure
-    return found
+    run = Run("", "", 0, covered, width, widest, error, z, fitted, shift)
+    run.missed, run.failure = seen.missed, seen.failure
+    return run
 
 
 def _prior(latent: Latent, at: int) -> Array:
-    found: Array = np.linalg.norm(latent.directions(at), axis=1)
-    return found
+    std: Array = np.linalg.norm(latent.directions(at), axis=1)
+    return std
 
 
 def _shift(problem: Problem, seen: _Seen, white: _Seen, spike: int) -> Array:
-    found = np.full((len(SHARES), len(problem.latents)), np.nan)
+    shift = np.full((len(SHARES), len(problem.latents)), np.nan)
     for k, share in enumerate(SHARES):
         if round(share * problem.intervals) < spike:
             continue
@@ -237,8 +237,8 @@ def _shift(problem: Problem, seen: _Seen, white: _Seen, spike: int) -> Array:
             half = 0.5 * (high - low) / NORMAL_95
             with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
                 reached = seen.values[k, label][0] if (k, label) in seen.values else np.inf
-                found[k, j] = _rms((reached - centre) / half)
-    return found
+                shift[k, j] = _rms((reached - centre) / half)
+    return shift
 
 
 def _rms(values: Any) -> float:

@@ -1,4 +1,4 @@
-"""A thermal response test; the truth is finite volumes, evenly spaced in the logarithm of r."""
+"""Thermal response test; the truth uses finite volumes, evenly spaced in the logarithm of r."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RHO_C = 2.3e6  # J/(m^3 K)
 
 
 class Borehole(Problem):
-    """rho_c r T_t = (k r T_r)_r, heated at the wall; the fluid is R_b Q/H warmer than the wall."""
+    """rho_c r T_t = (k r T_r)_r with a heated wall; the fluid is R_b Q/H warmer than the wall."""
 
     title = "thermal response test: conductivity and resistance"
     length, intervals = 60 * 3600.0, 240

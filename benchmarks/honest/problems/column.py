@@ -1,4 +1,4 @@
-"""A tracer in a column that is fed on the left; the truth is collocation in Chebyshev points."""
+"""Tracer in a column with an inlet on the left; the truth uses Chebyshev collocation."""
 
 from __future__ import annotations
 

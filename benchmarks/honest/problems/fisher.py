@@ -1,4 +1,4 @@
-"""A population that spreads and grows, Fisher-KPP; the truth is finite volumes about nodes."""
+"""Growing and spreading population (Fisher-KPP); the truth uses vertex-centred finite volumes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WIDTH = 2.0
 
 
 class Population(Stiff):
-    """u_t = D u_xx + r u (1 - u) without flux at the ends."""
+    """u_t = D u_xx + r u (1 - u) with zero flux at the ends."""
 
     def __init__(self, D: float, r: float) -> None:
         self.D, self.r = D, r
@@ -52,7 +52,7 @@ def _beginning(x: Any) -> Any:
 
 
 class Fisher(Problem):
-    """u_t = D u_xx + r u (1 - u), D and r unknown."""
+    """u_t = D u_xx + r u (1 - u) with unknown D and r."""
 
     title = "Fisher-KPP: diffusivity and growth rate"
     length, intervals = 8.0, 200
@@ -64,7 +64,7 @@ class Fisher(Problem):
     u0 = staticmethod(lambda x: _beginning(x[0]))  # type: ignore[assignment]
 
     def process(self, theta: Array) -> Population:
-        """Return the finite volumes."""
+        """Return the finite-volume system."""
         return Population(*(np.exp(item.value(theta, 0)).item() for item in self.latents.values()))
 
     def _solved(self, theta: Array, tangents: bool) -> tuple[Array, Array]:

@@ -1,6 +1,6 @@
-"""A flux that drifts, a random walk, beside a constant conductivity: linear, and k(u).
+"""Drifting flux with an unknown conductivity k or k (1 + u/2).
 
-The exact path of the flux is a random walk on substeps of the samples.
+The true flux is a random walk on the substeps of the samples.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from benchmarks.honest.problems.warm import Conduction
 DEGREE = 40
 CELLS = 80
 PRIOR, STD, RATE = 0.15, 0.03, 0.02
-GROWTH = 0.5  # of the conductivity with the temperature, where it does
+GROWTH = 0.5  # relative growth of the conductivity with u in the nonlinear problem
 
 
 class _Drifting(Problem):
-    """k and J(t); theta holds k, the flux at the start and the increments between the samples."""
+    """Unknown k and J(t); theta consists of k, the initial flux, and increments between samples."""
 
     length, intervals = 10.0, 200
     noise = 0.02
@@ -38,7 +38,7 @@ class _Drifting(Problem):
 
     @property
     def increment(self) -> float:
-        """Standard deviation that the flux gains between two samples."""
+        """Standard deviation of the increment of the flux between two samples."""
         return RATE * float(np.sqrt(self.length / self.intervals))
 
     def _flux_directions(self, at: int) -> Array:
@@ -52,18 +52,18 @@ class _Drifting(Problem):
         return float(np.exp(self.latents["k"].value(theta, 0)).item())
 
     def path(self, theta: Array) -> Array:
-        """Return the flux at the substeps, straight between the samples."""
+        """Return the flux at the substeps, linear between the samples."""
         flux = PRIOR + STD * theta[1] + self.increment * self.walk(theta)
         return np.asarray(np.interp(fine_times(self.times), self.times, flux))
 
     def walk(self, theta: Array) -> Array:
-        """Return the sum of increments at the samples, which a shortened problem has fewer of."""
+        """Return the cumulative increments at the samples of a possibly shortened problem."""
         return np.append(0.0, np.cumsum(theta[2 : 2 + self.intervals]))
 
     def draw(self, rng: np.random.Generator) -> tuple[Array, Array]:
         theta = np.zeros(self.coordinates)
         theta[:2] = rng.standard_normal(2)
-        # A Brownian path on the substeps; livepde and the batch fit know its law, not the path.
+        # Brownian path on the substeps, of which livepde and the batch fit know only the law.
         steps = rng.standard_normal((self.intervals, SUBSTEPS)) / np.sqrt(SUBSTEPS)
         theta[2 : 2 + self.intervals] = steps.sum(axis=1)
         walk = self.increment * np.append(0.0, np.cumsum(steps))
@@ -73,7 +73,7 @@ class _Drifting(Problem):
         return self.shown(self.k(theta), self.path(theta))
 
     def shown(self, k: float, flux: Array) -> Array:
-        """Return what the sensors show for a conductivity and a flux at the substeps."""
+        """Return the readings for a conductivity and a flux at the substeps."""
         raise NotImplementedError
 
     def model(self, refine: int = 1) -> lp.Model:
@@ -95,13 +95,13 @@ class _Drifting(Problem):
 
 
 class RodFlux(_Drifting):
-    """u_t = k u_xx with the flux J(t) on the left; the truth is collocation."""
+    """u_t = k u_xx with the flux J(t) on the left; the truth uses collocation."""
 
-    title = "heat in a rod: conductivity beside a drifting flux"
+    title = "heat in a rod: conductivity and a drifting flux"
     points = MappingProxyType({"T_1": 0.1, "T_2": 0.35, "T_3": 0.65})
 
     def system(self, k: float) -> Linear:
-        """Return the process with the inputs T_right and J."""
+        """Return the system with the inputs T_right and J."""
         space = Chebyshev(DEGREE)
         nodes = len(space.x)
         ends = np.vstack([-k * space.D1[0], np.eye(nodes)[-1]])
@@ -118,7 +118,7 @@ class RodFlux(_Drifting):
         step[0] = DIFFERENCE
         found = np.zeros((self.intervals + 1, len(self.points), self.coordinates))
         found[:, :, 0] = (self.predict(theta + step) - self.predict(theta)) / DIFFERENCE
-        # The answer to a flux that rises from 0 to 1 in the first interval, and to a constant one.
+        # Responses to a flux that rises from 0 to 1 in the first interval, and to a constant flux.
         fine = fine_times(self.times)
         h = self.length / self.intervals
         system = self.system(self.k(theta))
@@ -131,7 +131,7 @@ class RodFlux(_Drifting):
 
 
 class _DrivenRod(Conduction):
-    """Conduction with a flux on the left that depends on coordinates."""
+    """Conduction with a flux on the left that depends on the coordinates theta."""
 
     def __init__(self, problem: NonlinearFlux, k: float, flux: Array) -> None:
         super().__init__(CELLS, k, GROWTH, None, problem.channels["T_right"])
@@ -154,9 +154,9 @@ class _DrivenRod(Conduction):
 
 
 class NonlinearFlux(_Drifting):
-    """u_t = (k (1 + u/2) u_x)_x with the flux J(t) on the left; the truth is finite volumes."""
+    """u_t = (k (1 + u/2) u_x)_x with the flux J(t) on the left; the truth uses finite volumes."""
 
-    title = "conductivity k(1 + u/2) beside a drifting flux"
+    title = "conductivity k(1 + u/2) and a drifting flux"
     points = MappingProxyType({"T_1": 0.1, "T_2": 0.25, "T_3": 0.4, "T_4": 0.6, "T_5": 0.8})
     growth = GROWTH
 
@@ -171,7 +171,7 @@ class NonlinearFlux(_Drifting):
 
     @property
     def _sensors(self) -> Array:
-        """Every sensor stands at a node."""
-        found = np.zeros((len(self.points), CELLS))
-        found[np.arange(len(self.points)), [round(x * CELLS) for x in self.points.values()]] = 1.0
-        return found
+        """Matrix that selects the nodes of the sensors, shape (sensors, nodes)."""
+        rows = np.zeros((len(self.points), CELLS))
+        rows[np.arange(len(self.points)), [round(x * CELLS) for x in self.points.values()]] = 1.0
+        return rows

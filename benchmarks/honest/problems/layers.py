@@ -1,4 +1,4 @@
-"""Conductivity that depends on the place: by layer, and a field; the truth is finite volumes."""
+"""Conductivity by layer, or as a field; the truth uses finite volumes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class _Conduction(Problem):
     )
 
     def conductivity(self, theta: Array, x: Array) -> Array:
-        """Return k at points."""
+        """Return k at the points x."""
         raise NotImplementedError
 
     def predict(self, theta: Array) -> Array:
@@ -48,7 +48,7 @@ class _Conduction(Problem):
 
 
 class Wall(_Conduction):
-    """A wall of four layers."""
+    """Wall of four layers with unknown conductivities."""
 
     title = "conductivities of four layers"
     points = MappingProxyType({"T_1": 0.1, "T_2": 0.3, "T_3": 0.4, "T_4": 0.6, "T_5": 0.85})
@@ -75,18 +75,18 @@ class Wall(_Conduction):
 
 
 def cosines(count: int, length: float, factor: float) -> Array:
-    """Return standard deviations of the cosines of a field with the prior Sobolev(2, length).
+    """Return standard deviations of the cosine coefficients under the prior Sobolev(2, length).
 
-    (1 - length^2 Laplace)^2 has the cosines cos(j pi x) as eigenfunctions, with natural boundary
-    values: this is the exact Karhunen-Loeve expansion of that prior on (0, 1), or in one direction
-    of a square.
+    With natural boundary conditions, the cosines cos(j pi x) are eigenfunctions of
+    (1 - length^2 Laplace)^2. They give the exact Karhunen-Loeve expansion of this prior on (0, 1),
+    or in one direction of a square.
     """
     waves = (np.pi * length * np.arange(count)) ** 2
     return np.asarray(1.0 / (np.sqrt(factor) * (1.0 + waves)))
 
 
 class Profile(_Conduction):
-    """A conductivity k(x), log-normal."""
+    """Log-normal conductivity k(x)."""
 
     title = "conductivity k(x), a field"
     points = MappingProxyType({f"T_{n}": n / 8 for n in range(1, 8)})

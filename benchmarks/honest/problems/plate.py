@@ -1,4 +1,4 @@
-"""A square: numbers of an anisotropic plate, and a reaction field; the truth is cosine series."""
+"""Anisotropic plate, and reaction field on a square; the truths use cosine series."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from benchmarks.honest.problem import Latent, Problem, constant, waves
 
 
 def _waves(count: int, x: Array) -> Array:
-    """Return the orthonormal cosines of (0, 1) at points, shape (points, count)."""
+    """Return orthonormal cosines on (0, 1) at points, shape (points, count)."""
     j = np.arange(count)
     return np.asarray(np.where(j == 0, 1.0, np.sqrt(2.0)) * np.cos(np.pi * j * x[:, None]))
 
@@ -31,7 +31,7 @@ def _midpoints(count: int) -> tuple[Array, Array]:
 
 
 class Plate(Problem):
-    """u_t = kx u_xx + ky u_yy - loss u + P(t) bump(x, y) without flux at the sides."""
+    """u_t = kx u_xx + ky u_yy - loss u + P(t) bump(x, y) with zero flux at the sides."""
 
     title = "heat in an anisotropic plate: two conductivities and a loss"
     length, intervals = 10.0, 200
@@ -105,10 +105,10 @@ class Reaction(Problem):
     channels = MappingProxyType({"S": lambda t: 1.0 + waves(20.0, (0.5, 3.0), (0.3, 7.0))(t)})
     u0 = 1.0
     D = 0.05
-    COUNT, GRID = 10, 24  # cosines of the state, quadrature points; in each direction
+    COUNT, GRID = 10, 24  # cosines of the state, and quadrature points, in each direction
     LENGTH, PRIOR, STD = 0.3, 1.0, 0.4
-    # Cosines of the field up to those that livepde's mesh of 12 x 12 cells can have. The data say
-    # nothing of most, but together they make a good part of the posterior's width.
+    # The field has all cosines that livepde's mesh of 12 x 12 cells resolves. Most of them are not
+    # identifiable, but they contribute considerably to the posterior's width.
     FIELD = tuple((j, k) for j in range(13) for k in range(13) if j**2 + k**2 <= 12**2)
     coordinates = len(FIELD)
 
@@ -133,7 +133,7 @@ class Reaction(Problem):
         return 1.0 + 0.5 * np.cos(np.pi * x) * np.cos(np.pi * y)
 
     def _expansion(self, x: Array, y: Array) -> Array:
-        """Return the cosines with the standard deviations of the prior Sobolev(2, length)."""
+        """Return the cosines times their standard deviations under the prior Sobolev(2, length)."""
         factor = lp.Sobolev(2, self.LENGTH).pointwise(2).factor
         j, k = np.array(self.FIELD).T
         shapes = _waves(13, x)[:, j] * _waves(13, y)[:, k]
@@ -141,7 +141,7 @@ class Reaction(Problem):
         return np.asarray(shapes * scale * self.STD / self.PRIOR)
 
     def reaction(self, theta: Array, x: Array, y: Array) -> Array:
-        """Return q at points."""
+        """Return q at the points (x, y)."""
         return np.asarray(self.PRIOR * np.exp(self._expansion(x, y) @ theta))
 
     def predict(self, theta: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Rods between two measured temperatures; the truth is collocation in Chebyshev points."""
+"""Rods between two measured temperatures; the truths use Chebyshev collocation."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Rod(Problem):
         return self.respond(k, 0.0, 0.0)
 
     def respond(self, k: float, loss: float, source: float) -> Array:
-        """Return the sensors for u_t = k u_xx - loss u + source; `source` is an input, too."""
+        """Return the readings for u_t = k u_xx - loss u + source without noise."""
         space = Chebyshev(DEGREE)
         nodes = len(space.x)
         given = np.column_stack([np.eye(2), np.zeros(2)])
@@ -56,14 +56,14 @@ class Rod(Problem):
 
     @staticmethod
     def state(refine: int = 1) -> lp.Field:
-        """Return the temperature between the two channels."""
+        """Return the temperature field with the two channels at its ends."""
         mesh = lp.interval(0.0, 1.0, 30 * refine)
         ends = {"left": lp.Channel("T_left"), "right": lp.Channel("T_right")}
         return lp.Field(mesh, lp.linear(mesh), dirichlet=ends)
 
 
 class LossyRod(Rod):
-    """u_t = k u_xx - loss u + source with three unknowns."""
+    """u_t = k u_xx - loss u + source with unknown k, loss and source."""
 
     title = "heat in a rod: conductivity, loss and source"
     coordinates = 3

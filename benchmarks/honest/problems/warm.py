@@ -1,4 +1,4 @@
-"""Conductivity that grows with the temperature; the truth is finite volumes about nodes."""
+"""Conductivity that grows with the temperature; the truth uses vertex-centred finite volumes."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ CELLS = 80
 
 
 class Conduction(Stiff):
-    """u_t = (k (1 + m u) u_x)_x on (0, 1): the mean of k between two nodes is exact.
+    """u_t = (k (1 + m u) u_x)_x on (0, 1) with exact fluxes between two nodes.
 
     Parameters
     ----------
     cells
-        Of equal width.
+        Number of cells of equal width.
     k, m
-        Conductivity at u = 0 and its growth.
+        Conductivity at u = 0, and its relative growth with u.
     left, right
-        Temperatures of the ends; None for a flux `into` the left one.
+        Temperatures of the ends; None on the left for the flux `into`.
     """
 
     def __init__(self, cells: int, k: float, m: float, left: Signal | None, right: Signal) -> None:
@@ -40,7 +40,7 @@ class Conduction(Stiff):
         return 0.0
 
     def inflow(self, flux: float) -> Array:
-        """Return the rate that a flux into the left end makes."""
+        """Return the rate of change of y due to a flux into the left end."""
         found = np.zeros(self.nodes)
         if self.left is None:
             found[0] = flux / self.capacity[0]
@@ -60,12 +60,12 @@ class Conduction(Stiff):
         flows = self._flows(t, y)
         if self.left is None:
             flows = np.append(self.into(t), flows)
-            flows[0] *= -1.0  # what flows in on the left flows to the right
+            flows[0] *= -1.0  # the flux into the left end flows to the right
         return np.asarray((flows[1:] - flows[:-1]) / self.capacity)
 
     def jacobian(self, t: float, y: Array) -> Array:
         u = self._all(t, y)
-        # Flow from i+1 to i: (k/h) (u + m u^2/2) at i+1 less that at i.
+        # The flow from i+1 to i is (k/h) (u + m u^2/2) at i+1 minus its value at i.
         slope = self.k / self.h * (1 + self.m * u)
         inner = slope[:-1] if self.left is None else slope[1:-1]
         bands = np.zeros((3, self.nodes))
@@ -84,7 +84,7 @@ class Conduction(Stiff):
 
 
 class WarmRod(Problem):
-    """u_t = (k (1 + m u) u_x)_x between two measured temperatures, k and m unknown."""
+    """u_t = (k (1 + m u) u_x)_x between two measured temperatures, with unknown k and m."""
 
     title = "conductivity k(1 + m u)"
     length, intervals = 10.0, 200
@@ -102,7 +102,7 @@ class WarmRod(Problem):
     )
 
     def process(self, theta: Array) -> Conduction:
-        """Return the finite volumes."""
+        """Return the finite-volume system."""
         k, m = (item.value(theta, 0).item() for item in self.latents.values())
         return Conduction(CELLS, float(np.exp(k)), m, *self.channels.values())
 
