@@ -1,9 +1,9 @@
-"""The same data and the same model in what users write and take today.
+"""Comparison with estimators of other packages, and with filters that users would write.
 
-Each peer is given the reduced coordinates, the prior, the noise level and the initial state that
-our laws are given, and steps of our forward model. Where it has a knob, the setting that does best
-*with the truth* on the very data set is reported, which favours it. A package that is not installed
-is a row that says so: `pip install --group peers`.
+Each peer receives the reduced coordinates, the prior, the noise level and the initial state of our
+laws, and steps of our forward model. If it has options, the setting with the smallest *true* error
+on the same data set is reported, which favours it. The row of a package that is not installed has a
+note. `pip install --group peers` installs all packages.
 """
 
 from __future__ import annotations

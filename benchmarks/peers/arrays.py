@@ -1,8 +1,8 @@
-"""Filters as a user would write them today with NumPy: all members stepped as arrays.
+"""Filters as a user would write them with NumPy: all members are stepped as arrays.
 
-Each member has a matrix of its own; all of them are one band that LAPACK factorises and solves in
-one call (`benchmarks.lean.Matrices`). This is for processes that are affine in the state, with
-steps of one length and unknowns that do not move; of others a row says why not.
+Each member has its own matrix; LAPACK factorises and solves all of them as one band matrix
+(`benchmarks.lean.Matrices`). This requires a process that is affine in the state, steps of equal
+length, and constant unknowns. For other problems, the note of the row gives the reason.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from benchmarks.scoring import Contender, Known, Score, measured
 from livepde.linalg import Array
 from livepde.stepping import Alexander2, ImplicitEuler, Interval
 
-INFLATIONS = (1.0, 1.02)  # of the anomalies after each update
+INFLATIONS = (1.0, 1.02)  # factors on the anomalies after each update
 
 
 class Stack:
-    """The forward model for members with states of shape (p, n) and parameters of shape (p, k).
+    """Forward model for members with states of shape (p, n) and parameters of shape (p, k).
 
-    What is assembled is assembled at the first sample, as in our laws.
+    Matrices are assembled at the first sample, as in our laws.
     """
 
     def __init__(self, data: Data) -> None:
@@ -34,12 +34,12 @@ class Stack:
 
     @property
     def refused(self) -> str:
-        """Why the process cannot be stepped so; empty if it can."""
+        """Reason why the problem is not supported; empty if it is supported."""
         process, widths = self.data.process, np.diff(self.data.process.times)
         if not np.allclose(widths, self.h, rtol=1e-9) or process.dt_max < self.h:
-            return "not run: one step for each sample, all of one length, only"
+            return "not run: requires one step of equal length for each sample"
         if process.model.latent.moves or not self.data.observed.linear:
-            return "not run: constant unknowns and linear sensors only"
+            return "not run: requires constant unknowns and linear sensors"
         try:
             _ = self.matrices
         except lean.NotAffineError as error:
@@ -48,13 +48,13 @@ class Stack:
 
     @property
     def h(self) -> float:
-        """The time between samples."""
+        """Time between samples."""
         times = self.data.process.times
         return float(times[-1] - times[0]) / (len(times) - 1)
 
     @cached_property
     def matrices(self) -> lean.Matrices:
-        """The process for the length of a stage; all stages of a scheme have the same."""
+        """Matrices for a stage; all stages of the scheme have the same implicit coefficient."""
         scheme = self.data.process.scheme
         share = scheme.gamma if isinstance(scheme, Alexander2) else 1.0
         Phi = self.augmented.trajectory.Phi
@@ -62,17 +62,17 @@ class Stack:
 
     @cached_property
     def G(self) -> Array:
-        """Observation in units of the noise, in the order of the band, shape (sensors, n)."""
+        """Observation operator over the noise, in the order of the band, shape (sensors, n)."""
         G: Array = self.data.observed.G.toarray()
         return np.ascontiguousarray(G[:, self.matrices.order] / self.data.noise[:, None])
 
     @cached_property
     def start(self) -> Array:
-        """The known initial state, shape (n,), in the order of the model."""
+        """Known initial state in the order of the model, shape (n,)."""
         return self.augmented.full(np.append(self.augmented.start, np.zeros(self.k)), 0)
 
     def forecast(self, u: Array, a: Array, at: int) -> Array:
-        """Return states at a sample from those at the one before."""
+        """Advance states from the previous sample to sample `at`."""
         matrices, (before, now) = self.matrices, self.augmented.moments[at - 1 : at + 1]
         none = np.zeros(0)
         interval = Interval(
@@ -86,20 +86,20 @@ class Stack:
         return self.data.process.scheme.advance(stage, u, before.t, now.t - before.t)
 
     def z(self, at: int) -> Array:
-        """Return the measurements of a sample in units of the noise, shape (sensors,)."""
+        """Return the measurements of a sample over the noise, shape (sensors,)."""
         z: Array = self.data.z[at] / self.data.noise
         return z
 
 
 class Ensemble:
-    """Deterministic square-root ensemble filter: the ensemble transform with a symmetric root.
+    """Ensemble transform Kalman filter with a symmetric square root.
 
-    Hunt, Kostelich and Szunyogh (2007), without localisation.
+    See Hunt, Kostelich and Szunyogh (2007); without localisation.
 
     Attributes
     ----------
     E
-        States and reduced parameters side by side, shape (members, n + k).
+        Columns of states and reduced parameters, shape (members, n + k).
     """
 
     def __init__(self, stack: Stack, members: int, inflation: float) -> None:
@@ -135,14 +135,14 @@ class Ensemble:
 class Unscented:
     """Unscented filter on the reduced coordinates, with 2k + 1 sigma points.
 
-    The state is uncertain through the k unknowns alone, so that their joint covariance has the
-    square root [U; C] of k columns; the points stand at its columns, as in the reduced-order filter
+    The state is uncertain only through the k unknowns, so that the joint covariance has a square
+    root [U; C] with k columns. The columns define the sigma points, as in the reduced-order filter
     of Moireau and Chapelle (2011).
 
     Attributes
     ----------
     u, a, U, C
-        Estimates, shapes (n,) and (k,), and the root, shapes (n, k) and (k, k).
+        Estimates, shapes (n,) and (k,), and square root, shapes (n, k) and (k, k).
     """
 
     def __init__(self, stack: Stack) -> None:
@@ -179,7 +179,7 @@ class Unscented:
 
 
 def ensemble(members: int, data: Data) -> Score:
-    """Run the square-root ensemble filter, with the best of some inflations."""
+    """Run the square-root ensemble filter with each inflation, and return the best score."""
     runs: dict[str, Contender] = {
         f"inflation {x:g}": partial(_ensemble_run, members, x) for x in INFLATIONS
     }
@@ -200,12 +200,12 @@ def unscented(data: Data) -> Score:
 
 
 def reference(data: Data) -> Score:
-    """Run the lean reference of our own filter, where the process is linear in its unknowns."""
+    """Run the lean reference of our filter, if the process is linear in its unknowns."""
     if refused := Stack(data).refused:
         return Score(note=refused)
     stack, process = Stack(data), data.process
     if not process.model.latent.linear or not isinstance(process.scheme, ImplicitEuler):
-        return Score(note="not run: linear unknowns and implicit Euler steps only")
+        return Score(note="not run: requires linear unknowns and implicit Euler steps")
     state: lean.Filter | None = None
 
     def step(at: int) -> None:

@@ -1,4 +1,4 @@
-"""Our forward model as other packages want it, and their best setting."""
+"""Interface of our forward model for other packages, and choice of their best setting."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from livepde.stepping import ForwardStage, Interval, StepFailed, advance
 
 
 class Augmented:
-    """Our forward model as peers want it: x = (free coefficients of u, reduced coordinates a)."""
+    """Forward model of the augmented state x = (free coefficients of u, reduced coordinates a)."""
 
     def __init__(self, data: Data) -> None:
         self.data = data
@@ -36,23 +36,23 @@ class Augmented:
 
     @cached_property
     def start(self) -> Array:
-        """The known initial state, free coefficients."""
+        """Free coefficients of the known initial state."""
         start: Array = self.model.initial(self.data.process.u0, self.moments[0])[self.free]
         return start
 
     def latent(self, a: Array) -> Array:
-        """Return the latent coefficients."""
+        """Return the latent coefficients for reduced coordinates a."""
         q: Array = self.model.latent.prior + self.trajectory.Phi @ a
         return q
 
     def full(self, x: Array, at: int) -> Array:
-        """Return all coefficients of the state at a time."""
+        """Return all coefficients of the state at a time index."""
         u = np.zeros(self.model.X.dim)
         u[self.free] = x[: self.n]
         return self.model.impose(u, self.moments[at])
 
     def forecast(self, x: Array, at: int) -> Array:
-        """Return x at the sample with this number from that at the one before."""
+        """Advance x from the previous sample to sample `at`."""
         q, none = self.latent(x[self.n :]), np.zeros(0)
         before, now = self.moments[at - 1], self.moments[at]
         interval = Interval(
@@ -70,25 +70,25 @@ class Augmented:
         return np.concatenate([u[self.free], x[self.n :]])
 
     def output(self, x: Array, at: int) -> Array:
-        """Return what the sensors show."""
+        """Return the predicted readings."""
         q = self.model.latent.value(self.latent(x[self.n :]))
         return self.data.observed.predict(self.full(x, at), q, self.moments[at])
 
     def growth(self, at: int) -> Array:
-        """Return the deviation that each reduced coordinate gains up to this sample, (k,)."""
+        """Return the standard deviation of the increment of each reduced coordinate, (k,)."""
         gained = np.zeros(self.k)
         gained[self.trajectory.moving] = self.trajectory.growth[at - 1]
         return gained
 
     def known(self, mean: Array, root: Array | None) -> Known:
-        """Return latent coefficients and their factor for those of a; raises `StepFailed`."""
+        """Return latent coefficients and factor; raise `StepFailed` if `mean` is not finite."""
         if not np.isfinite(mean).all():
             raise StepFailed("not_finite", "the estimate is not finite")
         return self.latent(mean), None if root is None else self.trajectory.Phi @ root
 
 
 def best(data: Data, settings: Mapping[str, Contender]) -> Score:
-    """Return the score with the least error, noted with its setting."""
+    """Run all settings, and return the score with the least error and its setting as note."""
     scores = []
     for setting, contender in settings.items():
         score = scored(contender, data)

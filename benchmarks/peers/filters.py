@@ -1,4 +1,4 @@
-"""Kalman filters of the augmented state: DAPPER's ensemble, filterpy's sigma points."""
+"""Kalman filters of the augmented state: DAPPER's ensemble filter, filterpy's unscented filter."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from benchmarks.peers.augmented import Augmented, best
 from benchmarks.problems import Data
 from benchmarks.scoring import Known, Score, measured
 
-INFLATIONS = (1.0, 1.02)  # of the ensemble, after each update
+INFLATIONS = (1.0, 1.02)  # factors on the ensemble after each update
 NUGGETS = (1e-6, 1e-4)  # process noise of the state in the unscented filter, relative to the data
 ALPHAS = (0.1, 1.0)  # spread of its sigma points
-LARGEST = 100  # coordinates of state and parameters that the unscented filter is asked to carry
+LARGEST = 100  # largest dimension of the augmented state for the unscented filter
 
 
 def ensemble(members: int, data: Data) -> Score:
@@ -52,7 +52,7 @@ def unscented(data: Data) -> Score:
     augmented = Augmented(data)
     size = augmented.n + augmented.k
     if size > LARGEST:
-        return Score(note=f"not run: {2 * size + 1} forward steps for each sample")
+        return Score(note=f"not run: requires {2 * size + 1} forward steps for each sample")
     return best(
         data,
         {

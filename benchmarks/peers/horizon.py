@@ -1,4 +1,4 @@
-"""do-mpc's moving-horizon estimator, for the paper's equation."""
+"""Moving-horizon estimator of do-mpc for the paper's equation."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from benchmarks.problems import Data
 from benchmarks.scoring import Known, Score, measured
 from livepde.linalg import Array
 
-ARRIVALS = (1.0, 10.0, 100.0)  # weight of the parameters' last estimate in the moving horizon
+ARRIVALS = (1.0, 10.0, 100.0)  # weights of the last estimate of the parameters
 HORIZON = 10
 SETTINGS: Any = {
     "n_horizon": HORIZON,
     "meas_from_data": False,
     "store_full_solution": False,
     "state_discretization": "collocation",
-    "collocation_type": "radau",  # of degree 1: implicit Euler, as the data
+    "collocation_type": "radau",  # degree 1 is implicit Euler, the scheme of the data
     "collocation_deg": 1,
     "collocation_ni": 1,
     "nlpsol_opts": {
@@ -33,7 +33,7 @@ SETTINGS: Any = {
 
 
 def moving_horizon(data: Data) -> Score | None:
-    """Run do-mpc's moving-horizon estimator; on the paper's example only."""
+    """Run do-mpc's moving-horizon estimator; None except for the paper's example."""
     if data.problem.name != "seed":
         return None
     return best(
@@ -47,12 +47,12 @@ def moving_horizon(data: Data) -> Score | None:
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """M u' + K u + sum_k a_k A_k u = F and z = H u, scaled: else Ipopt fails.
+    """Equation M u' + K u + sum_k a_k A_k u = F and z = H u, scaled so that Ipopt converges.
 
     Attributes
     ----------
     unit
-        Free coefficients of unit mass, as they are in the model, shape (n,).
+        Scale of the free coefficients that gives unit mass, shape (n,).
     M, K, A, H, F
         Shapes (n, n), (n, n), (n, n, k) with the column of u first, (sensors, n) for measurements
         of unit noise, and (times, n).
@@ -67,7 +67,7 @@ class Scaled:
 
     @classmethod
     def of(cls, augmented: Augmented) -> Scaled:
-        """Return the equation of the paper, which is linear in u and in a."""
+        """Return the scaled equation of the paper, which is bilinear in u and a."""
         model, free, data = augmented.model, augmented.free, augmented.data
         unit = 1.0 / np.sqrt(model.mass.diagonal()[free])
         eye = np.eye(model.X.dim)[:, free] * unit
@@ -82,7 +82,7 @@ class Scaled:
         )
 
     def process(self) -> Any:
-        """Return it as a model of do-mpc."""
+        """Return the do-mpc model of the equation."""
         import casadi
         import do_mpc
 
@@ -95,7 +95,7 @@ class Scaled:
         process.set_meas("z", casadi.DM(self.H) @ u, meas_noise=True)
         process.set_rhs("u", rate)
         flux = casadi.DM(self.K) @ u
-        for mode in range(k):  # bilinear: one sparse matrix for each mode
+        for mode in range(k):  # one sparse matrix for each mode
             matrix = self.A[:, :, mode].T
             matrix = np.where(np.abs(matrix) < 1e-14 * np.abs(matrix).max(), 0.0, matrix)
             flux += a[mode] * (casadi.sparsify(casadi.DM(matrix)) @ u)
@@ -117,7 +117,7 @@ def _run(arrival: float, data: Data) -> Score:
     now = 0
 
     def window(template: Any, name: str, rows: Array) -> Any:
-        # Measurements and sources at the ends of the intervals, the last of them now.
+        # Measurements and sources at the ends of the intervals, the last of which ends now.
         for j in range(HORIZON):
             template[name, j] = rows[now - HORIZON + 1 + j]
         return template
@@ -139,7 +139,7 @@ def _run(arrival: float, data: Data) -> Score:
     def step(at: int) -> None:
         nonlocal now
         now = at
-        if at >= HORIZON:  # before, it would take the first sample for older ones
+        if at >= HORIZON:  # a shorter window would repeat the first sample
             horizon.make_step((data.z[at] / data.noise).reshape(-1, 1))
 
     def known() -> Known:

@@ -1,4 +1,4 @@
-"""DeepXDE's physics-informed network, for the paper's equation."""
+"""Physics-informed neural network of DeepXDE for the paper's equation."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from benchmarks.problems import Data
 from benchmarks.scoring import Judge, Score
 from livepde.reproduce import seed_excited
 
-EPOCHS = 10_000  # of the network; in each, other collocation points and values
+EPOCHS = 10_000  # training epochs, each with new collocation points and values
 COLLOCATION = 500
 BATCH = 500
-WEIGHTS = (10.0, 100.0)  # of the data, that of the equation being 1
-RATE = 3e-3  # of learning; halved three times
-WAVES = 16  # sines and cosines of time among its inputs
+WEIGHTS = (10.0, 100.0)  # weights of the data; the equation has weight 1
+RATE = 3e-3  # initial learning rate, halved after each quarter of the epochs
+WAVES = 16  # number of sines and of cosines of time among the inputs
 LAYERS = (32, 32, 32)
 
 
 def network(data: Data) -> Score | None:
-    """Train DeepXDE's network for u and the reduced coordinates; on `seed-excited` only."""
+    """Train DeepXDE's network for u and the reduced coordinates; None except `seed-excited`."""
     if data.problem.name != "seed-excited":
         return None
     return best(
@@ -44,7 +44,7 @@ def _network_run(weight: float, data: Data) -> Score:
     augmented, model, times = Augmented(data), data.process.model, data.process.times
     last = float(times[-1])
 
-    # Of the coefficients it is given the values at the nodes; their slopes are mostly noise.
+    # The data are nodal values of the Hermite elements; their nodal slopes are mostly noise.
     nodes = np.linspace(0.0, 1.0, seed_excited.N)[1:-1]
     values = model.state_space.probe(nodes[None]).toarray()
     exact_start = values @ model.initial(data.process.u0, augmented.moments[0])

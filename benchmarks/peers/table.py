@@ -1,4 +1,4 @@
-"""The table of peers: who they are, each run in a process of its own, what is promised of them."""
+"""Table of peers, each of which runs in a separate process, and checks of the comparison."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ PROBLEMS: Mapping[str, Problem] = {
 
 @dataclass(frozen=True)
 class Peer:
-    """Another package's estimator.
+    """Estimator of another package.
 
     Attributes
     ----------
     packages
-        What has to be installed: names to import.
+        Import names of the required packages.
     run
-        Its contender.
+        Contender that runs the estimator.
     """
 
     packages: tuple[str, ...]
@@ -56,7 +56,7 @@ class Peer:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Packages that are not installed."""
+        """Required packages that are not installed."""
         return tuple(name for name in self.packages if find_spec(name) is None)
 
 
@@ -66,7 +66,7 @@ def _filter_alone(data: Data) -> Score | None:
 
 
 PEERS: dict[str, Peer] = {
-    # Does as much as the filters below it: no verdict, no refit, no discretisation errors.
+    # Comparable with the filters below: no verdict, no refit, no discretisation errors.
     "sensitivity, filter alone": Peer((), _filter_alone),
     **{
         f"EnKF as arrays, {members} members": Peer((), partial(arrays.ensemble, members))
@@ -84,7 +84,7 @@ PEERS: dict[str, Peer] = {
     "do-mpc: moving horizon": Peer(("do_mpc", "casadi"), moving_horizon),
     "DeepXDE: network": Peer(("deepxde", "torch"), network),
 }
-"""Row -> peer. Those as arrays are this project's own lines, as a user would write them."""
+"""Row -> peer. Filters "as arrays" are written in this project, as a user would write them."""
 
 
 OURS = (
@@ -96,15 +96,15 @@ OURS = (
 )
 ROWS = (*OURS, *PEERS)
 LEVEL = 0.01
-MINE = "sensitivity"  # the row of which the promises below are checked
-RIVAL = "EnKF as arrays, 20 members"  # is to cost more, wherever it is not more exact
+MINE = "sensitivity"  # row whose promises are checked
+RIVAL = "EnKF as arrays, 20 members"  # must cost more than `MINE` if it is not more accurate
 LEAST_WORK = {"do-mpc: moving horizon": 50.0}
-"""Peer -> how many times the work of our step it takes."""
+"""Peer -> smallest ratio of its cost to the cost of `MINE`."""
 
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep what packages print and warn of at import to themselves."""
+    """Suppress output and warnings of packages at import."""
     os.environ.setdefault("MPLBACKEND", "agg")
     os.environ.setdefault("DDE_BACKEND", "pytorch")
     nowhere = io.StringIO()
@@ -118,7 +118,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _peak(reset: bool = False) -> float:
-    """Return the largest memory of this process so far in MB, or since a reset; NaN if unknown."""
+    """Return the peak memory of this process in MB, since the last reset; NaN if unknown."""
     try:
         if reset:
             Path("/proc/self/clear_refs").write_text("5")
@@ -129,12 +129,12 @@ def _peak(reset: bool = False) -> float:
 
 
 def run_row(problem: Problem, level: float | None, seed: int, row: str) -> Score | None:
-    """Run one row on one data set, in the process that calls."""
+    """Run one row on one data set in this process."""
     peer = PEERS.get(row)
     if peer is not None and peer.missing:
         return Score(note=f"not installed: {', '.join(peer.missing)}")
     data = problem.data(level, seed)
-    data.forward  # noqa: B018 (what it needs is not the contender's memory)
+    data.forward  # noqa: B018 (its memory does not count as the contender's)
     with _quiet():
         for package in peer.packages if peer is not None else ():
             __import__(package)
@@ -155,18 +155,18 @@ def peers(
     rows: Sequence[str] = (),
     progress: bool = False,
 ) -> Outcome:
-    """Run our laws and the peers on the same data, each row in a fresh process.
+    """Run our laws and the peers on the same data, each row in a new process.
 
     Parameters
     ----------
     only
-        Names of problems; default all that have a known truth.
+        Names of problems; default all with a known truth.
     seeds
         Data sets for each noise level.
     levels
         Noise levels.
     rows
-        Names of rows; default all. The prior, by whose error the others are divided, always runs.
+        Names of rows; default all. The prior always runs, because its error is the unit of errors.
     progress
         Show a bar on standard error.
     """
@@ -195,7 +195,7 @@ def peers(
 
 
 def _relative(found: Found, at: tuple[str, float | None], row: str) -> list[float]:
-    """Return the error of a row over that of the prior, for each data set that has one."""
+    """Return the error of a row over the error of the prior, for each data set with an error."""
     scores, priors = found.get((*at, row), []), found.get((*at, "prior"), [])
     if not scores:
         return []
@@ -210,7 +210,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _tables(found: Found) -> list[Table]:
-    """Return a table for each problem: rows are noise level and contender."""
+    """Return a table for each problem, with a row for each noise level and contender."""
     tables = []
     for name in dict.fromkeys(key[0] for key in found):
         lines, most = [], 0
@@ -236,7 +236,7 @@ def _tables(found: Found) -> list[Table]:
 
 
 def _checks(found: Found) -> list[Check]:
-    """Return the promises: less work than the peers, wherever ours is at most as wrong."""
+    """Return the checks: our cost is smaller than a peer's if our error is not larger."""
     checks = []
     for problem, level, peer in found:
         at = (problem, level)
@@ -255,14 +255,12 @@ def _checks(found: Found) -> list[Check]:
 
 
 NOTES = (
-    "Same model, samples, prior, reduced coordinates and noise level for all; knobs of peers are "
-    "set to the best of those tried, with the truth of the very data set (see note).",
-    "error: of the parameter, over that of the prior on the same data set; mean over the data sets "
-    "and their standard deviation (spread).",
-    "mean, median: processor time of a sample over that of a forward step with the matrix kept; "
-    "the mean is over all samples, the first included. MB: memory needed on top of what data and "
-    "imported packages take.",
-    "As arrays: all members stepped as one block, by lines of NumPy and LAPACK. One by one: a "
-    "Python loop over the members around our forward model; what that costs is not what the "
-    "method costs.",
+    "All estimators have the same model, samples, prior, reduced coordinates and noise level. "
+    "Peers use the setting with the smallest true error on the same data set (see note).",
+    "error: error of the parameter over the error of the prior; mean and standard deviation "
+    "(spread) over data sets.",
+    "mean, median: processor time of a sample over a forward step with a stored factorisation; the "
+    "mean includes the first sample. MB: peak memory in addition to data and imported packages.",
+    "as arrays: all members are stepped as one block with NumPy and LAPACK. one by one: a Python "
+    "loop over members calls our forward model, which costs more than the method itself.",
 )

@@ -1,10 +1,9 @@
-"""The problems of the benchmark suite: what is unknown, what is seen, where the data come from.
+"""Problems of the benchmark suite.
 
-A problem makes a `Process` for each seed: the model that every estimator is given, and a truth of
-which it is given the samples only. Except for `seed` and `seed-excited`, whose example is the
-paper's with data of the same scheme, the truth comes from a finer mesh with shorter steps and is
-drawn anew for each seed from the prior, so that an honest interval has something to be honest
-about.
+A problem returns a `Process` for each seed: the model for all estimators, and a truth of which they
+receive only samples. `seed` and `seed-excited` are examples of the paper with data from the same
+scheme. Otherwise, the truth comes from a finer mesh with shorter steps, and is drawn from the prior
+for each seed, so that coverage of intervals is meaningful.
 """
 
 from __future__ import annotations

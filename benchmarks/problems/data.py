@@ -1,4 +1,4 @@
-"""What a benchmark problem is, and the data that are drawn of it."""
+"""Benchmark problems, and their simulated or measured data sets."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from livepde.observation import Observation, Observed
 from livepde.samples import Sample
 from livepde.stepping import Advance, ForwardStage, ImplicitEuler, Interval, Scheme, advance
 
-WARM_UP = 2  # samples whose time does not count: matrices are built that are built once
+WARM_UP = 2  # untimed samples, in which matrices are assembled once
 LEVELS = (0.0, 0.01, 0.05, 0.1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Process:
-    """What an estimator is given, and the truth behind it.
+    """Configuration of the estimators, and the truth.
 
     Attributes
     ----------
     model, observation, u0, scheme, dt_max, halvings, inputs, validation, assimilate_from
-        As an `Identifier` takes them; `inputs` are the channels at each time.
+        Arguments of `Identifier`; `inputs` are the channels at each time.
     times
-        Of the samples, shape (times,); the first is the initial time.
+        Times of the samples, shape (times,); the first is the initial time.
     exact
         Data without noise, shape (times, sensors).
     q_true
-        Coefficients of the exact parameter at each time, shape (times, m); None for a real
-        process, of which nobody knows them.
+        Coefficients of the exact parameter at each time, shape (times, m); None for a real process
+        with an unknown truth.
     hidden
         Measured values of the validation sensors, shape (times, validation).
     weights
@@ -59,7 +59,7 @@ class Process:
 
     @cached_property
     def size(self) -> Array:
-        """Share of each sensor in the root mean square of the exact data, shape (sensors,)."""
+        """Noise of each sensor for the noise level 1, shape (sensors,)."""
         weights = np.eye(self.exact.shape[1]) if self.weights is None else self.weights
         square = np.einsum("ti,ij,tj->t", self.exact, weights, self.exact).mean()
         return np.asarray(np.sqrt(square / (len(weights) * np.diag(weights))))
@@ -67,16 +67,16 @@ class Process:
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """One noisy data set of a problem.
+    """Noisy data set of a problem.
 
     Attributes
     ----------
     problem, process
-        Where it comes from.
+        Problem, and its process for the seed.
     observation
-        The sensors, with the noise level that estimators are told.
+        Sensors with the noise that estimators assume.
     noise
-        That level for each sensor, shape (sensors,).
+        Assumed noise of each sensor, shape (sensors,).
     z
         Measurements, shape (times, sensors).
     """
@@ -104,13 +104,13 @@ class Data:
 
     @cached_property
     def observed(self) -> Observed:
-        """The sensors bound to the model."""
+        """Sensors, bound to the model."""
         model = self.process.model
         return self.observation.bind(model.state_space, model.X, model.parameter_space)
 
     @cached_property
     def forward(self) -> float:
-        """Processor time of a forward step with the parameter at its prior: the unit of cost."""
+        """Processor time of a forward step with the parameter at its prior, the unit of costs."""
         return float(np.median([self._forward() for _ in range(3)]))
 
     def _forward(self) -> float:
@@ -139,11 +139,11 @@ class Data:
 
     @property
     def modes(self) -> dict[str, int]:
-        """Modes of each field, as `SensitivityLaw` takes them."""
+        """Number of modes of each field, for `SensitivityLaw`."""
         return dict.fromkeys(self.process.model.parameter_space.fields, self.problem.modes)
 
     def until(self, at: int) -> Data:
-        """Return the data up to the sample with this number."""
+        """Return the data up to time index `at`."""
         process, stop = self.process, at + 1
 
         def cut(values: Any) -> Any:
@@ -167,20 +167,20 @@ class Problem:
     Parameters
     ----------
     name, summary
-        What it is called, and one sentence.
+        Name, and description.
     make
         Seed -> process.
     floor
-        Told instead of a smaller noise level, relative to the data: what the estimator's mesh and
-        step leave unexplained.
+        Smallest noise level that estimators assume, relative to the data. It accounts for errors of
+        their mesh and time step.
     levels
         Noise levels relative to the root mean square of the data; None: the data are measured.
     modes
-        Modes of a field in the reduced coordinates that all estimators share.
+        Number of modes of a field in the reduced coordinates of all estimators.
     gain
-        Of the gradient law, set by hand; None where the law is not meant for the sensors.
+        Constant gain of the gradient law; None if the law does not support the sensors.
     varying
-        The parameter moves: the score is the mean over the second half instead of the end.
+        Whether the parameter varies; if so, scores are means over the second half.
     """
 
     name: str
@@ -193,27 +193,27 @@ class Problem:
     varying: bool = False
 
     def data(self, level: float | None, seed: int) -> Data:
-        """Return the data of a seed, which draws truth and noise."""
+        """Draw the truth and the noise of a seed, and return the data."""
         process = self.make(seed)
         if level is None:
             observed = process.observation.bind(
                 process.model.state_space, process.model.X, process.model.parameter_space
             )
             noise = observed.noise
-            told = np.ones(observed.size) if noise is None else noise
-            return Data(self, process, process.observation, told, process.exact)
+            assumed = np.ones(observed.size) if noise is None else noise
+            return Data(self, process, process.observation, assumed, process.exact)
         rng = np.random.default_rng([seed, 1])
         noise = process.size * rng.standard_normal(process.exact.shape)
-        told = max(level, self.floor) * process.size
-        observation = replace(process.observation, noise=told.tolist())
-        return Data(self, process, observation, told, process.exact + level * noise)
+        assumed = max(level, self.floor) * process.size
+        observation = replace(process.observation, noise=assumed.tolist())
+        return Data(self, process, observation, assumed, process.exact + level * noise)
 
     def chosen(self, levels: Sequence[float] | None) -> Sequence[float | None]:
-        """Return the noise levels to run: those given, if the data are not measured."""
+        """Return the given noise levels if the data are simulated, else the problem's levels."""
         return self.levels if levels is None or None in self.levels else levels
 
     def error(self, process: Process, q: Array, at: int = -1) -> float:
-        """Return the relative error of q at a time: the root mean square over the unknowns."""
+        """Return the relative error of q at a time index, as root mean square over unknowns."""
         if process.q_true is None:
             return float("nan")
         model, exact = process.model, process.q_true[at]

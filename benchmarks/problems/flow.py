@@ -1,4 +1,4 @@
-"""Burgers with a viscosity that wanders."""
+"""Burgers' equation with a viscosity that is a random walk."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from livepde.observation import Points
 from livepde.stepping import Advance, Alexander2, simulate
 
 TIMES = np.linspace(0.0, 20.0, 401)
-RATE = 0.1  # deviation of the logarithm per square root of time
+RATE = 0.1  # rate of the random walk of the logarithm, per square root of time
 POINTS = [0.25, 0.5, 0.75]
 SIDES: dict[str, Any] = {
     "left": lambda x, t: 0.5 + 0.5 * np.sin(2.0 * t) + 0.0 * x[0],
@@ -33,7 +33,7 @@ def _process(seed: int) -> Process:
     model = burgers(interval(0.0, 1.0, 32), nu, dirichlet=SIDES)
     rng = np.random.default_rng([seed, 0])
     gained = RATE * np.sqrt(np.diff(TIMES, prepend=TIMES[0]))
-    gained[0] = 0.5  # the prior deviation of the logarithm
+    gained[0] = 0.5  # prior standard deviation of the logarithm
     path = 0.1 * np.exp(np.cumsum(gained * rng.standard_normal(len(TIMES))))
     mesh = interval(0.0, 1.0, 96)
     fine = Model(
@@ -63,7 +63,7 @@ def _process(seed: int) -> Process:
 
 FLOW = Problem(
     name="burgers-varying",
-    summary="Burgers with a wandering viscosity, three point sensors",
+    summary="Burgers' equation with a moving viscosity, three point sensors",
     make=_process,
     floor=3e-3,
     varying=True,

@@ -1,4 +1,4 @@
-"""The paper's equation, as it is there and excited."""
+"""Example of the paper, original and with persistent excitation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from livepde.streams import Twin
 
 @cache
 def _twin(experiment: ModuleType, std: float) -> Process:
-    """Return an experiment's own twin, with a prior deviation of q."""
+    """Return the twin of an experiment, with a prior standard deviation of q."""
     twin: Twin = experiment.twin_of(std)
     return Process(
         model=twin.model,
@@ -24,7 +24,7 @@ def _twin(experiment: ModuleType, std: float) -> Process:
         q_true=np.tile(twin.q, (len(twin.times), 1)),
         u0=twin.states[0],
         scheme=twin.scheme,
-        halvings=0,  # the data are those of whole steps, which must not be graded
+        halvings=0,  # the data come from whole steps, which must not be halved
         weights=twin.weights,
     )
 
@@ -39,7 +39,7 @@ SEED = Problem(
 
 SEED_EXCITED = Problem(
     name="seed-excited",
-    summary="The same equation, excited and fully observed, data of the same scheme",
+    summary="Paper's equation, excited and fully observed, data of the same scheme",
     make=lambda _: _twin(seed_excited, 3.0),
     gain=1e2,
 )

@@ -1,4 +1,4 @@
-"""Heat in a plate with a log-normal diffusivity, seen by nine point sensors."""
+"""Heat in a plate with a log-normal diffusivity and nine point sensors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from livepde.stepping import Advance, Alexander2, simulate
 TIMES = np.linspace(0.0, 20.0, 401)
 POINTS = [(x, y) for x in (0.2, 0.5, 0.8) for y in (0.2, 0.5, 0.8)]
 STD = 0.06
-WAVES = 13  # largest j^2 + k^2 of the cosines that the exact logarithm is made of
+WAVES = 13  # largest j^2 + k^2 of the cosines in the exact logarithm
 
 
 def _model(cells: int) -> Model:

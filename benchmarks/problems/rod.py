@@ -1,4 +1,4 @@
-"""Rods of four layers whose conductivities are drawn from the prior (see `benchmarks.layered`)."""
+"""Rods of four layers with conductivities drawn from the prior (see `benchmarks.layered`)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NODES, UNKNOWNS = 101, 4
 
 @cache
 def _process(ends: str, seed: int) -> Process:
-    """Return the process with a truth on a mesh three times as fine, by another scheme."""
+    """Return the process with a truth by another scheme on a mesh three times as fine."""
     model, fine = rod(NODES, UNKNOWNS, ends), rod(3 * (NODES - 1) + 1, UNKNOWNS, ends)
     drawn = np.random.default_rng([seed, 0]).standard_normal(UNKNOWNS)
     q: Array = PRIOR + STD * drawn
@@ -43,4 +43,4 @@ def _problem(name: str, ends: str, summary: str) -> Problem:
 
 
 ROD = _problem("rod", "channels", "Rod of four layers between two channels, four point sensors")
-ROD_SOURCE = _problem("rod-source", "source", "The same with constant ends and a constant source")
+ROD_SOURCE = _problem("rod-source", "source", "Rod of four layers with constant ends and source")

@@ -1,4 +1,4 @@
-"""The soil of the case soil_layers, with its real data."""
+"""Soil of the case soil_layers with its measured data."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _process(_: int) -> Process:
 
     path = next((path for path in find_cases() if path.stem == "soil_layers"), None)
     if path is None:
-        raise CaseError("there is no case soil_layers.toml beside the other cases.")
+        raise CaseError("the folder of cases has no soil_layers.toml.")
     prepared = load(path).prepare()
     identifier = prepared.identifier
     samples = list(prepared.stream)

@@ -1,4 +1,4 @@
-"""A wall of three layers, seen at its surfaces."""
+"""Wall of three layers with sensors at its surfaces."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from livepde.stepping import Advance, Alexander2, simulate
 TIMES = np.linspace(0.0, 240.0, 481)  # h
 LAYERS = {"inner": (0.0, 0.1), "middle": (0.1, 0.2), "outer": (0.2, 0.3)}  # m
 FILM = {"left": 8.0, "right": 20.0}  # W/(m^2 K)
-BLEND = 0.004  # m, over which one layer turns into the next
+BLEND = 0.004  # m, width of the smooth transition between layers
 
 
 def _share(x: Any, name: str) -> tuple[Any, Any]:
-    """Return how much of a layer is at x, and the derivative of that."""
+    """Return the smooth indicator of a layer at x, and its derivative."""
     start, stop = LAYERS[name]
     up = 1.0 if start == 0.0 else 0.5 * (1 + np.tanh((x[0] - start) / BLEND))
     down = 1.0 if stop == 0.3 else 0.5 * (1 - np.tanh((x[0] - stop) / BLEND))
@@ -38,7 +38,7 @@ def _mixed(values: Any, x: Any) -> tuple[Any, Any]:
 
 
 def _air(t: float) -> dict[str, float]:
-    """Return the temperatures of the air: heated by day, with a cold spell outside."""
+    """Return the air temperatures: daytime heating inside, a cold spell outside."""
     day = 2 * np.pi * t / 24.0
     heating = 2.0 * np.tanh(4.0 * np.sin(day))
     outside = 5.0 + 5.0 * np.sin(day - 2.0) + 4.0 * np.sin(day / 4.3)
@@ -50,9 +50,9 @@ def _u0(x: Any) -> Any:
 
 
 def _model() -> Model:
-    """Return the wall with unknown k and C: divided by C, since the mass may not be unknown.
+    """Return the wall with unknown k and C, divided by C because the mass must be known.
 
-    C u_t = (k u_x)_x tested with v/C, whose derivative is v_x/C - v C_x/C^2.
+    C u_t = (k u_x)_x is tested with v/C, whose derivative is v_x/C - v C_x/C^2.
     """
     mesh = interval(0.0, 0.3, 60)
 
@@ -83,7 +83,7 @@ def _model() -> Model:
 
 
 def _truth(k: dict[str, float], C: dict[str, float]) -> Model:
-    """Return the wall as one writes it with known coefficients, on a finer mesh."""
+    """Return the wall with known coefficients on a finer mesh, without division by C."""
     mesh = interval(0.0, 0.3, 240)
     return Model(
         Field(mesh, linear(mesh)),
@@ -111,7 +111,7 @@ def _process(seed: int) -> Process:
     control = Advance(Alexander2(), dt_max=0.125)
     inputs = [_air(float(t)) for t in TIMES]
 
-    def air(t: float) -> dict[str, float]:  # what is between two samples nobody measures
+    def air(t: float) -> dict[str, float]:  # also between samples, where it is not measured
         return {
             name: float(np.interp(t, TIMES, [row[name] for row in inputs]))
             for name in ("inside", "outside")

@@ -1,9 +1,9 @@
-"""Refits: whether stored samples are fitted as well as they can be, from any honest prior.
+"""Refits of stored samples from distant priors, compared with the best known fit.
 
-Each problem has a model as a user of livepde writes it, a truth by another code on a finer mesh or
-by a formula, and a lean forward model with the discretisation of livepde that shares no code with
-it. SciPy fits the same readings with that model, from the prior and from the truth; its least cost
-is the best known one. Priors are up to three standard deviations and a factor of ten off.
+Each problem has a model as a user of livepde would write it, a truth from another code on a finer
+mesh or from a formula, and a lean forward model with livepde's discretisation, but separate code.
+SciPy fits the readings with the lean model, from the prior and from the truth. The best fit of both
+is the reference. Priors are up to three standard deviations and a factor of ten from the truth.
 """
 
 from benchmarks.refit.run import PARTS, refit

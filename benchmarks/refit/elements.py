@@ -1,7 +1,7 @@
-"""Matrices of elements of first order on evenly spaced nodes, by their closed forms.
+"""Matrices of first-order elements on evenly spaced nodes in closed form.
 
-Row i of a matrix has the test function of node i. A quadratic form has the array T of shape
-(n, n, n) as a sparse matrix (n n, n): its Jacobian in u is T u, its value (T u) u/2.
+Row i of a matrix has the test function of node i. A quadratic form is an array T of shape
+(n, n, n), stored as a sparse matrix (n n, n). Its Jacobian in u is T u, its value (T u) u/2.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Array = NDArray[Any]
 
 
 def _sum(local: Array, cells: int, scale: Array | float = 1.0) -> sp.csr_array:
-    """Add up a matrix (2, 2) of each cell, times a number for each cell."""
+    """Assemble the matrix (2, 2) of each cell, times a factor for each cell."""
     weights = np.broadcast_to(scale, cells)
     left = np.arange(cells)
     rows = np.concatenate([left + i for i in (0, 0, 1, 1)])
@@ -32,7 +32,7 @@ def mass(cells: int, h: float) -> sp.csr_array:
 
 
 def stiffness(cells: int, h: float, of: Array | float = 1.0) -> sp.csr_array:
-    """Return the integrals of k u_x v_x for k = `of`, constant or a number for each cell."""
+    """Return the integrals of k u_x v_x for k = `of`, a constant or an array over cells."""
     return _sum(np.array([[1.0, -1.0], [-1.0, 1.0]]) / h, cells, of)
 
 
@@ -49,7 +49,7 @@ def advection(cells: int) -> sp.csr_array:
 
 
 def _quadratic(entries: dict[tuple[int, int, int], float], cells: int) -> sp.csr_array:
-    """Add up arrays (2, 2, 2) of each cell: (row, column, factor) -> entry of T."""
+    """Assemble T from an array (2, 2, 2) of each cell, (row, column, factor) -> entry."""
     n, left = cells + 1, np.arange(cells)
     rows, columns, data = [], [], []
     for (i, j, k), entry in entries.items():
@@ -62,15 +62,15 @@ def _quadratic(entries: dict[tuple[int, int, int], float], cells: int) -> sp.csr
 
 def square(cells: int, h: float) -> sp.csr_array:
     """Return T of the integrals of u^2 v."""
-    # The integral of a product of three hat functions over a cell is h/4 if all are the same, else
-    # h/12; the derivative of u^2 is 2 u.
+    # The integral of three hat functions over a cell is h/4 if all are equal, else h/12; the
+    # derivative of u^2 is 2 u.
     places = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
     return _quadratic({p: 2.0 * (h / 4 if len(set(p)) == 1 else h / 12) for p in places}, cells)
 
 
 def self_advection(cells: int) -> sp.csr_array:
     """Return T of the integrals of u u_x v."""
-    # The test function i with hat j and the slope of hat k: slope times 1/3 or 1/6.
+    # The integral of test function i, hat j and the slope of hat k is the slope times 1/3 or 1/6.
     slope, entries = (-1.0, 1.0), dict[tuple[int, int, int], float]()
     for i in (0, 1):
         for j in (0, 1):
@@ -82,7 +82,7 @@ def self_advection(cells: int) -> sp.csr_array:
 
 
 def interpolation(points: Array, cells: int, left: float, right: float) -> Array:
-    """Return the rows that evaluate a function at points, shape (points, nodes)."""
+    """Return the matrix that evaluates a function at points, shape (points, nodes)."""
     place = (np.asarray(points) - left) / (right - left) * cells
     cell = np.minimum(place.astype(int), cells - 1)
     rows = np.zeros((len(place), cells + 1))
@@ -92,7 +92,7 @@ def interpolation(points: Array, cells: int, left: float, right: float) -> Array
 
 
 def projected(f: Callable[[Array], Array], cells: int, right: float, points: int = 2) -> Array:
-    """Return the L2 projection of a function on (0, right), by so many Gauss points in a cell."""
+    """Return the L2 projection of f on (0, right), with `points` Gauss points in each cell."""
     place, weight = np.polynomial.legendre.leggauss(points)
     share, h = 0.5 * (1.0 + place), right / cells
     values = f(h * (np.arange(cells)[:, None] + share)) * (0.5 * h * weight)

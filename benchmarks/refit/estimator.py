@@ -1,4 +1,4 @@
-"""What livepde makes of stored samples: its fit at the end of a batch run."""
+"""Fit of stored samples by livepde at the end of a batch run."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from livepde.stepping import StepFailed
 
 Array = NDArray[Any]
 PLAIN = {"refit": None}
-"""Options of a filter that takes no sample twice."""
+"""Options of a filter that processes each sample once."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The fit of one data set.
+    """Fit of one data set.
 
     Attributes
     ----------
     a
-        Coordinates of the final estimate, shape (k,); NaN if there is none.
+        Coordinates of the final estimate, shape (k,); NaN without an estimate.
     cost, claimed
-        Its cost by the lean forward model, and the cost that livepde reports: NaN where a reading
-        is refused, which counts for the lean model alone.
+        Cost by the lean forward model, and cost that livepde reports; the latter is NaN if livepde
+        refused a reading.
     passes
-        Passes over all samples that livepde reports, NaN if it reports none.
+        Passes over all samples that livepde reports; NaN without a report.
     converged, level
-        Whether livepde reports a fit that has converged; level of its verdict.
+        Whether livepde reports convergence, and the level of its verdict.
     seconds
         Processor time of the run.
     failure
-        What ended the run, if anything did.
+        Error that ended the run; empty without one.
     """
 
     a: Array
@@ -54,7 +54,7 @@ class Fit:
 
 
 def livepde_fit(problem: Problem, priors: Priors, z: Array) -> Fit:
-    """Return livepde's fit of readings z, shape (samples, sensors), with its defaults."""
+    """Return livepde's fit of readings z, shape (samples, sensors), with default options."""
     objective = Objective(problem, priors, z)
     begun = process_time()
     try:
@@ -62,7 +62,7 @@ def livepde_fit(problem: Problem, priors: Priors, z: Array) -> Fit:
     except (LivepdeError, StepFailed, ArithmeticError, np.linalg.LinAlgError) as error:
         lost = np.full(objective.coordinates.size, np.nan)
         text = f"{type(error).__name__}: {error}"
-        # A run that ends with an error does not claim anything.
+        # A run that ends with an error counts as "do not trust".
         spent = process_time() - begun
         return Fit(lost, np.inf, np.nan, np.nan, False, "do not trust", spent, text)
     seconds = process_time() - begun
@@ -77,15 +77,15 @@ def _judged(objective: Objective, result: Result, seconds: float) -> Fit:
     fit = last.fit
     if fit is None:
         return Fit(a, cost, np.nan, np.nan, True, last.verdict.level, seconds)
-    claimed = np.nan if fit.refused else fit.cost  # it leaves out the readings that are refused
+    claimed = np.nan if fit.refused else fit.cost  # `fit.cost` excludes refused readings
     return Fit(a, cost, claimed, fit.passes, fit.converged, last.verdict.level, seconds)
 
 
 @lru_cache(maxsize=64)
 def plain_seconds(problem: Problem) -> float:
-    """Return the processor time of a filter that takes no sample twice.
+    """Return the processor time of a filter that processes each sample once.
 
-    Its prior is the truth, so that no safeguard acts; what a fit takes beyond this is its own.
+    Its prior is centred at the truth, so that no safeguard acts. Fits add the time of refits.
     """
     near = {
         name: item.prior or Belief(item.truth, 0.1 * float(item.slope(item.latent(item.truth))))

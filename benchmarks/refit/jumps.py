@@ -1,4 +1,4 @@
-"""Three jumps of one unknown among several: found as well as if all may jump, the rest is kept."""
+"""Detection of three jumps of one unknown while a second unknown remains constant."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from benchmarks.refit.elements import interpolation
 from livepde.models import advection_dispersion
 
 Array = NDArray[Any]
-AT = (80, 140, 200)  # samples before which the unknown v jumps
+AT = (80, 140, 200)  # the unknown v jumps before these samples
 SAMPLES = 260
 FINE = 120  # cells of the truths
-SOON = 15  # samples within which an alarm is that of a jump
-LEVELS = (0.6, 2.0)  # between which v is drawn
-CHANGE = 1.3  # least factor of a jump
+SOON = 15  # samples within which an alarm is attributed to a jump
+LEVELS = (0.6, 2.0)  # range of v
+CHANGE = 1.3  # smallest factor of a jump
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,14 +34,14 @@ class JumpTrial:
     Attributes
     ----------
     process, seed
-        The process, and which of its truths.
+        Name of the process, and seed of the truth.
     one, every
-        Jumps that are found if v alone may jump, and if all unknowns may.
+        Number of detected jumps if only v may jump, and if all unknowns may jump.
     shift
-        Largest distance of the constant from its estimate before the first jump, once each jump has
-        been learned, in standard deviations of that estimate.
+        Largest distance between the estimates of the constant after and before the first jump, in
+        standard deviations of the latter. Estimates after a jump are from before the next jump.
     widest
-        Largest standard deviation of the constant then over that before the first jump.
+        Largest standard deviation of these later estimates over the one before the first jump.
     """
 
     process: str
@@ -53,16 +53,16 @@ class JumpTrial:
 
 
 class Jumping(ABC):
-    """A process with the unknown v, which jumps, and a constant.
+    """Process with an unknown v that jumps, and a constant unknown.
 
     Attributes
     ----------
     constant
-        Label of the unknown that stays as it is.
+        Label of the constant unknown.
     step, noise
-        Time between two samples, and the standard deviation of the readings.
+        Time between two samples, and standard deviation of the readings.
     points
-        Places of the sensors.
+        Positions of the sensors.
     u0
         Initial state.
     """
@@ -75,11 +75,11 @@ class Jumping(ABC):
 
     @abstractmethod
     def system(self, v: float) -> tuple[Array, Array]:
-        """Return A and B of the truth y' = A y + B g: finite volumes about nodes."""
+        """Return A and B of the truth y' = A y + B g, by vertex-centred finite volumes."""
 
     @abstractmethod
     def model(self) -> lp.Model:
-        """Return the model as a user of livepde writes it."""
+        """Return the model as a user of livepde would write it."""
 
     @property
     @abstractmethod
@@ -87,7 +87,7 @@ class Jumping(ABC):
         """Length of the rod or column."""
 
     def signal(self, t: Array) -> Array:
-        """Return the input g; it is straight between samples."""
+        """Return the input g, which is linear between samples."""
         return np.ones_like(t)
 
     def inputs(self, t: float) -> Mapping[str, float]:
@@ -95,15 +95,15 @@ class Jumping(ABC):
         return {}
 
     def shown(self, levels: Array) -> Array:
-        """Return what the sensors show, shape (samples, sensors), for v before each sample."""
+        """Return the readings without noise, shape (samples, sensors), for v before each sample."""
         seen = interpolation(np.array(self.points), FINE, 0.0, self.length)[:, : self._nodes]
-        y, found = np.full(self._nodes, self.u0), []
+        y, shown = np.full(self._nodes, self.u0), []
         g = self.signal(self.step * np.arange(len(levels) + 1))
         for n, v in enumerate(levels.tolist()):
             once, first, last = self._response(v)
             y = once @ y + first * g[n] + last * g[n + 1]
-            found.append(seen @ y)
-        return np.array(found)
+            shown.append(seen @ y)
+        return np.array(shown)
 
     @property
     def _nodes(self) -> int:
@@ -111,13 +111,13 @@ class Jumping(ABC):
 
     @cache  # noqa: B019  as many processes as there are classes
     def _response(self, v: float) -> tuple[Array, Array, Array]:
-        """Return the exact response of a step to the state and to the inputs at both ends."""
+        """Return the exact responses of a step to the state and to the inputs at its two ends."""
         A, B = self.system(v)
         n = len(A)
         block = np.zeros((n + 2, n + 2))
         block[:n, :n], block[:n, n], block[n, n + 1] = A * self.step, B * self.step, 1.0
-        found = sla.expm(block)
-        return found[:n, :n], found[:n, n] - found[:n, n + 1], found[:n, n + 1]
+        E = sla.expm(block)
+        return E[:n, :n], E[:n, n] - E[:n, n + 1], E[:n, n + 1]
 
 
 class Rod(Jumping):
@@ -131,7 +131,7 @@ class Rod(Jumping):
     def system(self, v: float) -> tuple[Array, Array]:
         h, n = self.length / FINE, self._nodes
         A = self.K / h**2 * (np.eye(n, k=1) + np.eye(n, k=-1) - 2.0 * np.eye(n))
-        A[0] *= 2.0  # half of a volume
+        A[0] *= 2.0  # half a volume
         A[0, 0] /= 2.0
         A[-1] = 0.0
         B = np.zeros(n)
@@ -151,7 +151,7 @@ class Rod(Jumping):
 
 
 class Column(Jumping):
-    """c_t = D c_xx - v c_x, fed on the left."""
+    """c_t = D c_xx - v c_x with an inlet on the left."""
 
     constant, step, noise, points = "D", 0.16, 0.02, (2.0, 5.0, 8.0)
     D = 0.5
@@ -161,7 +161,7 @@ class Column(Jumping):
     def system(self, v: float) -> tuple[Array, Array]:
         h, n = self.length / FINE, self._nodes
         one = np.eye(n)
-        # Fluxes through the faces between nodes, and on the right, where c goes with the water.
+        # Fluxes through the faces between nodes, and advection through the right end.
         flux = 0.5 * v * (one[1:] + one[:-1]) - self.D / h * (one[1:] - one[:-1])
         flux = np.vstack([0.0 * one[:1], flux, v * one[-1:]])
         volume = np.full(n, h)
@@ -184,7 +184,7 @@ PROCESSES: Mapping[str, Jumping] = {"rod": Rod(), "column": Column()}
 
 
 def _levels(rng: np.random.Generator) -> Array:
-    """Return v before each sample: four levels, each well apart from the one before."""
+    """Draw v before each sample: four levels that differ by at least a factor `CHANGE`."""
     levels = [1.0]
     while len(levels) <= len(AT):
         level = float(np.exp(rng.uniform(*np.log(LEVELS))))
@@ -194,8 +194,8 @@ def _levels(rng: np.random.Generator) -> Array:
 
 
 def jump_trials(seed: int) -> list[JumpTrial]:
-    """Run one truth of each process; the same seed gives the same numbers."""
-    found = []
+    """Run one truth of each process; a seed determines all numbers."""
+    trials = []
     for name, process in PROCESSES.items():
         rng = np.random.default_rng([zlib.crc32(f"jumps {name}".encode()), seed])
         shown = process.shown(_levels(rng))
@@ -206,12 +206,12 @@ def jump_trials(seed: int) -> list[JumpTrial]:
         before, *later = [at - 1 for at in (*AT, SAMPLES)]
         shift = float(np.abs(constant[later] - constant[before]).max() / std[before])
         widest = float(std[later].max() / std[before])
-        found.append(JumpTrial(name, seed, one, every, shift, widest))
-    return found
+        trials.append(JumpTrial(name, seed, one, every, shift, widest))
+    return trials
 
 
 def _run(process: Jumping, jumps: lp.Jumps, z: Array) -> tuple[int, Array, Array]:
-    """Return how many jumps are found, and estimates of the constant with standard deviations."""
+    """Return the number of detected jumps, and estimates and deviations of the constant."""
     sensors = lp.Points(list(process.points), noise=process.noise)
     law = lp.SensitivityLaw(jumps=jumps)
     identifier = lp.Identifier(process.model(), sensors, law, u0=process.u0)
@@ -223,5 +223,5 @@ def _run(process: Jumping, jumps: lp.Jumps, z: Array) -> tuple[int, Array, Array
         estimate = identifier.step(t, row, process.inputs(t))
         alarms.append(bool(estimate.diagnostics.jump > 0.0))
         known.append(estimate.parameters[process.constant])
-    found = sum(any(alarms[at : at + SOON]) for at in AT)
-    return found, *np.array(known).T
+    detected = sum(any(alarms[at : at + SOON]) for at in AT)
+    return detected, *np.array(known).T

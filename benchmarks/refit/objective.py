@@ -1,4 +1,4 @@
-"""The cost of a fit, c(a) = |r|^2/2 + |a|^2/2, with the lean forward model."""
+"""Cost of a fit, c(a) = |r|^2/2 + |a|^2/2, with the lean forward model."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from benchmarks.refit.problem import Priors, Problem
 from benchmarks.refit.process import LostError, Trajectory
 
 Array = NDArray[Any]
-LOST = 1e4  # residual, in standard deviations, where the forward model has no solution
+LOST = 1e4  # residual, in standard deviations, if the forward model has no solution
 
 
 class Objective:
-    """Residuals in standard deviations and their derivative, as SciPy asks for them.
+    """Residuals in standard deviations and their derivative, for `scipy.optimize.least_squares`.
 
     Parameters
     ----------
     problem, priors
-        And the priors of its unknowns.
+        Problem, and priors of its unknowns.
     z
-        Readings, shape (samples, sensors), NaN where missing.
+        Readings, shape (samples, sensors), NaN if missing.
     """
 
     def __init__(self, problem: Problem, priors: Priors, z: Array) -> None:
@@ -48,11 +48,11 @@ class Objective:
         return self._last
 
     def residual(self, a: Array) -> Array:
-        """Return the misfits and the coordinates, both in standard deviations."""
+        """Return misfits and coordinates, both in standard deviations."""
         return self._evaluated(a)[2]
 
     def jacobian(self, a: Array) -> Array:
-        """Return the derivative of `residual`; the states are those of the last call of it."""
+        """Return the derivative of `residual`, with the states of its last call."""
         path, size = self._evaluated(a)[1], self.coordinates.size
         if path is None:
             rows = np.zeros((int(self.used.sum()), size))
@@ -69,5 +69,5 @@ class Objective:
         return 0.5 * float(residual @ residual)
 
     def root(self, a: Array) -> Array:
-        """Return R with R^T R = I + J^T J: distances in standard deviations of the posterior."""
+        """Return R with R^T R = I + J^T J, so that |R da| is a distance in posterior deviations."""
         return np.asarray(np.linalg.qr(self.jacobian(a), mode="r"))

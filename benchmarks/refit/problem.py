@@ -1,4 +1,4 @@
-"""Abstract problem: a model as a user writes it, its lean twin, and a truth by another code."""
+"""Abstract problem: a user's model, a lean forward model, and a truth by another code."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ Priors = Mapping[str, Belief]
 
 
 class Problem(ABC):
-    """A process with unknowns, its sensors and its truth.
+    """Process with unknowns, its sensors and its truth.
 
     Attributes
     ----------
     title
-        The process in a few words.
+        Description of the process.
     unknowns
-        By the label that livepde gives them, in its order: those of sensors come last.
+        livepde's label -> unknown, in livepde's order, with unknowns of sensors last.
     points, noise
-        Sensors with their positions, and the standard deviation of their noise.
+        Sensors with their positions, and standard deviation of their noise.
     times
-        Of the samples, the first at the start, where nothing is measured.
+        Times of the samples; the first is the start, without readings.
     longest
-        Longest step.
+        Longest time step.
     converging
         Share of the priors from which the best cost must be reached.
     most_passes
-        Passes over all samples that nine of ten fits may take.
+        Bound on the passes over all samples of nine in ten fits.
     law
         Options of the law.
     """
@@ -53,26 +53,26 @@ class Problem(ABC):
     law: ClassVar[Mapping[str, Any]] = {}
 
     def at(self, seed: int) -> Problem:
-        """Return the problem of a seed: itself, unless the samples depend on it."""
+        """Return the problem of a seed, which is the same unless the samples depend on the seed."""
         return self
 
     def priors(self, seed: int) -> Priors:
-        """Return the priors of a seed, drawn away from the truth."""
+        """Draw the priors of a seed, distant from the truth."""
         return drawn(self.unknowns, self._random("priors", seed))
 
     def readings(self, seed: int) -> Array:
-        """Return what is measured, with noise, shape (samples, sensors); NaN at the start."""
+        """Return the noisy readings, shape (samples, sensors); NaN at the start."""
         shown = np.array(self.shown)
         shown += self.noise * self.errors(self._random("noise", seed))
         shown[0] = np.nan
         return shown
 
     def errors(self, rng: np.random.Generator) -> Array:
-        """Return errors of the readings in standard deviations of the noise."""
+        """Draw errors of the readings, in standard deviations of the noise."""
         return rng.standard_normal(self.shown.shape)
 
     def random(self, what: str, seed: int) -> np.random.Generator:
-        """Return the random numbers of a seed for one purpose."""
+        """Return the random generator of a seed for one purpose."""
         return self._random(what, seed)
 
     def _random(self, what: str, seed: int) -> np.random.Generator:
@@ -81,20 +81,20 @@ class Problem(ABC):
 
     @cached_property
     def shown(self) -> Array:
-        """What the sensors show without noise at the samples, shape (samples, sensors)."""
+        """Readings without noise, shape (samples, sensors)."""
         return self.truth()
 
     @abstractmethod
     def truth(self) -> Array:
-        """Compute `shown`, by a code that shares nothing with livepde or the lean model."""
+        """Compute `shown` by a code that is independent of livepde and the lean model."""
 
     @abstractmethod
     def model(self, priors: Priors) -> lp.Model:
-        """Return the model as a user of livepde writes it."""
+        """Return the model as a user of livepde would write it."""
 
     @property
     def u0(self) -> Any:
-        """Initial state as a user of livepde writes it."""
+        """Initial state as a user of livepde would write it."""
         return 0.0
 
     @property
@@ -103,17 +103,17 @@ class Problem(ABC):
         return {}
 
     def sensors(self, priors: Priors) -> lp.Points:
-        """Return the sensors as a user of livepde writes them."""
+        """Return the sensors as a user of livepde would write them."""
         return lp.Points(dict(self.points), noise=self.noise)
 
     def prior_of(self, name: str, priors: Priors) -> Any:
-        """Return the prior of an unknown as a user of livepde writes it."""
+        """Return the prior of an unknown as a user of livepde would write it."""
         return self.unknowns[name].declared(priors[name])
 
     def identifier(self, priors: Priors, **options: Any) -> lp.Identifier:
-        """Return an identifier with its defaults and some more options of the law.
+        """Return an identifier with defaults, except for given options of the law.
 
-        Its steps are those that are stated, as in the forward model that it is compared with.
+        Its time steps equal those of the lean forward model.
         """
         stated = {"shadows": lp.laws.Shadows(parts=1)}
         law = lp.SensitivityLaw(**{**stated, **self.law, **options})
@@ -132,11 +132,11 @@ class Problem(ABC):
     @cached_property
     @abstractmethod
     def process(self) -> Process:
-        """The lean forward model, with the discretisation of `model`."""
+        """Lean forward model with the discretisation of `model`."""
 
     @abstractmethod
     def theta(self, q: Array) -> tuple[Array, Array]:
-        """Return the coefficients of `process` and their derivative, shapes (J,) and (J, m)."""
+        """Return the coefficients of `process` and their derivative by q, (J,) and (J, m)."""
 
     def coordinates(self, priors: Priors) -> Coordinates:
         """Return the coordinates of a fit."""

@@ -1,11 +1,11 @@
-"""A lean forward model with exact sensitivities: what the fits of SciPy and all costs use.
+"""Lean forward model with exact sensitivities, for the fits of SciPy and for all costs.
 
     M u' + sum over j of theta_j(q) (K_j u + Q_j(u) - F_j g(t)) = 0,    z = G u + D q
 
-with fixed rows where u is given, inputs g that change linearly between samples, and the scheme of
-Alexander (1977), whose first steps are graded as in `livepde.Advance`. It shares no code with
-livepde. Matrices are bands that are assembled once, and factorised once for each theta and length
-of a step where the process is linear.
+with rows of given values, inputs g that are linear between samples, and the scheme of Alexander
+(1977), whose first steps are graded as in `livepde.Advance`. It shares no code with livepde. Band
+matrices are assembled once. For a linear process, they are factorised once for each theta and step
+length.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ Array = NDArray[Any]
 Factor: TypeAlias = tuple[Array, Array]
 
 GAMMA = 1.0 - np.sqrt(0.5)
-GRADES = 3  # times a step near the start is halved at most
-NEWTON = 30  # updates of a stage at most
-SMALL = 1e-6  # of the last update of a stage, relative to the state: its square is left
+GRADES = 3  # largest number of halvings of a step near the start
+NEWTON = 30  # largest number of Newton updates of a stage
+SMALL = 1e-6  # last update of a stage relative to the state; the error is about its square
 
 
 class LostError(ArithmeticError):
@@ -35,10 +35,10 @@ class LostError(ArithmeticError):
 
 
 def stages_of(times: Array, longest: float) -> tuple[Array, Array, Array]:
-    """Return the steps between samples: their starts and lengths, and the last of each interval.
+    """Return starts and lengths of all steps, and the index of the last step of each interval.
 
-    A step h that begins less than 2 h after the start is halved, at most three times, to a grid of
-    halvings of its interval.
+    A step h that begins less than 2 h after the start is halved, at most three times, to a dyadic
+    grid of its interval.
     """
     starts, lengths, last = [], [], []
     for t0, t1 in pairwise(times.tolist()):
@@ -60,7 +60,7 @@ def stages_of(times: Array, longest: float) -> tuple[Array, Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """The states of one pass.
+    """States of one forward run.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class Trajectory:
     u
         State at the end of each stage, two for each step, shape (2 steps, n).
     factors
-        Of each length of a step; empty if the process is not linear.
+        Factorisation for each step length; empty if the process is not linear.
     """
 
     theta: Array
@@ -79,25 +79,25 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class Process:
-    """The forward model.
+    """Lean forward model.
 
     Attributes
     ----------
     M, K, F
-        Mass, (n, n); a matrix (n, n) and an array (n, inputs) for each theta.
+        Mass matrix (n, n); a matrix (n, n) and an array (n, inputs) for each theta.
     G, D
-        Sensors, shapes (sensors, n) and (sensors, unknowns).
+        Sensor matrices, shapes (sensors, n) and (sensors, unknowns).
     u0
-        State at the start, shape (n,).
+        Initial state, shape (n,).
     times, longest
-        Of the samples, shape (samples,), the first at the start; longest step.
+        Times of the samples from the start on, shape (samples,), and longest step.
     inputs
-        At the samples, shape (samples, inputs).
+        Inputs at the samples, shape (samples, inputs).
     fixed, given
-        Rows where u is given, shape (f,), and by which inputs, (f, inputs).
+        Rows with given values of u, shape (f,), and matrix from inputs to values, (f, inputs).
     quadratic, scale
-        Array T of the quadratic form (see `elements`), None for a linear process, and the number of
-        the theta that multiplies it.
+        Array T of the quadratic form (see `elements`), None for a linear process, and index of the
+        theta that multiplies it.
     """
 
     M: sp.csr_array
@@ -116,9 +116,9 @@ class Process:
 
     @cached_property
     def _grid(self) -> tuple[Array, Array, Array, Array]:
-        """Lengths of all steps, number of each among the unequal ones, these, last of a sample."""
+        """Step lengths, index of each among the distinct lengths, these, last step of a sample."""
         _, lengths, last = stages_of(self.times, self.longest)
-        # Differences of times differ in their last digits.
+        # Equal steps differ by rounding errors of the times.
         _, first, number = np.unique(
             np.round(lengths / lengths.max(), 11), return_index=True, return_inverse=True
         )
@@ -144,18 +144,18 @@ class Process:
 
     @cached_property
     def _stack(self) -> sp.csr_array:
-        """All K above each other, with rows of zeros where u is given."""
+        """All K stacked vertically, with zero rows for given values of u."""
         rows = sp.diags_array(self._free)
         return sp.csr_array(sp.vstack([rows @ K for K in self.K]))
 
     @cached_property
     def width(self) -> int:
-        """Half of the bandwidth."""
+        """Half-bandwidth."""
         coords = [matrix.tocoo().coords for matrix in (self.M, *self.K)]
         return max(int(np.abs(i - j).max(initial=0)) for i, j in coords)
 
     def _band(self, matrix: Any) -> Array:
-        """Return a matrix as bands of its free rows, shape (2 width + 1, n), upper ones first."""
+        """Return the bands of a matrix's free rows, shape (2 width + 1, n), upper bands first."""
         found = sp.csr_array(sp.diags_array(self._free) @ matrix).tocoo()
         band = np.zeros((2 * self.width + 1, found.shape[1]))
         i, j = found.coords
@@ -164,14 +164,14 @@ class Process:
 
     @cached_property
     def _bands(self) -> tuple[Array, Array, Array]:
-        """Bands of the mass, of all K, shape (J, bands, n), and of the rows where u is given."""
+        """Bands of the mass, of all K, shape (J, bands, n), and of the rows of given values."""
         fixed = np.zeros((2 * self.width + 1, len(self.u0)))
         fixed[self.width, self.fixed] = 1.0
         return self._band(self.M), np.array([self._band(K) for K in self.K]), fixed
 
     @cached_property
     def _slope(self) -> sp.csr_array:
-        """Map from a state to the bands of the Jacobian of the quadratic form."""
+        """Matrix from a state to the bands of the Jacobian of the quadratic form."""
         n, b = len(self.u0), self.width
         T = (sp.csr_array((n * n, n)) if self.quadratic is None else self.quadratic).tocoo()
         i, j = np.divmod(T.coords[0], n)
@@ -181,7 +181,7 @@ class Process:
         return sp.csr_array((T.data[kept], (rows[kept], T.coords[1][kept])), shape=shape)
 
     def _forcing(self, theta: Array) -> Array:
-        """Return the sources at all stages, and what is given there, shape (2 steps, n)."""
+        """Return sources and given values at all stages, shape (2 steps, n)."""
         F = np.tensordot(theta, np.array(self.F), 1) * self._free[:, None]
         F[self.fixed] = self.given
         return np.ascontiguousarray(self._signals @ F.T)
@@ -200,7 +200,7 @@ class Process:
         return np.asarray(x)
 
     def states(self, theta: Array) -> Trajectory:
-        """Return the states for coefficients theta; raise `LostError` if they are not finite."""
+        """Run the model for coefficients theta; raise `LostError` if states are not finite."""
         lengths, number, unequal, _ = self._grid
         mass, K, fixed = self._bands
         if not np.isfinite(theta).all():
@@ -238,7 +238,7 @@ class Process:
             u = u - update
             if np.abs(update).max() <= SMALL * (1.0 + np.abs(u).max()):
                 return u
-        raise LostError("Newton's method does not converge")
+        raise LostError("Newton's method did not converge")
 
     def tangents(self, path: Trajectory, along: Array) -> Array:
         """Return the derivative of the states at the samples, shape (samples, n, p).
@@ -246,7 +246,7 @@ class Process:
         Parameters
         ----------
         along
-            Derivative of theta in p coordinates, shape (J, p).
+            Derivative of theta by p coordinates, shape (J, p).
         """
         lengths, number, _, last = self._grid
         n, p = len(self.u0), along.shape[1]
@@ -272,7 +272,7 @@ class Process:
         return ends[last]
 
     def _driven(self, path: Trajectory, along: Array) -> Array:
-        """Return the derivative of the equation in the coordinates, shape (2 steps, n, p)."""
+        """Return the derivative of the equation by the coordinates, shape (2 steps, n, p)."""
         stages, n = path.u.shape
         each = (self._stack @ path.u.T).reshape(len(self.K), n, stages)
         if self.quadratic is not None:
@@ -282,7 +282,7 @@ class Process:
         return np.ascontiguousarray(np.tensordot(along, each, (0, 0)).transpose(2, 1, 0))
 
     def predicted(self, path: Trajectory, q: Array) -> Array:
-        """Return what the sensors show at the samples after the first, (samples, sensors)."""
+        """Return the readings at the samples after the first, shape (samples, sensors)."""
         ends = path.u[2 * self._grid[3] + 1]
         return np.asarray(ends @ self.G.T + self.D @ q)
 
@@ -292,7 +292,7 @@ class Process:
 
 
 def _times(bands: Array, u: Array) -> Array:
-    """Return a banded matrix (bands, n, ...) times u (n, ...)."""
+    """Return the product of a banded matrix (bands, n, ...) and u (n, ...)."""
     width = len(bands) // 2
     found = bands[width] * u
     for k in range(1, width + 1):

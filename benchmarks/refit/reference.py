@@ -1,4 +1,4 @@
-"""The best known fit: SciPy's two methods, from the prior and from the truth."""
+"""Reference fits by SciPy's methods "lm" and "trf", from the prior and from the truth."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from benchmarks.refit.problem import Priors, Problem
 
 Array = NDArray[Any]
 METHODS: tuple[Literal["lm", "trf"], ...] = ("lm", "trf")
-EVALUATIONS = 200  # at most
-TOLERANCE = 1e-8  # of steps and costs, SciPy's default
+EVALUATIONS = 200  # largest number of evaluations
+TOLERANCE = 1e-8  # tolerance of steps and costs, SciPy's default
 
 
 def enough(best: float) -> float:
-    """Return the largest cost that counts as the best known one."""
+    """Return the largest cost that counts as equal to the best known cost."""
     return max(1.001 * best, best + 0.5)
 
 
@@ -31,9 +31,9 @@ class Reference:
     Attributes
     ----------
     a, cost
-        Coordinates of the best, shape (k,), and its cost.
+        Coordinates of the best fit, shape (k,), and its cost.
     reached
-        Cost that each method has reached from the prior.
+        Cost that each method reached from the prior.
     seconds
         Processor time of each method from the prior.
     """
@@ -45,7 +45,7 @@ class Reference:
 
 
 def reference(problem: Problem, priors: Priors, z: Array) -> Reference:
-    """Return the fits of readings z."""
+    """Fit readings z from both starts with both methods."""
     prior = Objective(problem, priors, z)
     starts = {
         "prior": np.zeros(prior.coordinates.size),
@@ -68,7 +68,7 @@ def reference(problem: Problem, priors: Priors, z: Array) -> Reference:
 
 
 def _fitted(objective: Objective, start: Array, method: Literal["lm", "trf"]) -> Array:
-    found = least_squares(
+    minimum = least_squares(
         objective.residual,
         start,
         jac=objective.jacobian,
@@ -78,4 +78,4 @@ def _fitted(objective: Objective, start: Array, method: Literal["lm", "trf"]) ->
         gtol=TOLERANCE,
         max_nfev=EVALUATIONS,
     )
-    return np.asarray(found.x)
+    return np.asarray(minimum.x)

@@ -1,4 +1,4 @@
-"""Scores of all priors as tables and checks."""
+"""Tables and checks of the scores of all priors."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from livepde.diagnostics.check_report import Check, Table
 from livepde.runs import Outcome
 
 MEDIAN_PASSES = 9.0
-LEVEL = 0.9  # share of the fits whose passes are bounded, and that outliers must not move
-TIMES = 2.0  # processor time of the refits over SciPy's, median
-CLAIM = 1e-3  # relative difference of the cost that livepde reports and that of the lean model
-KEPT = 3.0  # standard deviations that a constant may move while another unknown jumps
-WIDENED = 1.2  # its standard deviation over that before the first jump
+LEVEL = 0.9  # share of the fits with bounded passes, and of fits that outliers must not move
+TIMES = 2.0  # largest median processor time of the refits over SciPy's
+CLAIM = 1e-3  # largest relative difference between the cost by livepde and by the lean model
+KEPT = 3.0  # standard deviations, largest shift of a constant while another unknown jumps
+WIDENED = 1.2  # largest ratio of its standard deviations after and before the first jump
 
 NOTES = (
-    "Cost: half of the squared misfit in standard deviations of the noise and of the squared "
-    "distance from the prior, by a forward model that shares no code with livepde. Best: the least "
-    'of livepde and SciPy\'s least_squares, "lm" and "trf", from the prior and from the truth. '
-    "Reached: at most max(1.001 best, best + 0.5). Silent: missed without `do not trust` or a fit "
-    "that did not converge. Passes: over all samples. Time: processor time beyond a filter that "
-    "takes no sample twice, over that of SciPy's quicker method where it reaches the best cost "
-    "from the prior; run: of the whole run. Outliers: 20 % of the readings 10 to 100 standard "
-    "deviations off, every second prior; kept: within one standard deviation of the best clean "
-    "fit.",
+    "cost: half of the squared misfit in standard deviations of the noise plus half of the squared "
+    "distance from the prior, by a forward model that shares no code with livepde. best: smallest "
+    'cost of livepde and SciPy\'s least_squares ("lm" and "trf", from the prior and the truth). '
+    "reached: at most max(1.001 best, best + 0.5). silent: missed, but reported as converged and "
+    "without `do not trust`. passes: passes over all samples. time: processor time in addition to "
+    "a filter that processes each sample once, relative to the faster SciPy method that reaches "
+    "the best cost from the prior; run: time of the whole run. outliers: 20 % of the readings are "
+    "10 to 100 standard deviations off, for every second prior; kept: within one standard "
+    "deviation of the best fit without outliers.",
 )
 
 
 def outcome(trials: Iterable[Trial], jumps: Sequence[JumpTrial]) -> Outcome:
-    """Return tables and checks."""
-    found: dict[str, list[Trial]] = {}
-    for one in trials:
-        found.setdefault(one.problem, []).append(one)
-    order = [name for name in PROBLEMS if name in found]
-    checks = [check for name in order for check in _checks(name, found[name])]
-    tables = [_overview(found, order)] if order else []
-    missed = [item for name in order for item in found[name] if not item.reached]
+    """Return tables and checks of all trials."""
+    grouped: dict[str, list[Trial]] = {}
+    for item in trials:
+        grouped.setdefault(item.problem, []).append(item)
+    order = [name for name in PROBLEMS if name in grouped]
+    checks = [check for name in order for check in _checks(name, grouped[name])]
+    tables = [_overview(grouped, order)] if order else []
+    missed = [item for name in order for item in grouped[name] if not item.reached]
     if missed:
         tables.append(_missed(missed))
     if jumps:
@@ -73,21 +73,21 @@ def _checks(name: str, trials: Sequence[Trial]) -> Iterator[Check]:
 
 
 def _claims(trials: Sequence[Trial]) -> list[float]:
-    """Return the relative differences of reported costs, NaN where none is reported."""
-    # Differences of less than half a unit, to which the best cost is known, do not count.
+    """Return the relative errors of reported costs; NaN if no cost is reported."""
+    # The best cost is known to half a unit. Smaller differences do not count.
     return [abs(t.fit.claimed - t.fit.cost) / max(t.fit.cost, 0.5 / CLAIM) for t in trials]
 
 
 def _kept(trials: Sequence[Trial]) -> float:
-    """Return the share of fits that outliers have not moved, NaN if there is none."""
+    """Return the share of fits that outliers did not move; NaN without such fits."""
     run = [item.shifted for item in trials if not np.isnan(item.shifted)]
     return float(np.mean(np.array(run) <= 1.0)) if run else np.nan
 
 
-def _overview(found: dict[str, list[Trial]], order: Sequence[str]) -> Table:
+def _overview(grouped: dict[str, list[Trial]], order: Sequence[str]) -> Table:
     rows = []
     for name in order:
-        trials = found[name]
+        trials = grouped[name]
         passes = [item.fit.passes for item in trials]
         seconds = [item.fit.seconds / item.scipy_seconds for item in trials]
         rows.append(
@@ -106,7 +106,7 @@ def _overview(found: dict[str, list[Trial]], order: Sequence[str]) -> Table:
         )
     columns = ["problem", "priors", "reached", "SciPy reached", "silent", "passes", "90 %"]
     columns += ["time/SciPy", "run/SciPy", "outliers kept"]
-    return Table("Fits of stored samples from far priors", columns, rows)
+    return Table("Fits of stored samples from distant priors", columns, rows)
 
 
 def _median(values: Sequence[float]) -> float:
@@ -142,7 +142,7 @@ def _jumps(trials: Sequence[JumpTrial]) -> Table:
         "constant moved",
         "constant widened",
     ]
-    return Table(f"Found of {len(AT)} jumps of one unknown among two", columns, rows)
+    return Table(f"Detected jumps of {len(AT)}, of one unknown among two", columns, rows)
 
 
 def _jump_checks(name: str, trials: Sequence[JumpTrial]) -> Iterator[Check]:

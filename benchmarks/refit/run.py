@@ -1,4 +1,4 @@
-"""All priors, in several processes."""
+"""Runs of all priors, in several processes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from livepde.runs import Outcome
 
 JUMPS = "jumps"
 PARTS = (*PROBLEMS, JUMPS)
-"""What can be run by itself: the problems, and jumps of one unknown."""
+"""Parts of the benchmark: the problems, and jumps of one unknown."""
 
 
 def refit(
@@ -24,16 +24,16 @@ def refit(
     workers: int | None = None,
     progress: bool = False,
 ) -> Outcome:
-    """Run so many priors of each problem, default all of `PARTS`.
+    """Run `seeds` priors of each problem, default all of `PARTS`.
 
     Parameters
     ----------
     seeds
-        Priors of each problem; of truths with jumps half as many.
+        Priors of each problem; the number of truths with jumps is half of it.
     workers
-        Processes; default one for each processor. One runs in this process.
+        Processes; default one for each processor. With 1, fits run in this process.
     """
-    # A truth with jumps has two processes, each of which is run twice.
+    # Fewer truths with jumps, since each has two processes, which are run twice.
     jobs = [
         (name, seed)
         for seed in range(seeds)

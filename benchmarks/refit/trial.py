@@ -1,4 +1,4 @@
-"""One prior of one problem: livepde's fit against the best known one, clean and with outliers."""
+"""Trial of one prior: livepde's fit, without and with outliers, and the best known fit."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from benchmarks.refit.problem import Array, Priors, Problem
 from benchmarks.refit.problems import PROBLEMS
 from benchmarks.refit.reference import Reference, enough, reference
 
-OUTLIERS = 0.2  # share of the readings that are wild
-SIZES = (10.0, 100.0)  # of what is added to them, in standard deviations of the noise
-LEAST = 10  # samples from which outliers can be told from the rest
+OUTLIERS = 0.2  # share of outliers among the readings
+SIZES = (10.0, 100.0)  # range of their errors, in standard deviations of the noise
+LEAST = 10  # number of samples above which outliers can be detected
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,16 +25,16 @@ class Trial:
     Attributes
     ----------
     problem, seed
-        The problem, and which of its priors.
+        Name of the problem, and seed of the prior.
     best
         Best known cost.
     fit, plain
-        livepde's fit, and the processor time of a filter that takes no sample twice.
+        livepde's fit, and the processor time of a filter that processes each sample once.
     scipy
-        The fits of SciPy.
+        Fits by SciPy.
     shifted
-        Distance between the fit with outliers and the best clean one, root mean square over the
-        coordinates in standard deviations of the clean posterior; NaN if it was not run.
+        Root mean square distance between the fit with outliers and the best fit without, in
+        standard deviations of the posterior without outliers; NaN if it was not run.
     """
 
     problem: str
@@ -47,17 +47,17 @@ class Trial:
 
     @property
     def reached(self) -> bool:
-        """Whether livepde has reached the best known cost."""
+        """Whether livepde reached the best known cost."""
         return self.fit.cost <= enough(self.best)
 
     @property
     def silent(self) -> bool:
-        """Whether livepde has missed the best known cost and does not report that."""
+        """Whether livepde missed the best known cost without reporting it."""
         return not self.reached and self.fit.converged and self.fit.level != "do not trust"
 
     @property
     def scipy_seconds(self) -> float:
-        """Processor time of SciPy's quickest fit from the prior that reached the best cost; NaN."""
+        """Time of SciPy's fastest fit from the prior that reached the best cost; NaN if none."""
         each = [
             self.scipy.seconds[method]
             for method, cost in self.scipy.reached.items()
@@ -67,12 +67,12 @@ class Trial:
 
     @property
     def ratio(self) -> float:
-        """Processor time of livepde's refits over that of SciPy; NaN where SciPy fails."""
+        """Processor time of livepde's refits over SciPy's; NaN if SciPy misses the best cost."""
         return max(self.fit.seconds - self.plain, 0.0) / self.scipy_seconds
 
 
 def trial(name: str, seed: int) -> Trial:
-    """Run one prior; the same seed gives the same numbers, processor times aside."""
+    """Run one prior; a seed determines all numbers except processor times."""
     problem = PROBLEMS[name].at(seed)
     with threadpool_limits(1):
         priors, z = problem.priors(seed), problem.readings(seed)
@@ -80,14 +80,14 @@ def trial(name: str, seed: int) -> Trial:
         scipy = reference(problem, priors, z)
         best = min(scipy.cost, fit.cost)
         a = fit.a if fit.cost < scipy.cost else scipy.a
-        # Every second prior is enough for a share of nine in ten.
+        # Every second prior suffices to check a share of nine in ten.
         wild = len(z) > LEAST and seed % 2 == 1
         shifted = _shifted(problem, priors, z, a, seed) if wild else np.nan
         return Trial(name, seed, best, fit, plain_seconds(problem), scipy, shifted)
 
 
 def with_outliers(z: Array, noise: float, rng: np.random.Generator) -> Array:
-    """Return readings of which a fifth is far off, by either sign."""
+    """Return readings with large errors of either sign in a share `OUTLIERS` of them."""
     wild = rng.uniform(size=z.shape) < OUTLIERS
     size = np.exp(rng.uniform(np.log(SIZES[0]), np.log(SIZES[1]), z.shape)) * rng.choice(
         [-1.0, 1.0], z.shape
@@ -97,7 +97,7 @@ def with_outliers(z: Array, noise: float, rng: np.random.Generator) -> Array:
 
 def _shifted(problem: Problem, priors: Priors, z: Array, a: Array, seed: int) -> float:
     wild = with_outliers(z, problem.noise, problem.random("outliers", seed))
-    found = livepde_fit(problem, priors, wild).a
-    steps = Objective(problem, priors, z).root(a) @ (found - a)
+    moved = livepde_fit(problem, priors, wild).a
+    steps = Objective(problem, priors, z).root(a) @ (moved - a)
     distance = float(np.sqrt(np.mean(steps**2)))
     return distance if np.isfinite(distance) else np.inf

@@ -1,4 +1,4 @@
-"""Finite volumes about nodes as systems y' = A y + B g: truths that share no code with livepde."""
+"""Truths by vertex-centred finite volumes, y' = A y + B g, which share no code with livepde."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ Array = NDArray[Any]
 
 
 def conduction(k: Callable[[Array], Array], cells: int, length: float, points: Array) -> Linear:
-    """Return u_t = (k u_x)_x between two given values, the inputs.
+    """Return the system u_t = (k u_x)_x with the two boundary values as inputs.
 
     Parameters
     ----------
     k
-        Conductivity at places, shape (cells,).
+        Points -> conductivity, evaluated at the cell centres.
     cells, length
-        Nodes are the ends of cells; those inside are y.
+        Number of cells, whose ends are the nodes, and total length; y are the inner nodes.
     points
-        Of the sensors, inside.
+        Positions of the sensors inside the interval.
     """
     h = length / cells
     between = k(h * (np.arange(cells) + 0.5)) / h**2

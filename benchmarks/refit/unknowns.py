@@ -1,4 +1,4 @@
-"""Unknowns, their priors far from the truth, and the coordinates a ~ N(0, I) of a fit."""
+"""Unknowns, priors distant from the truth, and coordinates a ~ N(0, I) of a fit."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import livepde as lp
 Array = NDArray[Any]
 Kind = Literal["log", "logit", "normal"]
 
-FARTHEST = 3.0  # standard deviations between truth and prior
-FACTOR = 10.0  # between truth and prior; of a share in (0, 1) between the odds
-WIDTHS = (0.3, 1.0)  # of the logarithm
+FARTHEST = 3.0  # largest distance between truth and prior, in standard deviations
+FACTOR = 10.0  # largest factor between truth and prior, or between their odds for "logit"
+WIDTHS = (0.3, 1.0)  # range of the latent standard deviation
 
 
 @dataclass(frozen=True)
 class Belief:
-    """What is known of a number before the first sample: median and standard deviation."""
+    """Prior of a constant: median and standard deviation."""
 
     median: float
     std: float
@@ -29,16 +29,16 @@ class Belief:
 
 @dataclass(frozen=True)
 class Unknown:
-    """An unknown number.
+    """Unknown constant, or value of a field.
 
     Attributes
     ----------
     truth
-        Its true value; of a field one that is typical.
+        True value, for a field a typical value.
     kind
-        "log" for a positive number, "logit" for one in (0, 1), "normal" for any.
+        "log" for positive values, "logit" for values in (0, 1), "normal" for any values.
     prior
-        The prior if it is the same in all draws; None: it is drawn.
+        Fixed prior; None: the prior is drawn.
     """
 
     truth: float
@@ -46,13 +46,13 @@ class Unknown:
     prior: Belief | None = None
 
     def latent(self, q: Any) -> Any:
-        """Return the value in which the prior is Gaussian."""
+        """Return the latent value, which has a Gaussian prior."""
         if self.kind == "log":
             return np.log(q)
         return np.log(q) - np.log1p(-q) if self.kind == "logit" else q
 
     def value(self, latent: Any) -> Any:
-        """Return the inverse of `latent`."""
+        """Return the value for a latent value, the inverse of `latent`."""
         if self.kind == "log":
             return np.exp(latent)
         return 1.0 / (1.0 + np.exp(-latent)) if self.kind == "logit" else latent
@@ -63,7 +63,7 @@ class Unknown:
         return q if self.kind == "log" else q * (1.0 - q) if self.kind == "logit" else 1.0
 
     def declared(self, belief: Belief) -> Any:
-        """Return the prior as a user of livepde writes it."""
+        """Return the prior as a user of livepde would write it."""
         if self.kind == "log":
             return lp.LogNormal(belief.median, std=belief.std)
         if self.kind == "logit":
@@ -72,29 +72,29 @@ class Unknown:
 
 
 def drawn(unknowns: Mapping[str, Unknown], rng: np.random.Generator) -> dict[str, Belief]:
-    """Return priors: each up to three standard deviations and a factor of ten off the truth."""
-    found = {}
+    """Draw priors within three standard deviations and a factor of ten of the truth."""
+    priors = {}
     for name, unknown in unknowns.items():
         if unknown.prior is not None:
-            found[name] = unknown.prior
+            priors[name] = unknown.prior
             continue
         std = float(np.exp(rng.uniform(*np.log(WIDTHS))))
         shift = std * rng.uniform(-FARTHEST, FARTHEST)
         latent = unknown.latent(unknown.truth) + np.clip(shift, -np.log(FACTOR), np.log(FACTOR))
-        found[name] = Belief(float(unknown.value(latent)), float(std * unknown.slope(latent)))
-    return found
+        priors[name] = Belief(float(unknown.value(latent)), float(std * unknown.slope(latent)))
+    return priors
 
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """q = T(latent), latent = centre + Phi a with a ~ N(0, I).
+    """Coordinates a ~ N(0, I) with q = T(latent) and latent = centre + Phi a.
 
     Attributes
     ----------
     unknowns
-        Of each value of q; those of a field are alike.
+        Unknown of each value of q, the same for all values of a field.
     centre, Phi
-        Shapes (m,) and (m, k).
+        Arrays of shapes (m,) and (m, k).
     """
 
     unknowns: tuple[Unknown, ...]
@@ -103,7 +103,7 @@ class Coordinates:
 
     @classmethod
     def of(cls, unknowns: Mapping[str, Unknown], priors: Mapping[str, Belief]) -> Coordinates:
-        """Return the coordinates of some numbers."""
+        """Return the coordinates of unknown constants with their priors."""
         centre = [item.latent(priors[name].median) for name, item in unknowns.items()]
         std = [
             priors[name].std / item.slope(at)
@@ -125,7 +125,7 @@ class Coordinates:
         return self._each("slope", self.centre + self.Phi @ a)[:, None] * self.Phi
 
     def inverse(self, q: Array) -> Array:
-        """Return the coordinates of q; of a field those of its part in the modes."""
+        """Return the coordinates of q; a field is projected onto the modes."""
         off = self._each("latent", q) - self.centre
         return np.asarray(np.linalg.lstsq(self.Phi, off, rcond=None)[0])
 

@@ -1,4 +1,4 @@
-"""Costs of steps, of memory, and of a fleet; `python -m benchmarks` prints their bounds, too.
+"""Costs of steps, memory, and speed-up of a fleet; `python -m benchmarks` also checks bounds.
 
 `python -m benchmarks.suite.costs NODES LAW` prints the memory of one identification.
 """
@@ -21,7 +21,7 @@ MODES = 10
 
 
 class Step:
-    """A step of each law over a forward step of the same model: the dearest of its settings."""
+    """Cost of a step of each law in forward steps of the same model, largest over settings."""
 
     params: Any = ((31, 1_000, 10_000), LAWS)
     param_names = ("nodes", "law")
@@ -43,7 +43,7 @@ class Step:
 
 
 class Memory:
-    """What an identification adds to a process that has imported livepde, per state unknown."""
+    """Memory per state unknown that an identification adds to a process with livepde imported."""
 
     params: Any = ((10_000,), LAWS)
     param_names = ("nodes", "law")
@@ -57,7 +57,7 @@ class Memory:
 
 
 class Fleet:
-    """How many times cheaper a fleet of rods of 100 nodes is than separate identifiers."""
+    """Speed-up of a fleet of rods with 100 nodes relative to separate identifiers."""
 
     members, runs = 1000, 25
     unit = "times"
@@ -73,13 +73,13 @@ class Fleet:
 
 
 def _peak() -> float:
-    """Return the most memory that this process has had, in bytes (Linux)."""
+    """Return the peak memory of this process, in bytes (Linux)."""
     rows = Path("/proc/self/status").read_text().splitlines()
     return next(1024.0 * int(row.split()[1]) for row in rows if row.startswith("VmHWM"))
 
 
 def _spent(nodes: int, law: str) -> float:
-    """Return the kilobytes per state unknown that some steps have needed."""
+    """Return the memory of the model and five steps of a law, in kB per state unknown."""
     before, given = _peak(), problem(nodes)
     gradient = law == "gradient"
     rule = GradientLaw(1e4, ResidualDamping(1.0)) if gradient else SensitivityLaw(MODES, 1e-3)

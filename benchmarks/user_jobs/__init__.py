@@ -1,5 +1,5 @@
-"""Jobs of users as whole processes: `livepde run` against a fit that the user would write.
+"""Jobs of users as whole processes: `livepde run` compared with a fit that a user would write.
 
-`data` makes the tables with a separate finite-volume code, and has the cases. `fits` has lean
-scripts that fit them. `report` times both and compares their estimates.
+`data` defines the cases, and simulates their tables with a separate finite-volume code. `fits`
+contains lean scripts that fit them. `report` times both, and compares their estimates.
 """

@@ -1,8 +1,8 @@
-"""Five jobs: a table of measurements by a finite-volume code, and the case that a user would write.
+"""Five jobs: a simulated table of measurements, and the case that a user would write.
 
-In one dimension the volumes are many and the integration in time is exact for inputs that are
-lines, or that hold, between two rows; in two dimensions it is Crank-Nicolson with substeps. Neither
-shares mesh, scheme or code with livepde or with the fits.
+Tables come from finite volumes on fine meshes. In one dimension, time integration is exact for
+inputs that are linear or constant between rows; in two dimensions, it is Crank-Nicolson with
+substeps. Neither shares mesh, scheme or code with livepde or with the fits.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ MEAN = 1.0e-5  # m^2/s, median of the field
 
 @dataclass(frozen=True)
 class Job:
-    """A job.
+    """Job of a user.
 
     Attributes
     ----------
     name, title
-        Its key, and what it is.
+        Key of the job, and description.
     table
-        Makes the table, from a random generator.
+        Random generator -> table.
     case
-        The case in TOML; its data are `data.csv`.
+        Case in TOML, which reads `data.csv`.
     truth
-        Label of an unknown -> its true value; empty for a field.
+        Label of an unknown -> true value; empty for a field.
     part, whole
-        Bounds of the cost over that of the fit: without imports and figure, and whole.
+        Bounds on the time relative to the fit: without imports and figure, and of whole processes.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Job:
     whole: float
 
     def write(self, folder: Path, rows: int | None = None) -> None:
-        """Write case and table, or the first rows of it, into a folder."""
+        """Write the case and its table, or only the table's first rows, into a folder."""
         folder.mkdir(parents=True, exist_ok=True)
         self.table(np.random.default_rng(SEED))[:rows].to_csv(folder / "data.csv", index=False)
         (folder / "case.toml").write_text(self.case)
@@ -66,7 +66,7 @@ class Job:
 
 
 def followed(A: Any, B: Any, C: Any, inputs: Any, h: float, u: Any, *, hold: bool = False) -> Any:
-    """Return C u at rows of inputs b that are h apart, for u' = A u + B b, exact in time."""
+    """Return C u at all rows of inputs b, with row spacing h, for the exact u' = A u + B b."""
     n, m = B.shape
     whole = np.zeros((n + 2 * m, n + 2 * m))
     whole[:n, :n], whole[:n, n : n + m] = A * h, B * h
@@ -81,7 +81,7 @@ def followed(A: Any, B: Any, C: Any, inputs: Any, h: float, u: Any, *, hold: boo
 
 
 def conduction(faces: Any, alpha: Any) -> tuple[Any, Any]:
-    """Return A and B of conduction between values at both ends; `alpha` in each volume."""
+    """Return A and B of conduction between given end values, for `alpha` of each volume."""
     width = np.diff(faces)
     resist = 0.5 * width / alpha
     between = 1.0 / np.concatenate([resist[:1], resist[:-1] + resist[1:], resist[-1:]])
@@ -93,13 +93,13 @@ def conduction(faces: Any, alpha: Any) -> tuple[Any, Any]:
 
 
 def at(faces: Any, places: Any) -> Any:
-    """Return the matrix that interpolates values of volumes at places."""
+    """Return the matrix that interpolates values of volumes to given positions."""
     centres = 0.5 * (faces[1:] + faces[:-1])
     return np.array([np.interp(places, centres, row) for row in np.eye(len(centres))]).T
 
 
 def rod(rng: np.random.Generator) -> pd.DataFrame:
-    """A rod with a loss to surroundings at 20 degC."""
+    """Simulate a rod with a heat loss to surroundings at 20 degC."""
     t = 10.0 * np.arange(4000)
     faces, places = np.linspace(0.0, 0.4, 201), [0.08, 0.16, 0.24, 0.32]
     A, B = conduction(faces, np.full(200, 2.0e-5))
@@ -117,7 +117,7 @@ def rod(rng: np.random.Generator) -> pd.DataFrame:
 
 
 def soil(rng: np.random.Generator) -> pd.DataFrame:
-    """Six layers of soil below a day's weather, and offsets of the sensors."""
+    """Simulate six layers of soil below varying weather, with offsets of the sensors."""
     hours = np.arange(2928)
     t, days = 3600.0 * hours, hours / 24.0
     weather = np.cumsum(rng.standard_normal(len(t))) * 0.15
@@ -137,12 +137,12 @@ def soil(rng: np.random.Generator) -> pd.DataFrame:
 
 
 def column(rng: np.random.Generator) -> pd.DataFrame:
-    """Three pulses of a tracer through a column."""
+    """Simulate three pulses of a tracer through a column."""
     minutes = np.arange(600) / 3.0
     faces = np.linspace(0.0, 20.0, 801)
     width, D, v = faces[1], 16.2, 27.0
     A, B = conduction(faces, np.full(800, D))
-    A[-1, -1] += B[-1, 1]  # nothing disperses out of the end
+    A[-1, -1] += B[-1, 1]  # no dispersion through the end
     A += np.diag(np.full(799, 0.5 * v / width), -1) - np.diag(np.full(799, 0.5 * v / width), 1)
     A[0, 0] -= 0.5 * v / width
     A[-1, -1] -= 0.5 * v / width
@@ -161,7 +161,7 @@ def column(rng: np.random.Generator) -> pd.DataFrame:
 
 
 def square(alpha: Any, ends: Any, h: float, sensors: Any, substeps: int = 3) -> Any:
-    """Return readings of a square between two sides with values; `alpha` of volumes, (n, n)."""
+    """Return readings of a square with two given sides, for `alpha` of volumes, shape (n, n)."""
     n = len(alpha)
     width = SIDE / n
     number = np.arange(n * n).reshape(n, n)  # first index along x
@@ -207,7 +207,7 @@ def _square_table(
 
 
 def plate(rng: np.random.Generator) -> pd.DataFrame:
-    """A plate whose four quarters differ."""
+    """Simulate a plate with four different quarters."""
     alpha = np.repeat(np.repeat(PLATE.reshape(2, 2), 60, axis=0), 60, axis=1)
     return _square_table(rng, alpha, 300, 200.0, PLATE_SENSORS)
 
@@ -219,7 +219,7 @@ def true_field(x: Any, y: Any) -> Any:
 
 
 def field(rng: np.random.Generator) -> pd.DataFrame:
-    """A square whose diffusivity is a smooth field."""
+    """Simulate a square with a smooth field as diffusivity."""
     centres = (np.arange(90) + 0.5) / 90
     alpha = true_field(centres[:, None], centres[None])
     return _square_table(rng, alpha, 100, 600.0, FIELD_SENSORS)

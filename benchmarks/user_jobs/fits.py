@@ -1,9 +1,9 @@
-"""The fit of each job as a user would write it: own matrices, sensitivities and SciPy.
+"""Fit of each job as a user would write it: own matrices and sensitivities, and SciPy.
 
 Usage: python -m benchmarks.user_jobs.fits JOB FOLDER
 
-Reads `data.csv` in the folder; prints the estimates and the processor seconds as JSON. Unknowns are
-logarithms, with the prior of the case; steps are Crank-Nicolson from row to row.
+Reads `data.csv` in the folder, and prints estimates and processor time in s as JSON. Unknowns are
+fitted as logarithms with the prior of the case; time steps are Crank-Nicolson from row to row.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from scipy.sparse.linalg import splu
 
 
 def log_prior(mean: Any, std: Any) -> tuple[Any, Any]:
-    """Return mean and standard deviation of the logarithm of a log-normal number."""
+    """Return mean and standard deviation of the logarithm of a log-normal unknown."""
     spread = np.sqrt(np.log1p((np.asarray(std) / np.asarray(mean)) ** 2))
     return np.log(mean) - 0.5 * spread**2, spread
 
 
 def fitted(simulate: Any, readings: Any, noise: float, mean: Any, spread: Any) -> Any:
-    """Return the most probable unknowns; `simulate` returns readings and derivatives by them."""
+    """Return the maximum a posteriori unknowns; `simulate` returns readings and derivatives."""
     known = np.isfinite(readings)
 
     def both(xi: Any) -> tuple[Any, Any]:
@@ -48,17 +48,17 @@ def fitted(simulate: Any, readings: Any, noise: float, mean: Any, spread: Any) -
     def slopes(xi: Any) -> Any:
         return both(xi)[1]
 
-    found = least_squares(residuals, np.zeros(len(mean)), slopes, method="lm", xtol=1e-6)
-    return mean + spread * found.x
+    minimum = least_squares(residuals, np.zeros(len(mean)), slopes, method="lm", xtol=1e-6)
+    return mean + spread * minimum.x
 
 
-# --- intervals: dense matrices, which are the fastest below some hundred nodes -------------------
+# --- intervals: dense matrices, the fastest option below a few hundred nodes ---------------------
 
 
 def along(K: Any, B: Any, Ks: Any, Bs: Any, C: Any, means: Any, h: float, u: Any) -> Any:
-    """Return C u and its derivatives at all rows, for u' = -K u + B b and its parts.
+    """Return C u and its derivatives at all rows, for u' = -K u + B b.
 
-    `means` are those of b between two rows; `Ks` and `Bs` the derivatives of K and B.
+    `means` are means of b between two rows; `Ks` and `Bs` are the derivatives of K and B.
     """
     n, p = len(K), len(Ks)
     P = np.linalg.inv(np.eye(n) + 0.5 * h * K)
@@ -86,7 +86,7 @@ def middle(inputs: Any) -> Any:
 
 
 def conduction(x: Any, alpha: Any) -> tuple[Any, Any]:
-    """Return K and B of conduction on inner nodes, between two given ends; `alpha` in cells."""
+    """Return K and B of conduction on inner nodes with given ends, for `alpha` of each cell."""
     flow = alpha / np.diff(x)
     width = 0.5 * (x[2:] - x[:-2])
     K = np.diag((flow[1:] + flow[:-1]) / width)
@@ -97,12 +97,12 @@ def conduction(x: Any, alpha: Any) -> tuple[Any, Any]:
 
 
 def nodes_at(x: Any, places: Any) -> Any:
-    """Return the matrix that takes inner nodes at places."""
+    """Return the matrix that selects the inner nodes at given positions."""
     return (np.abs(x[None, 1:-1] - np.asarray(places)[:, None]) < 1e-9).astype(float)
 
 
 def rod(table: pd.DataFrame) -> dict[str, float]:
-    """Return diffusivity and loss."""
+    """Fit diffusivity and loss."""
     x = np.linspace(0.0, 0.4, 41)
     ends = table[["left", "right"]].to_numpy()
     means = np.column_stack([middle(ends), np.full(len(ends) - 1, 20.0)])
@@ -129,7 +129,7 @@ def _first(table: pd.DataFrame) -> list[float]:
 
 
 def soil(table: pd.DataFrame) -> dict[str, float]:
-    """Return the diffusivities; offsets are unknown, too."""
+    """Fit diffusivities and offsets, and return the diffusivities."""
     x = np.linspace(0.05, 0.60, 56)
     layer = np.searchsorted([0.10, 0.20, 0.30, 0.40, 0.50], 0.5 * (x[1:] + x[:-1]))
     parts = [conduction(x, (layer == j).astype(float)) for j in range(6)]
@@ -153,15 +153,15 @@ def soil(table: pd.DataFrame) -> dict[str, float]:
 
 
 def column(table: pd.DataFrame) -> dict[str, float]:
-    """Return dispersion and velocity."""
+    """Fit dispersion and velocity."""
     x = np.linspace(0.0, 20.0, 101)
     KD, BD = conduction(x, np.ones(100))
-    KD[-1, -1] -= BD[-1, 1]  # nothing disperses out of the end
+    KD[-1, -1] -= BD[-1, 1]  # no dispersion through the end
     KV = (np.diag(np.ones(98), 1) - np.diag(np.ones(98), -1)) / (2.0 * x[1])
     KV[-1, -1] += 1.0 / (2.0 * x[1])
     BD, BV = BD[:, :1], np.zeros((99, 1))
     BV[0] = 1.0 / (2.0 * x[1])
-    means = table[["c_in"]].to_numpy()[:-1]  # each value holds
+    means = table[["c_in"]].to_numpy()[:-1]  # piecewise constant
     C = nodes_at(x, [8.0, 16.0])
 
     def simulate(theta: Any) -> Any:
@@ -178,7 +178,7 @@ def column(table: pd.DataFrame) -> dict[str, float]:
 
 
 class Square:
-    """Bilinear conductances on n x n nodes between two given sides; first index along x."""
+    """Bilinear elements on n x n nodes with two given sides, as conductances; x index first."""
 
     def __init__(self, n: int, sensors: Any, table: pd.DataFrame) -> None:
         number = np.arange(n * n).reshape(n, n)
@@ -191,7 +191,7 @@ class Square:
         rows = np.tile(np.arange(count), 2)
         signs = np.repeat([-1.0, 1.0], count)
         D = sp.csr_array((signs, (rows, np.concatenate([begin, end]))), (count, n * n))
-        # Each cell gives half of its conductance to each of its edges.
+        # Each edge receives half of the conductance of each adjacent cell.
         along_x = np.arange((n - 1) * n).reshape(n - 1, n)
         along_y = (n - 1) * n + np.arange(n * (n - 1)).reshape(n, n - 1)
         of = [along_x[:, :-1], along_x[:, 1:], along_y[:-1], along_y[1:]]
@@ -208,13 +208,13 @@ class Square:
         sides = np.zeros((n * n, 2))
         sides[number[0], 0] = sides[number[-1], 1] = 1.0
         means = middle(table[["left", "right"]].to_numpy())
-        self.given = (D @ sides) @ means.T  # differences along edges that the sides make
+        self.given = (D @ sides) @ means.T  # differences along edges due to the given sides
         self.C = sp.csr_array(_bilinear(np.linspace(0.0, 1.0, n), sensors)[:, inner])
         names = [f"T{k + 1}" for k in range(len(sensors))]
         self.readings, self.start = table[names].to_numpy(), np.full(len(inner), 20.0)
 
     def factor(self, flow: Any) -> tuple[Any, Any]:
-        """Return the solver of a step and K, for the conductance of each edge."""
+        """Return the solver of a step, and K, for the conductances of edges."""
         K = self.D.T @ (sp.diags_array(flow) @ self.D)
         left = sp.diags_array(self.mass / self.h) + 0.5 * K
         options = {"SymmetricMode": True}
@@ -228,7 +228,7 @@ def _bilinear(x: Any, points: Any) -> Any:
 
 
 def plate(table: pd.DataFrame) -> dict[str, float]:
-    """Return the diffusivities of the quarters."""
+    """Fit the diffusivities of the quarters."""
     square = Square(101, [(0.2, 0.3), (0.3, 0.7), (0.6, 0.2), (0.7, 0.8), (0.8, 0.4)], table)
     half = np.arange(100) >= 50
     quarter = (2 * half[:, None] + half[None]).ravel()
@@ -257,7 +257,7 @@ def plate(table: pd.DataFrame) -> dict[str, float]:
 
 
 def field(table: pd.DataFrame) -> dict[str, float]:
-    """L-BFGS with an adjoint, on 14 x 14 values with a covariance; no standard deviations."""
+    """Fit 14 x 14 values with a prior covariance by L-BFGS and an adjoint, without deviations."""
     places = [(x, y) for x in np.arange(1, 6) / 6 for y in np.arange(1, 6) / 6]
     square, x = Square(57, places, table), np.linspace(0.0, 1.0, 14)
     centres = (np.arange(56) + 0.5) / 56

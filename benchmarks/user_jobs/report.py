@@ -1,4 +1,4 @@
-"""Processor times and errors of `livepde run` and of the fits, as whole processes."""
+"""Processor times and errors of `livepde run` and of the fits as whole processes."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from livepde.diagnostics.check_report import Check, Table
 from livepde.runs import Outcome
 
 QUICK = ("rod", "column")
-FEW = 12  # rows of a run that has imports, figure and report, and little else
-WORSE = 1.2  # error over that of the fit at most
+FEW = 12  # rows of a run whose time consists mainly of imports, figure and report
+WORSE = 1.2  # largest error over the error of the fit
 
 
 class Timed(NamedTuple):
-    """Processor seconds of a whole process, and of what it computes.
+    """Processor time of a whole process, and of its computation, in s.
 
-    Of livepde without those of a run with few rows, of the fit as it counts them itself.
+    For livepde, the time of a run with few rows is subtracted; the fit measures its own part.
     """
 
     whole: float
@@ -39,11 +39,11 @@ class Timed(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """Relative errors of livepde and of the fit, and what the estimates are apart."""
+    """Relative errors of livepde and of the fit, and difference of their estimates."""
 
     own: float
     fit: float
-    apart: float  # standard deviations; NaN for a field
+    apart: float  # largest difference in standard deviations; NaN for a field
 
 
 def user_jobs(names: Sequence[str] = (), rounds: int = 3) -> Outcome:
@@ -52,9 +52,9 @@ def user_jobs(names: Sequence[str] = (), rounds: int = 3) -> Outcome:
     Parameters
     ----------
     names
-        Jobs, default all.
+        Names of jobs; default all.
     rounds
-        Runs of each, of which the medians are reported.
+        Number of runs of each, whose medians are reported.
     """
     rows, checks = [], []
     for job in JOBS:
@@ -73,29 +73,29 @@ def user_jobs(names: Sequence[str] = (), rounds: int = 3) -> Outcome:
         ]
     head = ("job", "livepde, s", "fit, s", "ratio", "whole", "error", "of the fit", "apart")
     notes = [
-        f"Processor times with one thread, medians of {rounds} rounds. 'ratio' leaves out imports, "
-        f"of livepde what a run of {FEW} rows costs. 'whole' is that of whole processes, with "
-        "verdict, intervals, "
-        "journal, report and figure, which the fit has not; the fit of the field has no standard "
-        "deviations. 'apart' is the largest difference of the estimates, in standard deviations."
+        f"Processor times with one thread, medians of {rounds} rounds. ratio: without imports, and "
+        f"for livepde without the time of a run of {FEW} rows. whole: ratio of whole processes; "
+        "only livepde computes verdict, intervals, journal, report and figure. The fit of the "
+        "field has no standard deviations. apart: largest difference of the estimates, in standard "
+        "deviations."
     ]
     return Outcome(tables=[Table("Jobs of users", head, rows)], checks=checks, notes=notes)
 
 
 def _measured(job: Job, folder: Path, rounds: int) -> tuple[list[tuple[Timed, Timed]], Compared]:
-    """Return the times of livepde and of the fit in each round, and their estimates compared."""
+    """Return the times of livepde and of the fit in each round, and the errors of both."""
     job.write(folder / "all")
     job.write(folder / "few", FEW)
     times, cache = [], folder / "bytecode"
     fit = ["benchmarks.user_jobs.fits", job.name, f"{folder}/all"]
-    _livepde(folder, "few", "first", cache)  # these compile the modules
+    _livepde(folder, "few", "first", cache)  # the first runs write the bytecode
     _run(fit, cache)
     for number in range(rounds):
         own, few = (_livepde(folder, part, number, cache) for part in ("all", "few"))
         whole, printed = _run(fit, cache)
-        found = json.loads(printed)
-        times.append((Timed(own[0], own[0] - few[0]), Timed(whole, found["seconds"])))
-    return times, _compared(job, folder / "all0", found["estimates"])
+        result = json.loads(printed)
+        times.append((Timed(own[0], own[0] - few[0]), Timed(whole, result["seconds"])))
+    return times, _compared(job, folder / "all0", result["estimates"])
 
 
 def _livepde(folder: Path, part: str, number: int | str, cache: Path) -> tuple[float, str]:
@@ -104,7 +104,7 @@ def _livepde(folder: Path, part: str, number: int | str, cache: Path) -> tuple[f
 
 
 def _run(command: Sequence[str], cache: Path) -> tuple[float, str]:
-    """Return the processor seconds of a module that runs as a process, and its output."""
+    """Run a module as a process, and return its processor time in s and its output."""
     given = usual_environment(cache) | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     before = os.times()
     done = subprocess.run(
@@ -122,27 +122,27 @@ def _run(command: Sequence[str], cache: Path) -> tuple[float, str]:
 
 
 def _compared(job: Job, folder: Path, estimates: dict[str, float]) -> Compared:
-    found = runs.open(folder).dataset
+    data = runs.open(folder).dataset
     if not job.truth:
-        return _fields(found, estimates)
-    found = found.isel(time=-1)
+        return _fields(data, estimates)
+    last = data.isel(time=-1)
     labels = list(job.truth)
-    own = np.array([float(found[label]) for label in labels])
-    std = np.array([float(found[f"{label}_std"]) for label in labels])
+    own = np.array([float(last[label]) for label in labels])
+    std = np.array([float(last[f"{label}_std"]) for label in labels])
     fit, true = (np.array([each[label] for label in labels]) for each in (estimates, job.truth))
     apart = float(np.abs((own - fit) / std).max())
     return Compared(_error(own, true), _error(fit, true), apart)
 
 
-def _fields(found: xr.Dataset, estimates: dict[str, float]) -> Compared:
-    """Compare fields at the points of the fit's grid, as relative root mean squares."""
+def _fields(data: xr.Dataset, estimates: dict[str, float]) -> Compared:
+    """Return the relative errors of both fields at the points of the fit's grid."""
     points = np.array([list(map(float, place.split())) for place in estimates])
-    vertices = np.column_stack([found["x"], found["y"]])
-    own = griddata(vertices, np.asarray(found["alpha"])[-1], points)
+    vertices = np.column_stack([data["x"], data["y"]])
+    own = griddata(vertices, np.asarray(data["alpha"])[-1], points)
     fit, true = np.array(list(estimates.values())), true_field(*points.T)
     return Compared(_error(own, true), _error(fit, true), math.nan)
 
 
-def _error(found: np.ndarray, true: np.ndarray) -> float:
-    """Return a root mean square of relative errors."""
-    return float(np.sqrt(((found / true - 1.0) ** 2).mean()))
+def _error(values: np.ndarray, true: np.ndarray) -> float:
+    """Return the root mean square of the relative errors."""
+    return float(np.sqrt(((values / true - 1.0) ** 2).mean()))

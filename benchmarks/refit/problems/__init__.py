@@ -1,4 +1,4 @@
-"""The problems, by name."""
+"""Problems of the benchmark by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A tracer that is washed out of a column of soil; the truth is the analytic solution."""
+"""Tracer that is washed out of a soil column; the truth is the analytic solution."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SENSOR = 11.0
 
 
 class Column(Problem):
-    """c_t = D c_xx - v c_x from c = 1, with water of c = 0 that flows in."""
+    """c_t = D c_xx - v c_x with c = 1 initially and an inflow of c = 0."""
 
     title = "advection and dispersion in a column"
     unknowns: Mapping[str, Unknown] = MappingProxyType({"D": Unknown(0.0357), "v": Unknown(0.258)})
@@ -33,7 +33,7 @@ class Column(Problem):
     noise = 0.01
     times = np.append(0.0, 28.0 + 0.75 * np.arange(60))
     longest = 0.75
-    # Reported by a user: a fit from there ended in a plateau.
+    # A user reported that a fit from this prior stopped at a plateau.
     REPORTED: tuple[Priors, ...] = (
         {"D": Belief(0.1, 0.1), "v": Belief(0.7, 0.5)},
         {"D": Belief(0.01, 0.01), "v": Belief(0.1, 0.1)},
@@ -85,7 +85,7 @@ class Column(Problem):
 
 
 def _risen(x: float, t: Array, D: float, v: float) -> Array:
-    """Return c at x of a step of the inflow, third type (van Genuchten and Alves 1982)."""
+    """Return c at x after a step of the inflow, third-type inlet (van Genuchten and Alves 1982)."""
     near, far = (x - v * t) / (2 * np.sqrt(D * t)), (x + v * t) / (2 * np.sqrt(D * t))
     bell = np.exp(-(near**2))
     return np.asarray(
@@ -96,7 +96,7 @@ def _risen(x: float, t: Array, D: float, v: float) -> Array:
 
 
 class OffsetColumn(Column):
-    """The same with a sensor whose offset is not known."""
+    """Column with an unknown offset of the sensor."""
 
     title = "column with an unknown offset of the sensor"
     unknowns = MappingProxyType(
@@ -116,7 +116,7 @@ class OffsetColumn(Column):
 
 
 class Few(Column):
-    """The column with 2 to 8 samples, as the seed says."""
+    """Column with 2 to 8 samples, depending on the seed."""
 
     title = "column, 2 to 8 samples only"
 

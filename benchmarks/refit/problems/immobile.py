@@ -1,4 +1,4 @@
-"""A tracer in a soil whose water partly stands still; the truth is finite volumes."""
+"""Tracer in soil with mobile and immobile water; the truth uses finite volumes."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from benchmarks.refit.unknowns import Unknown
 Array = NDArray[Any]
 CELLS, FINE = 40, 200
 DEPTH = 20.0  # cm
-V = 0.5  # cm/h, mean pore velocity: known
+V = 0.5  # cm/h, known mean pore velocity
 
 
 class Immobile(Problem):
-    """Mobile water c and immobile water s, washed out from c = s = 1.
+    """Concentrations c in mobile and s in immobile water, washed out from c = s = 1.
 
     phi c_t = phi D c_xx - v c_x - omega (c - s),    (1 - phi) s_t = omega (c - s)
     """
@@ -47,8 +47,8 @@ class Immobile(Problem):
     def truth(self) -> Array:
         D, phi, omega = self.q_true
         h, one = DEPTH / FINE, np.eye(FINE)
-        # Flux through the faces, per volume of mobile water; no tracer enters on the left, and what
-        # leaves on the right goes with the water.
+        # Fluxes through the faces, per volume of mobile water. No tracer enters on the left; on the
+        # right it leaves by advection.
         inner = (one[1:] + one[:-1]) * (0.5 * V / phi) - (one[1:] - one[:-1]) * (D / h)
         flux = np.vstack([0.0 * one[:1], inner, one[-1:] * (V / phi)])
         exchange = omega * one
@@ -58,7 +58,7 @@ class Immobile(Problem):
                 [exchange / (1 - phi), -exchange / (1 - phi)],
             ]
         )
-        # Volumes are known at their midpoints.
+        # Values of volumes are at their midpoints.
         at = np.array(list(self.points.values()))
         seen = interpolation(at, FINE - 1, 0.5 * h, DEPTH - 0.5 * h)
         C = np.hstack([seen, 0.0 * seen])
@@ -93,7 +93,7 @@ class Immobile(Problem):
         M, nodes = mass(CELLS, h), np.eye(2)
 
         def both(matrix: Any, block: Any) -> sp.csr_array:
-            # c and s of a node are neighbours, so that bands stay narrow.
+            # c and s of a node are adjacent, so that the bandwidth is small.
             return sp.csr_array(sp.kron(matrix, np.array(block)))
 
         points: Mapping[str, float] = self.points

@@ -1,4 +1,4 @@
-"""Soil of three layers under model error: a sensor is off and the noise is correlated."""
+"""Soil of three layers with model errors: a misplaced sensor and correlated noise."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from benchmarks.refit.unknowns import Belief, Unknown
 Array = NDArray[Any]
 CELLS, FINE = 40, 200
 DEPTH = 0.5  # m
-ENDS = (0.1, 0.25)  # of the upper two layers
+ENDS = (0.1, 0.25)  # m, lower ends of the upper two layers
 NAMES = ("a_1", "a_2", "a_3")  # m^2/h
-OFF = 0.01  # m that the second sensor is deeper than stated
+OFF = 0.01  # m, true depth of the second sensor minus its configured depth
 RHO = 0.3  # correlation of successive errors
 
 
 class Layers(Problem):
     """u_t = (a(x) u_x)_x between two measured temperatures; each sensor has an unknown offset."""
 
-    title = "soil of three layers with offsets, under model error"
+    title = "soil of three layers with offsets and model errors"
     points = MappingProxyType({"T_5": 0.05, "T_15": 0.15, "T_25": 0.25, "T_35": 0.35})
     noise = 0.1
     times = np.arange(0.0, 73.0)

@@ -1,4 +1,4 @@
-"""A conductivity k(x) in 14 modes; the truth is finite volumes."""
+"""Conductivity k(x) in 14 modes; the truth uses finite volumes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from benchmarks.refit.unknowns import Coordinates, Unknown
 Array = NDArray[Any]
 CELLS, FINE = 40, 160
 MODES = 14
-CORRELATED = 0.3  # length over which k is correlated
+CORRELATED = 0.3  # correlation length of k
 
 
 class Profile(Problem):
@@ -70,11 +70,11 @@ class Profile(Problem):
 
     @cached_property
     def _modes(self) -> Array:
-        """Leading modes of the prior with standard deviation one, shape (nodes, modes)."""
+        """Leading modes of a prior with standard deviation 1, shape (nodes, modes)."""
         h = 1.0 / CELLS
         M, L = mass(CELLS, h).toarray(), stiffness(CELLS, h).toarray()
         L = M + CORRELATED**2 * L
-        # Whittle and Matern: |L q|^2 over 4 lengths has the pointwise standard deviation one.
+        # Whittle-Matern field: |L q|^2 over 4 lengths gives a pointwise standard deviation of 1.
         G = L @ np.linalg.solve(M, L) / (4.0 * CORRELATED)
         values, modes = sla.eigh(M, G)
         return np.asarray(modes[:, np.argsort(-values)[:MODES]])
@@ -103,6 +103,6 @@ class Profile(Problem):
         )
 
     def theta(self, q: Array) -> tuple[Array, Array]:
-        # Each cell has the mean of k at its ends.
+        # k of a cell is the mean of its end values.
         mean = 0.5 * (np.eye(CELLS, CELLS + 1) + np.eye(CELLS, CELLS + 1, 1))
         return mean @ q, mean

@@ -1,4 +1,4 @@
-"""A heated rod whose unknowns act almost alike, and a square that cools; truths are series."""
+"""Heated rod with nearly collinear unknowns, and cooling square; truths are series."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SINES = 399
 
 
 class Collinear(Problem):
-    """u_t = k u_xx - h u + p with u = 0 at both ends, seen close to its steady state."""
+    """u_t = k u_xx - h u + p with u = 0 at both ends, observed close to its steady state."""
 
     title = "three nearly collinear unknowns"
     unknowns = MappingProxyType({"k": Unknown(0.1), "h": Unknown(0.8), "p": Unknown(2.0)})
@@ -71,9 +71,9 @@ class Collinear(Problem):
 
 
 class Plate(Problem):
-    """u_t = kx u_xx + ky u_yy - loss u on a square, without flux at its sides."""
+    """u_t = kx u_xx + ky u_yy - loss u on a square with zero flux at its sides."""
 
-    title = "a square that cools: two conductivities and a loss"
+    title = "cooling square: two conductivities and a loss"
     unknowns = MappingProxyType({"kx": Unknown(0.05), "ky": Unknown(0.02), "loss": Unknown(0.3)})
     points = MappingProxyType(
         {
@@ -86,7 +86,7 @@ class Plate(Problem):
     )
     noise = 0.02
     times = np.linspace(0.0, 5.0, 41)
-    # Amplitudes of cos(i pi x) cos(j pi y) at the start.
+    # Initial amplitudes of cos(i pi x) cos(j pi y).
     WAVES = MappingProxyType(
         {(0, 0): 1.0, (1, 0): 0.8, (0, 1): 0.6, (1, 1): 0.5, (2, 0): 0.4, (0, 2): 0.4}
     )
@@ -121,7 +121,7 @@ class Plate(Problem):
 
     @staticmethod
     def _wave(i: int) -> Array:
-        # livepde projects with a rule that is exact for the mass matrix of such elements.
+        # livepde projects with a quadrature that is exact for the mass matrix of these elements.
         return projected(lambda x: np.cos(i * np.pi * x), SIDE, 1.0, points=3)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Nonlinear processes: a population that grows and spreads, and a wave that steepens."""
+"""Nonlinear processes: a growing and spreading population, and a steepening wave."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ def _two(q: Array) -> tuple[Array, Array]:
 
 
 class Source(Problem):
-    """u_t = D u_xx + r u (1 - u) without flux at the ends."""
+    """u_t = D u_xx + r u (1 - u) with zero flux at the ends."""
 
-    title = "a nonlinear source, r u (1 - u)"
+    title = "nonlinear source r u (1 - u)"
     unknowns = MappingProxyType({"D": Unknown(0.02), "r": Unknown(1.0)})
     points = MappingProxyType({"u_1": 0.2, "u_2": 0.6, "u_3": 1.0, "u_4": 1.5})
     noise = 0.02
@@ -92,8 +92,8 @@ class Burgers(Problem):
     points = MappingProxyType({"u_1": 0.2, "u_2": 0.45, "u_3": 0.7, "u_4": 0.9})
     noise = 0.01
     times = np.linspace(0.0, 1.5, 61)
-    WAVES = (1.0, 0.5)  # amplitudes of sin(j pi x) at the start
-    POINTS, COSINES = 4000, 60  # of the integrals of the truth
+    WAVES = (1.0, 0.5)  # initial amplitudes of sin(j pi x)
+    POINTS, COSINES = 4000, 60  # quadrature points and cosines of the truth
 
     @property
     def u0(self) -> Any:
