@@ -18,9 +18,9 @@ from benchmarks.offline import Fit, Trajectory, fit
 from benchmarks.problems import PROBLEMS, Data, Problem
 from benchmarks.scoring import (
     Contender,
-    Found,
     Judge,
     Known,
+    Results,
     Score,
     error_ratio,
     measured,
@@ -152,13 +152,13 @@ def _fitted(data: Data) -> Fit:
 
 def _all_data(data: Data) -> Score:
     """Return the score of the offline fit; its time is divided by the number of samples."""
-    found, judge = _fitted(data), Judge(data)
-    error, covered = judge.judged((k, found.q[k], found.factor(k)) for k in judge.scored)
+    fitted, judge = _fitted(data), Judge(data)
+    error, covered = judge.judged((k, fitted.q[k], fitted.factor(k)) for k in judge.scored)
     if data.process.hidden is not None:
-        error = _hidden(data, data.process.hidden - found.hidden)
-    cut = "" if found.converged else ", cut off"
-    note = f"{found.evaluations} runs over {len(data)} samples{cut}"
-    return Score(error, covered, found.seconds / len(data) / data.forward, note=note)
+        error = _hidden(data, data.process.hidden - fitted.hidden)
+    cut = "" if fitted.converged else ", cut off"
+    note = f"{fitted.evaluations} runs over {len(data)} samples{cut}"
+    return Score(error, covered, fitted.seconds / len(data) / data.forward, note=note)
 
 
 def _each_sample(data: Data) -> Score:
@@ -168,14 +168,14 @@ def _each_sample(data: Data) -> Score:
     samples so far, on average half of `SAMPLES`. If the number of unknowns grows with the samples,
     it is a third, since later runs have more unknowns.
     """
-    found, judge = _fitted(data), Judge(data)
-    run = found.seconds / found.evaluations / len(data) * SAMPLES
+    fitted, judge = _fitted(data), Judge(data)
+    run = fitted.seconds / fitted.evaluations / len(data) * SAMPLES
     cost = run / data.forward * (1 / 3 if data.problem.varying else 1 / 2)
 
     def fits() -> Iterator[tuple[int, Array, Array | None]]:
         start = None
         for at in judge.scored:
-            now = found if at == len(data) - 1 else fit(data.until(at), start)
+            now = fitted if at == len(data) - 1 else fit(data.until(at), start)
             start = now.coordinates
             yield at, now.q[at], now.factor(at)
 
@@ -218,7 +218,7 @@ def accuracy(
     progress
         Show a bar on standard error.
     """
-    found: Found = {}
+    results: Results = {}
     notes = []
     jobs = [
         (problem, level, seed)
@@ -231,9 +231,9 @@ def accuracy(
             notes.append(scores)
             continue
         for name, score in scores.items():
-            found.setdefault((problem.name, level, name), []).append(score)
-    tables = table_of(found, limit=EACH_SAMPLE)
-    return Outcome(tables=tables, checks=_checks(found), notes=[*dict.fromkeys(notes), *NOTES])
+            results.setdefault((problem.name, level, name), []).append(score)
+    tables = table_of(results, limit=EACH_SAMPLE)
+    return Outcome(tables=tables, checks=_checks(results), notes=[*dict.fromkeys(notes), *NOTES])
 
 
 def _scores(problem: Problem, level: float | None, seed: int) -> dict[str, Score] | str:
@@ -242,18 +242,18 @@ def _scores(problem: Problem, level: float | None, seed: int) -> dict[str, Score
         data = problem.data(level, seed)
     except (LivepdeError, StepFailed) as error:
         return f"{problem.name}: not run, {error}"
-    found = {name: scored(contender, data) for name, contender in ROWS.items()}
-    return {name: score for name, score in found.items() if score is not None}
+    results = {name: scored(contender, data) for name, contender in ROWS.items()}
+    return {name: score for name, score in results.items() if score is not None}
 
 
-def _checks(found: Found) -> list[Check]:
+def _checks(results: Results) -> list[Check]:
     """Return the checks: error ratios at each noise level, and cost ratios for each problem."""
     checks = []
-    for problem, level, row in found:
+    for problem, level, row in results:
         if row != PROMISED or level is None:
             continue
-        error = error_ratio(found, (problem, level), PROMISED, EACH_SAMPLE)
-        time = step_ratio(found, (problem, level), PROMISED, EACH_SAMPLE)
+        error = error_ratio(results, (problem, level), PROMISED, EACH_SAMPLE)
+        time = step_ratio(results, (problem, level), PROMISED, EACH_SAMPLE)
         name = f"{problem}, {level:.0%} noise: {{}} of '{PROMISED}' over '{EACH_SAMPLE}'"
         checks.append(Check(name.format("error"), error, LARGEST_ERROR, "<="))
         checks.append(Check(name.format("time"), time, LARGEST_TIME, "<="))

@@ -264,7 +264,7 @@ def followed(process: Process, seed: int, change: float = 0.0, samples: int = 0)
     truth = ((1.0 + change) * data.q)[process.where]
     belief, latent = identifier._latent_belief(), process.model.latent
     error = latent.value(belief.q)[process.where] / truth - 1.0
-    # Intervals are those of the latent coefficients: a transform maps their ends.
+    # Coverage in latent coefficients is equivalent, since transforms map the ends of intervals.
     std = np.asarray(belief.q_std, dtype=float)
     exact = latent.inverse((1.0 + change) * data.q)
     inside = np.abs(belief.q - exact) <= NORMAL_95 * std

@@ -6,7 +6,7 @@ q relative to the error of q = 0. With exact data, the error is compared with th
 a grid of constant gains and c_1. The cost is measured on the processes of
 `python -m benchmarks step`, in steps of the forward model.
 
-Reactions on partial data are those of `benchmarks.partial`.
+`benchmarks.partial` provides the reactions on partial data.
 """
 
 from __future__ import annotations
@@ -133,12 +133,12 @@ def auto(
         square = Square.of(size)
         best, name = _best(square)
         for level in LEVELS:
-            found = [
+            courses = [
                 square.follow(GradientLaw(gain="auto"), square.noisy(level, seed))
                 for seed in range(seeds if level else 1)
             ]
-            worst, last = max(c.worst for c in found), [c.last for c in found]
-            failed = sum(c.failed for c in found)
+            worst, last = max(c.worst for c in courses), [c.last for c in courses]
+            failed = sum(c.failed for c in courses)
             rows.append((square.model.X.dim, level, min(last), max(last), worst, failed, name))
             label = f"{square.model.X.dim} nodes, noise {level:g}"
             checks.append(Check(f"{label}: largest error with status ok", worst, WORST, "<="))
@@ -163,11 +163,11 @@ def auto(
 
 def _best(square: Square) -> tuple[float, str]:
     """Return the smallest error of constant gains with exact data, and a description of it."""
-    found = []
+    errors = []
     for gain, c1 in product(GAINS, DAMPINGS):
         course = square.follow(GradientLaw(gain, ResidualDamping(c1)), square.samples)
-        found.append((course.last, f"{course.last:.3g}: {gain:g}, c1 {c1:g}"))
-    return min(found)
+        errors.append((course.last, f"{course.last:.3g}: {gain:g}, c1 {c1:g}"))
+    return min(errors)
 
 
 def _costs(sizes: Sequence[int]) -> tuple[Table, list[Check]]:

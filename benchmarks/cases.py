@@ -156,9 +156,9 @@ def find_cases(folder: Path | None = None) -> list[Path]:
     here = Path.cwd()
     folders = [folder] if folder else [base / "cases" for base in (here, *here.parents)]
     for place in folders:
-        found = sorted(place.glob("*.toml"))
-        if found:
-            return found
+        paths = sorted(place.glob("*.toml"))
+        if paths:
+            return paths
     raise CaseError(
         f"{folder or here}: there are no case files (*.toml) here"
         + ("." if folder else ", nor in 'cases' here or in a parent folder. Add --folder DIR.")
@@ -203,8 +203,8 @@ def bench_cases(
     # Workers start with a new interpreter, so that they inherit no threads from this process.
     with ProcessPoolExecutor(WORKERS, get_context("spawn"), _one_thread) as pool:
         order, failed = _jobs(paths, pictures, variants, compared)
-        found = _collect(pool, order, progress)
-    runs = [(job, _mean(several)) for job, several in _grouped(found)] + failed
+        done = _collect(pool, order, progress)
+    runs = [(job, _mean(several)) for job, several in _grouped(done)] + failed
     runs.sort(key=lambda item: [path.name for path in paths].index(item[0].path.name))
     checks = [check for job, run in runs for check in _checks(job, run)]
     notes = [f"{job.label}: {run.error}" for job, run in runs if run.error]
@@ -389,10 +389,10 @@ def _paired(prepared: Prepared) -> tuple[xr.Dataset, xr.Dataset, float]:
 # --- report --------------------------------------------------------------------------------------
 
 
-def _grouped(found: Sequence[tuple[Job, Run]]) -> Iterator[tuple[Job, list[Run]]]:
+def _grouped(done: Sequence[tuple[Job, Run]]) -> Iterator[tuple[Job, list[Run]]]:
     """Yield the first job of each case and variant, with the runs of all seeds."""
     groups: dict[tuple[Path, str], list[tuple[Job, Run]]] = {}
-    for job, run in found:
+    for job, run in done:
         groups.setdefault((job.path, job.variant), []).append((job, run))
     for pairs in groups.values():
         yield pairs[0][0], [run for _, run in pairs]

@@ -115,7 +115,7 @@ class Program:
 
         def add(function: Measurement) -> Measurement:
             parameters = inspect.signature(function, eval_str=True).parameters
-            counts = {key: found for key, item in parameters.items() if (found := _count(item))}
+            counts = {key: count for key, item in parameters.items() if (count := _count(item))}
 
             def run(context: typer.Context, **given: Any) -> None:
                 shared = {key: given.pop(key, None) for key in ("quick", "as_json", "out")}

@@ -99,8 +99,8 @@ class Problem:
 
         def flux(q: Any, u: Any, v: Any, x: Any) -> Any:
             share = 1.0 - contrast * (x[0] > 0.5)
-            found = share * q.a * dot(grad(u), grad(v))
-            return found + q.b * (u - 2.0) * v if "b" in self.unknowns else found
+            form = share * q.a * dot(grad(u), grad(v))
+            return form + q.b * (u - 2.0) * v if "b" in self.unknowns else form
 
         ends: dict[str, Any] = {"left": lambda x, t: 5.0 * np.sin(t) + 0.0 * x[0], "right": 0.0}
         return Model(
@@ -123,7 +123,7 @@ def _between(low: float, high: float) -> Callable[[np.random.Generator], float]:
 
 PROBLEMS: Mapping[str, Problem] = {
     "two numbers": Problem("diffusivity and heat loss", {"a": A, "b": B}),
-    "short run": Problem("the same, from 20 samples", {"a": A, "b": B}, samples=20),
+    "short run": Problem("diffusivity and heat loss, 20 samples", {"a": A, "b": B}, samples=20),
     "field": Problem(
         "diffusivity a(x), positive",
         {"a": PROFILE},
@@ -131,24 +131,24 @@ PROBLEMS: Mapping[str, Problem] = {
         SPREAD,
     ),
     "field, few modes": Problem(
-        "the same with 6 modes", {"a": PROFILE}, SensitivityLaw(modes=6), SPREAD
+        "diffusivity a(x), 6 modes", {"a": PROFILE}, SensitivityLaw(modes=6), SPREAD
     ),
     "field, seen in part": Problem(
-        "the same, seen from 0.1 to 0.4",
+        "diffusivity a(x), sensors from 0.1 to 0.4",
         {"a": PROFILE},
         SensitivityLaw(modes="auto"),
         (0.1, 0.175, 0.25, 0.325, 0.4),
     ),
     "random walk": Problem(
-        "diffusivity that changes",
+        "diffusivity that moves",
         {"a": Scalar(LogNormal(0.3, 0.06), evolution=RandomWalk(0.1))},
         SensitivityLaw(),
     ),
     "missing loss": Problem(
-        "diffusivity; a heat loss is missing in the model", {"a": A}, loss=_between(0.003, 1.0)
+        "diffusivity; the model lacks a heat loss", {"a": A}, loss=_between(0.003, 1.0)
     ),
     "missing layer": Problem(
-        "diffusivity of the heated half; that the other differs is missing in the model",
+        "diffusivity of the heated half; the model lacks the other half's",
         {"a": A},
         contrast=_between(0.003, 0.9),
     ),
@@ -182,11 +182,11 @@ class Twin:
 def coverage(twins: int = 200, *, progress: bool = False) -> Outcome:
     """Run all problems, each with `twins` twins."""
     todo = [(name, seed) for name in PROBLEMS for seed in range(twins)]
-    found: dict[str, list[Twin]] = {name: [] for name in PROBLEMS}
+    scores: dict[str, list[Twin]] = {name: [] for name in PROBLEMS}
     for (name, _), scored in each(_twin, todo, "twins", progress=progress):
-        found[name].append(scored)
+        scores[name].append(scored)
     rows, checks = [], []
-    for name, several in found.items():
+    for name, several in scores.items():
         inside = {level: _mean([one.inside[level] for one in several]) for level in LEVELS}
         doubted = _mean([one.doubted for one in several])
         honest = _mean([one.doubted or one.inside[0.95] == 1.0 for one in several])
@@ -270,9 +270,9 @@ def twin(problem: Problem, seed: int) -> Twin:
     )
 
 
-def _white(found: Diagnostics[float], values: int) -> tuple[bool, bool]:
+def _white(diagnostics: Diagnostics[float], values: int) -> tuple[bool, bool]:
     """Return whether mean square and correlation of `values` innovations fit white noise."""
-    square, correlation = found.innovation_ratio - 1.0, found.innovation_correlation
+    square, correlation = diagnostics.innovation_ratio - 1.0, diagnostics.innovation_correlation
     return (
         abs(square) <= NORMAL_95 * np.sqrt(2.0 / values),
         abs(correlation) <= NORMAL_95 * np.sqrt(1.0 / values),

@@ -241,8 +241,8 @@ def breakthrough(v: float, D: float, hours: Array) -> Array:
     t = np.where(hours > 0.0, hours, np.nan)
     a, b = ((OUTLET + sign * v * t) / (2.0 * np.sqrt(D * t)) for sign in (-1.0, 1.0))
     # exp(v x/D) erfc(b) without the overflow of the first factor: v x/D - b^2 = -a^2.
-    found = 0.5 * (erfc(a) + np.exp(-(a**2)) * erfcx(b))
-    return np.where(hours > 0.0, found, 0.0)
+    step = 0.5 * (erfc(a) + np.exp(-(a**2)) * erfcx(b))
+    return np.where(hours > 0.0, step, 0.0)
 
 
 def column(seed: int, *, by: Factors = AS_DRAWN) -> tuple[list[str], Array, dict[str, float]]:
@@ -588,22 +588,22 @@ def _widths(
         raise RuntimeError(f"{walk}: the case does not specify the noise")
     each = zip(names, noise.tolist(), strict=True)
     columns = {str(channels[sensor].column): std for sensor, std in each}
-    found = {}
+    widths = {}
     for kind, noisy in ((WIDTH, True), (EXACT, False)):
         for name, std in batch_fit(walk, seed, problem, columns, noisy=noisy).items():
             low, high = last[name].interval()
-            found[kind + name] = math.log(high / low) / (2.0 * 1.96 * std)
-    return found
+            widths[kind + name] = math.log(high / low) / (2.0 * 1.96 * std)
+    return widths
 
 
 def _plate_scores(clone: Path, program: Path, seed: int) -> dict[str, float]:
     with contextlib.chdir(clone):
-        found = runpy.run_path(str(program))
-    data, truth = found["data"].isel(snapshot=-1), diffusivity(seed)(*found["mesh"].p)
+        names = runpy.run_path(str(program))
+    data, truth = names["data"].isel(snapshot=-1), diffusivity(seed)(*names["mesh"].p)
     held = (data["alpha_low"] <= truth) & (truth <= data["alpha_high"])
     return {"alpha": float(held.mean())}
 
 
-def _holds(found: Marginal, truth: float) -> bool:
-    low, high = found.interval()
+def _holds(marginal: Marginal, truth: float) -> bool:
+    low, high = marginal.interval()
     return bool(low <= truth <= high)

@@ -61,11 +61,11 @@ def fmu(
             case = load(write_template(Path(folder) / "rod")[0])
         if unit is None:
             unit = export_fmu(case, Path(folder) / "unit.fmu", fmi=fmi)
-        found = compare_fmu(unit, case, samples=samples, progress=progress)
-    rows = [[name, value] for name, value in found.differences.items()]
-    title = f"Unit and identifier after each of {found.samples} samples"
+        comparison = compare_fmu(unit, case, samples=samples, progress=progress)
+    rows = [[name, value] for name, value in comparison.differences.items()]
+    title = f"Unit and identifier after each of {comparison.samples} samples"
     table = Table(title, ["output", "largest relative difference"], rows)
-    check = Check("largest relative difference", found.largest, CLOSE, "<=")
+    check = Check("largest relative difference", comparison.largest, CLOSE, "<=")
     return Outcome(tables=[table], checks=[check])
 
 

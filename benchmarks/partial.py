@@ -115,15 +115,15 @@ class Reaction:
         k, m, stiff = STEP / SUBSTEPS, M[free][:, free], L[free][:, free]
         factor, other = splu(sp.csc_matrix(m + 0.5 * k * stiff)), m - 0.5 * k * stiff
         u = self.start(x) + np.zeros(x.shape[1])
-        v, found = u[free], [u[shown]]
+        v, states = u[free], [u[shown]]
         for t in times[:-1]:
             for part in range(SUBSTEPS):
                 load = (M @ self.source(x, t + (part + 0.5) * k))[free]
                 v = factor.solve(other @ v + k * load)
             u = np.zeros(x.shape[1])
             u[free] = v
-            found.append(u[shown])
-        return np.array(found)
+            states.append(u[shown])
+        return np.array(states)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,14 +200,14 @@ def follow(data: Readings, states: Array, law: GradientLaw) -> Course:
     """Run a law, and return its errors of q."""
     identifier = Identifier(data.model, Subdomain(omega), law, u0=data.process.start)
     G = identifier.observed.G
-    found = [
+    estimates = [
         identifier.step(float(t), np.asarray(G @ u))
         for t, u in zip(data.times, states, strict=True)
     ]
-    errors = [data.error(np.atleast_1d(estimate.q)) for estimate in found]
-    ok = [estimate.status.ok for estimate in found]
+    errors = [data.error(np.atleast_1d(estimate.q)) for estimate in estimates]
+    ok = [estimate.status.ok for estimate in estimates]
     worst = max(error for error, good in zip(errors, ok, strict=True) if good)
-    alpha = max(float(np.nan_to_num(estimate.diagnostics.alpha)) for estimate in found)
+    alpha = max(float(np.nan_to_num(estimate.diagnostics.alpha)) for estimate in estimates)
     return Course(errors[len(errors) // 2], errors[-1], worst, len(ok) - sum(ok), alpha)
 
 

@@ -97,8 +97,8 @@ def _run(command: str, ranks: int, size: int, samples: int) -> dict[str, Any]:
     if done.returncode:
         lines = done.stderr.strip().splitlines() or ["no reason given"]
         raise ConfigurationError(f"benchmark petsc: {ranks} ranks ended with an error: {lines[0]}")
-    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return found
+    result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return result
 
 
 def _models(cells: int) -> tuple[DolfinxModel, DolfinxModel]:
@@ -151,8 +151,8 @@ def _worker(size: int, samples: int) -> None:
     modes = number_modes(few.create_q(), [0.1, 0.5, 0.5])
     law = PetscFilter(few, few.parameter(NUMBERS), modes, 1e-3)
     true = few.parameter([0.25, 1.5, 0.8])
-    found, state = _timed(few, true, samples, law, law.init(start), law.read)
-    found["q"] = float(np.linalg.norm(gathered(law.parameter(state))))
+    filtered, state = _timed(few, true, samples, law, law.init(start), law.read)
+    filtered["q"] = float(np.linalg.norm(gathered(law.parameter(state))))
     paper = PetscObserver(field, gain=100.0)
     true = field.parameter(lambda x: 1.0 + x[0] * x[1])
     begin = paper.init(field.parameter(0.5), field.interpolate(lambda x: 2.0))
@@ -164,7 +164,7 @@ def _worker(size: int, samples: int) -> None:
     memory = comm.allgather(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000.0)
     result = {
         "nodes": field.mass.getSize()[0],
-        "filter": found,
+        "filter": filtered,
         "observer": learned,
         "share": share / field.mass.getInfo(kinds.GLOBAL_SUM)["nz_used"],
         "memory": max(memory),

@@ -62,7 +62,7 @@ Contender: TypeAlias = Callable[[Data], Score | None]
 Known: TypeAlias = tuple[Array, Array | None]
 """Latent coefficients of the parameter, and a square root of their covariance (None: unknown)."""
 
-Found: TypeAlias = dict[tuple[str, float | None, str], list[Score]]
+Results: TypeAlias = dict[tuple[str, float | None, str], list[Score]]
 """Problem, noise level, row -> a score for each data set."""
 
 
@@ -163,23 +163,23 @@ def scored(contender: Contender, data: Data) -> Score | None:
     return replace(score, step=step, whole=whole, median=median)
 
 
-def error_ratio(found: Found, at: tuple[str, float | None], row: str, other: str) -> float:
+def error_ratio(results: Results, at: tuple[str, float | None], row: str, other: str) -> float:
     """Return the ratio of the median errors of two rows; NaN if an error is unknown."""
-    return _median(found, (*at, row)) / _median(found, (*at, other))
+    return _median(results, (*at, row)) / _median(results, (*at, other))
 
 
-def step_ratio(found: Found, at: tuple[str, float | None], row: str, other: str) -> float:
+def step_ratio(results: Results, at: tuple[str, float | None], row: str, other: str) -> float:
     """Return the ratio of the mean costs of two rows; NaN if a cost is unknown."""
-    mine, others = ([score.step for score in found.get((*at, key), ())] for key in (row, other))
+    mine, others = ([score.step for score in results.get((*at, key), ())] for key in (row, other))
     return _mean(mine) / _mean(others)
 
 
-def _median(found: Found, key: tuple[str, float | None, str]) -> float:
-    errors = [score.error for score in found.get(key, ())]
+def _median(results: Results, key: tuple[str, float | None, str]) -> float:
+    errors = [score.error for score in results.get(key, ())]
     return float(np.nanmedian(errors)) if np.isfinite(errors).any() else math.nan
 
 
-def table_of(found: Found, limit: str) -> list[Table]:
+def table_of(results: Results, limit: str) -> list[Table]:
     """Return a table for each problem, with a row for each noise level and contender.
 
     Parameters
@@ -188,9 +188,9 @@ def table_of(found: Found, limit: str) -> list[Table]:
         Row whose error is the unit of the column `limit`.
     """
     tables = []
-    for name in dict.fromkeys(key[0] for key in found):
+    for name in dict.fromkeys(key[0] for key in results):
         rows, most = [], 0
-        for (problem, level, row), scores in found.items():
+        for (problem, level, row), scores in results.items():
             if problem != name:
                 continue
             most = max(most, len(scores))
@@ -199,7 +199,7 @@ def table_of(found: Found, limit: str) -> list[Table]:
                 float(np.median(known)),
                 min(known),
                 max(known),
-                error_ratio(found, (problem, level), row, limit),
+                error_ratio(results, (problem, level), row, limit),
                 _mean([score.covered for score in scores]),
                 _mean([score.step for score in scores]),
             ]

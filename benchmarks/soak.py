@@ -225,15 +225,15 @@ def _outcome(
 ) -> Outcome:
     """Return the outcome; `record` is the size of an estimate in the journal, in bytes."""
     warm, retained = round(share * WARM), round(share * RETAINED)
-    found = [reading for reading in meter.readings if reading.steps >= warm]
-    tenth = max(len(found) // 10, 1)
-    first, last = found[0], found[-1]
-    middle = found[len(found) // 2]
+    readings = [reading for reading in meter.readings if reading.steps >= warm]
+    tenth = max(len(readings) // 10, 1)
+    first, last = readings[0], readings[-1]
+    middle = readings[len(readings) // 2]
     early, late = (
-        float(np.median([r.seconds / r.fresh for r in some]))
-        for some in (found[:tenth], found[-tenth:])
+        float(np.median([r.seconds / r.fresh for r in part]))
+        for part in (readings[:tenth], readings[-tenth:])
     )
-    shown = [*found[:: max(len(found) // 10, 1)][:10], last]
+    shown = [*readings[:: max(len(readings) // 10, 1)][:10], last]
     table = Table(
         f"{steps / MONTH:.3g} months on 31 nodes; the last {retained} samples and 1 of {EVERY} "
         "older estimates are retained",
@@ -260,7 +260,7 @@ def _outcome(
     checks = [
         Check(
             f"memory: growth after {warm} steps (MiB)",
-            (max(r.private for r in found) - first.private) / MIB,
+            (max(r.private for r in readings) - first.private) / MIB,
             GROWTH,
             "<=",
         ),
@@ -268,7 +268,7 @@ def _outcome(
             "time of a step over a fresh one: last tenth / first tenth", late / early, SLOWER, "<="
         ),
         Check("journal: growth in the second half over the estimates that stay", kept, KEPT, "<="),
-        Check("write-ahead log: largest (MiB)", max(r.log for r in found) / MIB, LOG, "<="),
+        Check("write-ahead log: largest (MiB)", max(r.log for r in readings) / MIB, LOG, "<="),
         Check("steps that failed", meter.failed, 0, "<="),
         Check("estimates that a reader does not find", unread, 0, "<="),
         Check("samples lost or doubled", lost, 0, "<="),

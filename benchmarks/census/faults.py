@@ -231,7 +231,7 @@ def _saturated(scene: Scene, values: Array) -> Array:
 
 
 def _rod(truth: Callable[[Problem, float], Array]) -> Change:
-    """Return a change that replaces the readings by those of another rod with the same k."""
+    """Return a change that replaces the readings by readings of another rod with the same k."""
 
     def changed(scene: Scene) -> Scene:
         k = float(np.exp(scene.problem.latents["k"].value(scene.theta, 0)).item())

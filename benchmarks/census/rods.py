@@ -99,7 +99,7 @@ def nonlinear(problem: Problem, k: float) -> Array:
         return np.asarray(system.A - np.diag(np.abs(y)))
 
     times, start = problem.times, np.zeros(len(system.A))
-    found: Any = solve_ivp(
+    solution: Any = solve_ivp(
         rate,
         (float(times[0]), float(times[-1])),
         start,
@@ -109,7 +109,7 @@ def nonlinear(problem: Problem, k: float) -> Array:
         rtol=1e-7,
         atol=1e-9,
     )
-    if not found.success:
-        raise RuntimeError(found.message)
+    if not solution.success:
+        raise RuntimeError(solution.message)
     ends = np.array([driven(float(t)) for t in times])
-    return np.asarray(found.y.T @ system.C.T + ends @ system.D.T)
+    return np.asarray(solution.y.T @ system.C.T + ends @ system.D.T)

@@ -97,10 +97,10 @@ def control(
         raise ConfigurationError(
             "benchmark control: do-mpc is not installed: pip install 'livepde[control]'."
         )
-    found = {name: PROBLEMS[name].compare(seeds, short, progress) for name in only or PROBLEMS}
+    runs = {name: PROBLEMS[name].compare(seeds, short, progress) for name in only or PROBLEMS}
     return Outcome(
-        tables=[comparison.table() for comparison in found.values()],
-        checks=[check for name in found for check in promises(found[name])],
+        tables=[comparison.table() for comparison in runs.values()],
+        checks=[check for name in runs for check in promises(runs[name])],
         notes=[
             "cost, least, largest: mean, minimum and maximum over seeds, for MPC with penalties of "
             "violations (LQ has no limits). learned: cost after livepde has learned, 10 samples "
@@ -112,7 +112,7 @@ def control(
             "least cost on the first seed."
         ],
         figures={
-            name: partial(PROBLEMS[name].figure, comparison) for name, comparison in found.items()
+            name: partial(PROBLEMS[name].figure, comparison) for name, comparison in runs.items()
         },
     )
 

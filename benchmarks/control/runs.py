@@ -52,19 +52,19 @@ class Run:
     def to_xarray(self, problem: Problem) -> xr.Dataset:
         """Return the dataset for `livepde.plots.loops`."""
         model, times = problem.reduced, self.t.tolist()
-        found: dict[str, Any] = dict(zip(model.outputs.names, self.outputs.T, strict=True))
-        found |= dict(zip(model.controls, self.inputs.T, strict=True))
+        columns: dict[str, Any] = dict(zip(model.outputs.names, self.outputs.T, strict=True))
+        columns |= dict(zip(model.controls, self.inputs.T, strict=True))
         for k, label in enumerate(model.unknowns):
-            found[label], found[f"{label}_std"] = self.q[:, k], self.std[:, k]
-            found[f"{label}_truth"] = [problem.truth(t)[label] for t in times]
+            columns[label], columns[f"{label}_std"] = self.q[:, k], self.std[:, k]
+            columns[f"{label}_truth"] = [problem.truth(t)[label] for t in times]
         for k, name in enumerate(problem.goal.track):
-            found[f"{name}_reference"] = self.reference[:, k]
+            columns[f"{name}_reference"] = self.reference[:, k]
         for name, given in problem.goal.limits.items():
             for k, end in enumerate(("low", "high")):
                 if np.isfinite(given[k]):
-                    found[f"{name}_{end}"] = [problem.limits_at(t)[name][k] for t in times]
+                    columns[f"{name}_{end}"] = [problem.limits_at(t)[name][k] for t in times]
         for name, (low, high) in problem.goal.inputs.items():
-            found[f"{name}_low"], found[f"{name}_high"] = (
+            columns[f"{name}_low"], columns[f"{name}_high"] = (
                 np.full(len(times), v) for v in (low, high)
             )
         space = model.frame.model.parameter_space
@@ -76,7 +76,7 @@ class Run:
                 np.asarray(values),
                 {"units": units.get(name, "")} | ({"held": 1} if name in model.controls else {}),
             )
-            for name, values in found.items()
+            for name, values in columns.items()
         }
         unit = model.frame.model.time_unit
         return xr.Dataset(data, coords={"time": ("time", self.t, {"units": unit})})

@@ -79,17 +79,17 @@ class Linear:
         y[0] = 0.0 if start is None else start
         for k in range(intervals):
             y[k + 1] = (power * y[k] if diagonal else power @ y[k]) + forced[k]
-        found: Array = y @ self.C.T + g[::SUBSTEPS] @ self.D.T
-        return found
+        z: Array = y @ self.C.T + g[::SUBSTEPS] @ self.D.T
+        return z
 
     def _dense_step(self, delta: float) -> tuple[Array, Array, Array]:
         n, m = self.B.shape
         block = np.zeros((n + 2 * m, n + 2 * m))
         block[:n, :n], block[:n, n : n + m] = self.A * delta, self.B * delta
         block[n : n + m, n + m :] = np.eye(m)
-        found = sla.expm(block)
-        last = found[:n, n + m :]
-        return found[:n, :n], found[:n, n : n + m] - last, last
+        E = sla.expm(block)
+        last = E[:n, n + m :]
+        return E[:n, :n], E[:n, n : n + m] - last, last
 
     def _diagonal_step(self, delta: float) -> tuple[Array, Array, Array]:
         z = self.A * delta
@@ -126,8 +126,8 @@ class Chebyshev:
 
     def rows(self, points: Sequence[float]) -> Array:
         """Return the matrix of barycentric interpolation to points, shape (points, nodes)."""
-        found = np.zeros((len(points), len(self.x)))
-        for row, point in zip(found, points, strict=True):
+        rows = np.zeros((len(points), len(self.x)))
+        for row, point in zip(rows, points, strict=True):
             gap = point - self.x
             hit = np.abs(gap) < 1e-14
             if hit.any():
@@ -135,7 +135,7 @@ class Chebyshev:
             else:
                 row[:] = self._weights / gap
                 row /= row.sum()
-        return found
+        return rows
 
     def system(
         self, operator: Array, ends: Array, given: Array, source: Array, points: Sequence[float]

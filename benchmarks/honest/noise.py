@@ -121,10 +121,10 @@ def _autoregressive(share: float) -> Callable[[Array, np.random.Generator], Arra
 
     def noise(white: Array, rng: np.random.Generator) -> Array:
         rho = np.exp(-1.0 / (share * (len(white) - 1)))
-        found = white.copy()
+        errors = white.copy()
         for k in range(1, len(white)):
-            found[k] = rho * found[k - 1] + np.sqrt(1 - rho**2) * white[k]
-        return found
+            errors[k] = rho * errors[k - 1] + np.sqrt(1 - rho**2) * white[k]
+        return errors
 
     return noise
 

@@ -83,14 +83,14 @@ class Stiff(ABC):
         return bands
 
     def _tangent(self, known: Array, y: Array, a: float, t: float) -> Array:
-        found: Array = solve_banded(
+        tangent: Array = solve_banded(
             (1, 1), self._matrix(y, a, t), known + a * self.forcing(t, y), check_finite=False
         )
-        return found
+        return tangent
 
 
 def _times(bands: Array, Y: Array) -> Array:
-    found = bands[1][:, None] * Y
-    found[:-1] += bands[0][1:, None] * Y[1:]
-    found[1:] += bands[2][:-1, None] * Y[:-1]
-    return np.asarray(found)
+    product = bands[1][:, None] * Y
+    product[:-1] += bands[0][1:, None] * Y[1:]
+    product[1:] += bands[2][:-1, None] * Y[:-1]
+    return np.asarray(product)

@@ -16,7 +16,7 @@ from livepde.diagnostics.check_report import Check, Table
 from livepde.runs import Outcome
 
 Array = NDArray[Any]
-Found: TypeAlias = Mapping[tuple[str, str], Sequence[Run]]
+Results: TypeAlias = Mapping[tuple[str, str], Sequence[Run]]
 
 ENOUGH = 40  # number of twins from which the bounds on coverage are used unchanged
 CHANCE = 0.005  # probability that chance breaks the bound for fewer twins, on each side
@@ -34,11 +34,11 @@ MOVING = {"flux": "k", "warm-flux": "k"}
 
 def outcome(runs: Iterable[Run]) -> Outcome:
     """Return tables and checks of runs."""
-    found: dict[tuple[str, str], list[Run]] = {}
+    grouped: dict[tuple[str, str], list[Run]] = {}
     for run in runs:
-        found.setdefault((run.problem, run.kind), []).append(run)
-    order = [(p, k) for k in KINDS for p in PROBLEMS if (p, k) in found]
-    kept: Found = {key: found[key] for key in order}
+        grouped.setdefault((run.problem, run.kind), []).append(run)
+    order = [(p, k) for k in KINDS for p in PROBLEMS if (p, k) in grouped]
+    kept: Results = {key: grouped[key] for key in order}
     checks = [check for key, several in kept.items() for check in _checks(key, several)]
     checks += _pooled_checks(kept)
     failures = sorted(
@@ -117,10 +117,10 @@ def _smoothed_scores(
     return covered, error, fit
 
 
-def _smoothed(found: Found) -> Iterator[Table]:
+def _smoothed(results: Results) -> Iterator[Table]:
     """Yield the table of the smoother, if it was run for any twin."""
     rows = []
-    for (problem, kind), several in found.items():
+    for (problem, kind), several in results.items():
         if any(run.smoothed for run in several):
             for label in PROBLEMS[problem].latents:
                 scores = _smoothed_scores(problem, label, several)
@@ -141,10 +141,10 @@ def _coverage(name: str, covered: Array, bounds: tuple[float, float], twins: int
     return Check(name, value, low, ">=") if high >= 1.0 else Check(name, value, (low, high), "in")
 
 
-def _pooled_checks(found: Found) -> Iterator[Check]:
+def _pooled_checks(results: Results) -> Iterator[Check]:
     """Yield checks of the coverage of each kind at each time, over all problems."""
     for kind, about in KINDS.items():
-        several = [runs for (_, k), runs in found.items() if k == kind]
+        several = [runs for (_, k), runs in results.items() if k == kind]
         if about.coverage is None or not several:
             continue
         shares = np.mean(
@@ -156,9 +156,9 @@ def _pooled_checks(found: Found) -> Iterator[Check]:
             yield _coverage(text, np.array(value), about.coverage, min(map(len, several)))
 
 
-def _overview(found: Found) -> Table:
+def _overview(results: Results) -> Table:
     rows = []
-    for (problem, kind), several in found.items():
+    for (problem, kind), several in results.items():
         covered = np.array([run.covered for run in several])
         by_time = covered.mean(axis=(0, 2))
         shift = np.array([run.shift for run in several])
@@ -193,9 +193,9 @@ def _overview(found: Found) -> Table:
     return Table("Coverage of 95 % intervals with default options", columns, rows)
 
 
-def _details(found: Found) -> Table:
+def _details(results: Results) -> Table:
     rows = []
-    for (problem, kind), several in found.items():
+    for (problem, kind), several in results.items():
         for j, label in enumerate(PROBLEMS[problem].latents):
             covered = np.array([run.covered[:, j] for run in several]).mean(axis=0)
             last = [run.z[-1, j] for run in several]

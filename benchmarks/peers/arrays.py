@@ -109,7 +109,7 @@ class Ensemble:
         self.E: Array | None = None
 
     def step(self, at: int) -> None:
-        """Take a sample."""
+        """Process a sample."""
         stack = self.stack
         if self.E is None:
             start = stack.start[stack.matrices.order]
@@ -159,7 +159,7 @@ class Unscented:
         return np.asarray(mean + np.vstack([0.0 * mean, wide, -wide]))
 
     def step(self, at: int) -> None:
-        """Take a sample."""
+        """Process a sample."""
         stack, k = self.stack, self.stack.k
         if self.u is None:
             self.u = stack.start[stack.matrices.order]

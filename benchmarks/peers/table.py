@@ -25,7 +25,7 @@ from benchmarks.peers.network import network
 from benchmarks.problems import PROBLEMS as ALL
 from benchmarks.problems import Data, Problem
 from benchmarks.problems.rod import ROD, ROD_SOURCE
-from benchmarks.scoring import Contender, Found, Score, scored
+from benchmarks.scoring import Contender, Results, Score, scored
 from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import LivepdeError
 from livepde.laws import SensitivityLaw
@@ -178,7 +178,7 @@ def peers(
         for seed in range(seeds)
         for row in chosen
     ]
-    found: Found = {}
+    results: Results = {}
     with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as pool:
         waiting = [pool.submit(_job, *job) for job in jobs]
         pairs = list(zip(jobs, waiting, strict=True))
@@ -190,13 +190,13 @@ def peers(
             except (LivepdeError, ArithmeticError, RuntimeError, ValueError) as error:
                 score = Score(note=f"{type(error).__name__}: {error}")
             if score is not None:
-                found.setdefault((name, level, row), []).append(score)
-    return Outcome(tables=_tables(found), checks=_checks(found), notes=NOTES)
+                results.setdefault((name, level, row), []).append(score)
+    return Outcome(tables=_tables(results), checks=_checks(results), notes=NOTES)
 
 
-def _relative(found: Found, at: tuple[str, float | None], row: str) -> list[float]:
+def _relative(results: Results, at: tuple[str, float | None], row: str) -> list[float]:
     """Return the error of a row over the error of the prior, for each data set with an error."""
-    scores, priors = found.get((*at, row), []), found.get((*at, "prior"), [])
+    scores, priors = results.get((*at, row), []), results.get((*at, "prior"), [])
     if not scores:
         return []
     pairs = zip(scores, priors, strict=True)
@@ -209,15 +209,15 @@ def _mean(values: Sequence[float]) -> float:
     return float(np.mean(known)) if known else math.nan
 
 
-def _tables(found: Found) -> list[Table]:
+def _tables(results: Results) -> list[Table]:
     """Return a table for each problem, with a row for each noise level and contender."""
     tables = []
-    for name in dict.fromkeys(key[0] for key in found):
+    for name in dict.fromkeys(key[0] for key in results):
         lines, most = [], 0
-        for (problem, level, row), scores in found.items():
+        for (problem, level, row), scores in results.items():
             if problem != name:
                 continue
-            shares, most = _relative(found, (problem, level), row), max(most, len(scores))
+            shares, most = _relative(results, (problem, level), row), max(most, len(scores))
             cells = [
                 _mean(shares),
                 float(np.std(shares)) if shares else math.nan,
@@ -235,13 +235,13 @@ def _tables(found: Found) -> list[Table]:
     return tables
 
 
-def _checks(found: Found) -> list[Check]:
+def _checks(results: Results) -> list[Check]:
     """Return the checks: our cost is smaller than a peer's if our error is not larger."""
     checks = []
-    for problem, level, peer in found:
+    for problem, level, peer in results:
         at = (problem, level)
-        mine, other = (_mean(_relative(found, at, row)) for row in (MINE, peer))
-        costs = [_mean([s.whole for s in found.get((*at, row), ())]) for row in (MINE, peer)]
+        mine, other = (_mean(_relative(results, at, row)) for row in (MINE, peer))
+        costs = [_mean([s.whole for s in results.get((*at, row), ())]) for row in (MINE, peer)]
         name = f"{problem}, {level:.0%} noise"
         if peer == RIVAL and mine <= other:
             work = f"{name}: cost of '{MINE}' over '{peer}'"

@@ -43,9 +43,9 @@ def cell_stiffness(cells: int, h: float) -> list[sp.csr_array]:
 
 def advection(cells: int) -> sp.csr_array:
     """Return the integrals of -u v_x over the column and of u v at its right end."""
-    found = _sum(np.array([[0.5, 0.5], [-0.5, -0.5]]), cells).tolil()
-    found[cells, cells] += 1.0
-    return sp.csr_array(found)
+    matrix = _sum(np.array([[0.5, 0.5], [-0.5, -0.5]]), cells).tolil()
+    matrix[cells, cells] += 1.0
+    return sp.csr_array(matrix)
 
 
 def _quadratic(entries: dict[tuple[int, int, int], float], cells: int) -> sp.csr_array:

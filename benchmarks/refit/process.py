@@ -156,10 +156,10 @@ class Process:
 
     def _band(self, matrix: Any) -> Array:
         """Return the bands of a matrix's free rows, shape (2 width + 1, n), upper bands first."""
-        found = sp.csr_array(sp.diags_array(self._free) @ matrix).tocoo()
-        band = np.zeros((2 * self.width + 1, found.shape[1]))
-        i, j = found.coords
-        band[self.width + i - j, j] = found.data
+        entries = sp.csr_array(sp.diags_array(self._free) @ matrix).tocoo()
+        band = np.zeros((2 * self.width + 1, entries.shape[1]))
+        i, j = entries.coords
+        band[self.width + i - j, j] = entries.data
         return band
 
     @cached_property
@@ -209,22 +209,22 @@ class Process:
         linear = self.quadratic is None
         factors = [self._factorise(mass / (GAMMA * h) + base) for h in unequal if linear]
         forcing, M = self._forcing(theta), self._mass
-        u, found = self.u0, np.empty((2 * len(lengths), len(self.u0)))
+        u, states = self.u0, np.empty((2 * len(lengths), len(self.u0)))
         ratio = (1.0 - GAMMA) / GAMMA
         for step, (h, k) in enumerate(zip(lengths.tolist(), number.tolist(), strict=True)):
             begin = u
             for stage in (2 * step, 2 * step + 1):
                 known = (M @ begin) / (GAMMA * h) + forcing[stage]
                 if linear:
-                    found[stage] = self._solve(factors[k], known)
+                    states[stage] = self._solve(factors[k], known)
                 else:
                     bands = mass / (GAMMA * h) + base
-                    found[stage] = self._newton(begin, known, bands, theta)
-                begin = u + ratio * (found[stage] - u)
-            u = found[2 * step + 1]
-        if not np.isfinite(found).all():
+                    states[stage] = self._newton(begin, known, bands, theta)
+                begin = u + ratio * (states[stage] - u)
+            u = states[2 * step + 1]
+        if not np.isfinite(states).all():
             raise LostError("states are not finite")
-        return Trajectory(theta, found, factors)
+        return Trajectory(theta, states, factors)
 
     def _newton(self, u: Array, known: Array, bands: Array, theta: Array) -> Array:
         """Solve (bands + theta_k T u/2) u = known."""
@@ -294,8 +294,8 @@ class Process:
 def _times(bands: Array, u: Array) -> Array:
     """Return the product of a banded matrix (bands, n, ...) and u (n, ...)."""
     width = len(bands) // 2
-    found = bands[width] * u
+    product = bands[width] * u
     for k in range(1, width + 1):
-        found[:-k] += bands[width - k][k:] * u[k:]
-        found[k:] += bands[width + k][:-k] * u[:-k]
-    return np.asarray(found)
+        product[:-k] += bands[width - k][k:] * u[k:]
+        product[k:] += bands[width + k][:-k] * u[:-k]
+    return np.asarray(product)

@@ -29,17 +29,17 @@ class Step:
 
     def setup_cache(self) -> dict[tuple[int, str], float]:
         sizes, laws = self.params
-        found: dict[tuple[int, str], float] = {}
+        largest: dict[tuple[int, str], float] = {}
         for size in sizes:
             (table,) = step([size], [MODES]).tables
             rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
             for law in laws:
                 ratios = [row["median"] for row in rows if row["law"].startswith(law)]
-                found[size, law] = max(ratios)
-        return found
+                largest[size, law] = max(ratios)
+        return largest
 
-    def track_ratio(self, found: dict[tuple[int, str], float], nodes: int, law: str) -> float:
-        return found[nodes, law]
+    def track_ratio(self, largest: dict[tuple[int, str], float], nodes: int, law: str) -> float:
+        return largest[nodes, law]
 
 
 class Memory:
@@ -65,11 +65,11 @@ class Fleet:
     def setup_cache(self) -> list[float]:
         return [check.value for check in fleet(self.members, self.runs).checks]
 
-    def track_step(self, found: list[float]) -> float:
-        return found[0]
+    def track_step(self, values: list[float]) -> float:
+        return values[0]
 
-    def track_command(self, found: list[float]) -> float:
-        return found[2]
+    def track_command(self, values: list[float]) -> float:
+        return values[2]
 
 
 def _peak() -> float:

@@ -110,8 +110,8 @@ def rod(rng: np.random.Generator) -> pd.DataFrame:
     inputs = np.column_stack([ends, np.full(len(t), 20.0)])
     B = np.column_stack([B, np.full(200, loss)])
     start = np.interp(0.5 * (faces[1:] + faces[:-1]), [0.0, 0.4], ends[0])
-    found = followed(A - loss * np.eye(200), B, at(faces, places), inputs, 10.0, start)
-    noisy = found + 0.05 * rng.standard_normal(found.shape)
+    exact = followed(A - loss * np.eye(200), B, at(faces, places), inputs, 10.0, start)
+    noisy = exact + 0.05 * rng.standard_normal(exact.shape)
     columns = {f"T{k + 1}": noisy[:, k] for k in range(4)}
     return pd.DataFrame({"t": t, "left": ends[:, 0], "right": ends[:, 1], **columns}).round(5)
 
@@ -130,8 +130,8 @@ def soil(rng: np.random.Generator) -> pd.DataFrame:
     alpha = SOIL[np.searchsorted(LAYERS, centres) - 1]
     A, B = conduction(faces, alpha)
     start = np.interp(centres, [0.05, 0.60], ends[0])
-    found = followed(A, B, at(faces, [0.1, 0.2, 0.4, 0.5]), ends, 3600.0, start)
-    noisy = found + 0.1 * rng.standard_normal(found.shape) + np.array([0.15, -0.2, 0.1, -0.1])
+    exact = followed(A, B, at(faces, [0.1, 0.2, 0.4, 0.5]), ends, 3600.0, start)
+    noisy = exact + 0.1 * rng.standard_normal(exact.shape) + np.array([0.15, -0.2, 0.1, -0.1])
     columns = {f"T{k}": noisy[:, i] for i, k in enumerate((10, 20, 40, 50))}
     return pd.DataFrame({"t": t, "T05": ends[:, 0], "T60": ends[:, 1], **columns}).round(5)
 
@@ -150,8 +150,8 @@ def column(rng: np.random.Generator) -> pd.DataFrame:
     inlet[0] += v / width
     c_in = (minutes % 80.0 < 30.0).astype(float)
     C = at(faces, [8.0, 16.0])
-    found = followed(A, inlet, C, c_in[:, None], 1.0 / 180.0, np.zeros(800), hold=True)
-    noisy = found + 0.01 * rng.standard_normal(found.shape)
+    exact = followed(A, inlet, C, c_in[:, None], 1.0 / 180.0, np.zeros(800), hold=True)
+    noisy = exact + 0.01 * rng.standard_normal(exact.shape)
     return pd.DataFrame(
         {"minute": minutes.round(6), "c_in": c_in, "c8": noisy[:, 0], "c16": noisy[:, 1]}
     ).round(6)
@@ -184,13 +184,13 @@ def square(alpha: Any, ends: Any, h: float, sensors: Any, substeps: int = 3) -> 
     each = [[np.array([np.interp(p, centres, e) for e in np.eye(n)]) for p in at] for at in sensors]
     C = sp.csr_array([np.outer(along, across).ravel() for along, across in each])
     u = np.repeat(np.interp(centres, [0.0, SIDE], ends[0]), n)
-    found = [C @ u]
+    readings = [C @ u]
     for before, after in pairwise(ends):
         for k in range(substeps):
             mean = before + (k + 0.5) / substeps * (after - before)
             u = solve(explicit @ u + dt * (B @ mean))
-        found.append(C @ u)
-    return np.array(found)
+        readings.append(C @ u)
+    return np.array(readings)
 
 
 def _square_table(
@@ -200,8 +200,8 @@ def _square_table(
     ends = np.column_stack(
         [20.0 + 10.0 * np.sin(t / (80.0 * h)), 20.0 + 6.0 * np.sin(t / (50.0 * h))]
     )
-    found = square(alpha, ends, h, sensors)
-    noisy = found + 0.05 * rng.standard_normal(found.shape)
+    exact = square(alpha, ends, h, sensors)
+    noisy = exact + 0.05 * rng.standard_normal(exact.shape)
     columns = {f"T{k + 1}": noisy[:, k] for k in range(len(sensors))}
     return pd.DataFrame({"t": t, "left": ends[:, 0], "right": ends[:, 1], **columns}).round(5)
 

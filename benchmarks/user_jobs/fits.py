@@ -142,14 +142,14 @@ def soil(table: pd.DataFrame) -> dict[str, float]:
         alpha = np.exp(theta[:6])
         Ks = [a * K for a, (K, _) in zip(alpha, parts, strict=True)]
         Bs = [a * B for a, (_, B) in zip(alpha, parts, strict=True)]
-        found, slopes = along(sum(Ks), sum(Bs), Ks, Bs, C, means, 3600.0, start[1:-1])
-        offsets = np.broadcast_to(np.eye(4), (len(found), 4, 4))
-        return found + theta[6:], np.concatenate([slopes, offsets], axis=-1)
+        readings, slopes = along(sum(Ks), sum(Bs), Ks, Bs, C, means, 3600.0, start[1:-1])
+        offsets = np.broadcast_to(np.eye(4), (len(readings), 4, 4))
+        return readings + theta[6:], np.concatenate([slopes, offsets], axis=-1)
 
     mean, spread = log_prior(np.full(6, 5e-7), np.full(6, 2e-7))
     mean, spread = np.append(mean, np.zeros(4)), np.append(spread, np.full(4, 0.2))
-    found = np.exp(fitted(simulate, readings, 0.1, mean, spread)[:6])
-    return {f"alpha[{name}]": value for name, value in zip("abcdef", found, strict=True)}
+    alpha = np.exp(fitted(simulate, readings, 0.1, mean, spread)[:6])
+    return {f"alpha[{name}]": value for name, value in zip("abcdef", alpha, strict=True)}
 
 
 def column(table: pd.DataFrame) -> dict[str, float]:
@@ -252,8 +252,8 @@ def plate(table: pd.DataFrame) -> dict[str, float]:
         return found[..., 0], found[..., 1:]
 
     mean, spread = log_prior(np.full(4, 1e-5), np.full(4, 0.5e-5))
-    found = np.exp(fitted(simulate, square.readings, 0.05, mean, spread))
-    return {f"alpha[{name}]": value for name, value in zip("abcd", found, strict=True)}
+    values = np.exp(fitted(simulate, square.readings, 0.05, mean, spread))
+    return {f"alpha[{name}]": value for name, value in zip("abcd", values, strict=True)}
 
 
 def field(table: pd.DataFrame) -> dict[str, float]:
@@ -289,10 +289,10 @@ def field(table: pd.DataFrame) -> dict[str, float]:
         gradient = L.T @ (grid.T @ (alpha * (square.W.T @ slope))) + xi
         return 0.5 * float((r**2).sum() + (xi**2).sum()), gradient
 
-    found = minimize(
+    minimum = minimize(
         cost, np.zeros(len(nodes)), jac=True, method="L-BFGS-B", options={"ftol": 1e-7}
     )
-    values = np.exp(mean + L @ found.x)
+    values = np.exp(mean + L @ minimum.x)
     return {f"{a:.6f} {b:.6f}": float(v) for (a, b), v in zip(nodes, values, strict=True)}
 
 

@@ -27,8 +27,8 @@ class Population(Stiff):
 
     def _spread(self, y: Array) -> Array:
         flows = np.diff(y)
-        found = np.append(flows, 0.0) - np.append(0.0, flows)
-        return np.asarray(found / self.volume / self.h**2)
+        change = np.append(flows, 0.0) - np.append(0.0, flows)
+        return np.asarray(change / self.volume / self.h**2)
 
     def rate(self, t: float, y: Array) -> Array:
         return np.asarray(self.D * self._spread(y) + self.r * y * (1 - y))

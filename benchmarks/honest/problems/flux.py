@@ -116,18 +116,18 @@ class RodFlux(_Drifting):
     def jacobian(self, theta: Array) -> Array:
         step = np.zeros(self.coordinates)
         step[0] = DIFFERENCE
-        found = np.zeros((self.intervals + 1, len(self.points), self.coordinates))
-        found[:, :, 0] = (self.predict(theta + step) - self.predict(theta)) / DIFFERENCE
+        J = np.zeros((self.intervals + 1, len(self.points), self.coordinates))
+        J[:, :, 0] = (self.predict(theta + step) - self.predict(theta)) / DIFFERENCE
         # Responses to a flux that rises from 0 to 1 in the first interval, and to a constant flux.
         fine = fine_times(self.times)
         h = self.length / self.intervals
         system = self.system(self.k(theta))
         rising = system.respond(np.column_stack([0 * fine, np.minimum(fine / h, 1.0)]), h)
         constant_one = system.respond(np.column_stack([0 * fine, 1.0 + 0 * fine]), h)
-        found[:, :, 1] = STD * constant_one
+        J[:, :, 1] = STD * constant_one
         for n in range(self.intervals):
-            found[n:, :, 2 + n] = self.increment * rising[: self.intervals + 1 - n]
-        return found
+            J[n:, :, 2 + n] = self.increment * rising[: self.intervals + 1 - n]
+        return J
 
 
 class _DrivenRod(Conduction):
@@ -142,15 +142,15 @@ class _DrivenRod(Conduction):
 
     def forcing(self, t: float, y: Array) -> Array:
         problem = self.problem
-        found = np.zeros((len(y), problem.coordinates))
+        forcing = np.zeros((len(y), problem.coordinates))
         flux = self.into(t)
-        found[:, 0] = (self.rate(t, y) - self.inflow(flux)) * (0.03 / 0.1)
+        forcing[:, 0] = (self.rate(t, y) - self.inflow(flux)) * (0.03 / 0.1)
         place = t / problem.length * problem.intervals
         share = np.clip(place - np.arange(problem.intervals), 0.0, 1.0)
-        found[0, 1] = STD
-        found[0, 2:] = problem.increment * share
-        found[0, 1:] /= self.capacity[0]
-        return found
+        forcing[0, 1] = STD
+        forcing[0, 2:] = problem.increment * share
+        forcing[0, 1:] /= self.capacity[0]
+        return forcing
 
 
 class NonlinearFlux(_Drifting):

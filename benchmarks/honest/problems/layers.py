@@ -59,8 +59,8 @@ class Wall(_Conduction):
 
     def conductivity(self, theta: Array, x: Array) -> Array:
         layers = np.exp([item.value(theta, 0).item() for item in self.latents.values()])
-        found: Array = layers[np.searchsorted(ENDS, x) - 1]
-        return found
+        k: Array = layers[np.searchsorted(ENDS, x) - 1]
+        return k
 
     def model(self, refine: int = 1) -> lp.Model:
         def layer(n: int) -> Any:

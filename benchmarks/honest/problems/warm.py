@@ -41,10 +41,10 @@ class Conduction(Stiff):
 
     def inflow(self, flux: float) -> Array:
         """Return the rate of change of y due to a flux into the left end."""
-        found = np.zeros(self.nodes)
+        rate = np.zeros(self.nodes)
         if self.left is None:
-            found[0] = flux / self.capacity[0]
-        return found
+            rate[0] = flux / self.capacity[0]
+        return rate
 
     def _all(self, t: float, y: Array) -> Array:
         at = np.array(t)
