@@ -172,8 +172,8 @@ def weather() -> Array:
     folder = os.environ.get("LIVEPDE_DATA")
     if not folder:
         raise ConfigurationError(
-            f"wall: reading the weather from {RECORD} requires LIVEPDE_DATA. Set it to the folder "
-            "of the measurements, or select other problems with --only."
+            f"wall: the weather is read from {RECORD}, and LIVEPDE_DATA is not set; set it to the "
+            "folder that holds the measurements, or leave this problem out."
         )
     with (Path(folder) / RECORD).open(newline="") as file:
         return np.array([float(row["TA_1_1_1"]) for row in csv.DictReader(file)])
