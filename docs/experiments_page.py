@@ -1,10 +1,10 @@
-"""Make docs/gallery/experiments.md, with: python docs/experiments_page.py [NAME ...].
+"""Write docs/gallery/experiments.md, with: python docs/experiments_page.py [NAME ...].
 
-Runs what `livepde reproduce` knows, the studies and scripts of experiments/, `python -m benchmarks
-control`, and the programs of examples/, each by the name of its experiment or file; without names
-all of them, which takes hours. What they print and draw is kept in docs/gallery/experiments/, and
-the page is made of all that is there, with the commit of each run. `--draw` runs nothing. The data
-of the cases are read from $LIVEPDE_DATA.
+Runs the experiments of `livepde reproduce`, the studies and scripts of experiments/, `python -m
+benchmarks control`, and the programs of examples/. NAME is an experiment or the stem of a file.
+Without names all of them run, which takes hours. Their output and figures are stored in
+docs/gallery/experiments/. The page shows everything stored there, with the commit of each run.
+`--draw` writes the page without running anything. Cases read their data from $LIVEPDE_DATA.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ PAGE = PROJECT / "docs" / "gallery" / "experiments.md"
 KEPT = PAGE.with_suffix("")
 COMMITS = KEPT / "commits.json"  # name -> commit of its last run
 WIDEST, COLOURS = 1100, 48  # pixels and colours of a figure
-LONGEST = 45  # lines of what a script prints that are shown
+LONGEST = 45  # lines of a script's output that the page shows
 OPTIONS = {
     "control": ["--only", "rod", "--only", "battery", "--seeds", "1"],
-}  # that spare hours
+}  # options that save hours
 
 HEAD = """\
 # Gallery: experiments
@@ -45,7 +45,7 @@ Experiments of the paper, studies that follow from it, and scripts that need the
 Each one has its command, its figure, its table and the commit at which it was recorded. Written by
 `python docs/experiments_page.py`. Cases on published data are in the [gallery](gallery.md).
 """
-COMMANDS = {  # what draws, and checks its numbers -> how it is run
+COMMANDS = {  # experiment that draws figures and checks its numbers -> program that runs it
     **dict.fromkeys(EXPERIMENTS, "livepde reproduce"),
     **dict.fromkeys(
         ("seed-excited-noise", "degenerate", "dimensions", "relatives", "exact"),
@@ -64,19 +64,19 @@ PARTS = {
 
 @dataclass(frozen=True)
 class Sketch:
-    """How the table that a script prints is drawn: a line of it is a row of dots.
+    """Pattern that turns the table printed by a script into a figure with one row of dots per line.
 
     Attributes
     ----------
     row
-        Pattern of a line; its groups are `label` and numbers, each by its name on the axis; a
-        group `NAME_std` is the deviation of NAME.
+        Pattern of a table line. Its groups are `label` and the numbers, named as in the legend; a
+        group `NAME_std` is the standard deviation of NAME.
     heading
-        Pattern of a line whose group comes before the labels of the lines after it.
+        Pattern of a heading; its group is put before the labels of the lines that follow.
     scale
-        Of the axis.
+        Scale of the axis.
     last
-        Only the last paragraph is shown, and drawn; what comes before it is single runs.
+        If True, only the last paragraph is shown and drawn; the text before it is single runs.
     """
 
     row: str
@@ -120,7 +120,7 @@ SKETCHES = {
 
 
 def shown(name: str, text: str) -> str:
-    """Return the part of a script's output that the page shows."""
+    """Return the lines of a script's output that the page shows."""
     text = text.strip("\n")
     if name in SKETCHES and SKETCHES[name].last:
         text = text.rsplit("\n\n", 1)[-1]
@@ -131,7 +131,7 @@ def shown(name: str, text: str) -> str:
 
 
 def drawn(name: str, text: str) -> Figure | None:
-    """Return the figure of a script's table, None if it has none."""
+    """Draw the table in a script's output; return None if the script has no table."""
     sketch = SKETCHES.get(name)
     rows = list(_rows(sketch, text)) if sketch else []
     if sketch is None or not rows:
@@ -158,13 +158,13 @@ def _rows(sketch: Sketch, text: str) -> Iterator[dict[str, str]]:
     for line in text.splitlines():
         if (head := re.search(sketch.heading, line)) is not None:
             heading = f"{head[1]}, "
-        elif (found := re.search(sketch.row, line)) is not None:
-            label = re.sub(r" {2,}", "  ", found["label"])
-            yield {**found.groupdict(), "label": heading + label}
+        elif (row := re.search(sketch.row, line)) is not None:
+            label = re.sub(r" {2,}", "  ", row["label"])
+            yield {**row.groupdict(), "label": heading + label}
 
 
 def run(name: str) -> None:
-    """Run one experiment, script or example, and keep what it printed and drew."""
+    """Run one experiment, script or example, and store its output and figures."""
     sys.stderr.write(f"runs: {name}\n")
     if name == "control":
         with tempfile.TemporaryDirectory() as folder:
@@ -175,7 +175,7 @@ def run(name: str) -> None:
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "run"
             words = [*COMMANDS[name].removeprefix("python -m ").split(), name, "--out", str(out)]
-            # A bound that is missed is said in the report.
+            # No check of the exit code: the report lists the bounds that are missed.
             subprocess.run([sys.executable, "-m", *words], cwd=PROJECT, check=False)
             keep(name, out, (out / "report.md").read_text(encoding="utf-8"))
         return
@@ -185,7 +185,7 @@ def run(name: str) -> None:
 
 
 def keep(name: str, out: Path, text: str) -> None:
-    """Keep a report, and the figures of a folder, smaller."""
+    """Store a report, and the figures of a folder at reduced size."""
     text = re.sub(r"^!\[.*\]\(.*\)$\n?", "", text, flags=re.MULTILINE)
     for path in sorted(out.glob("*.png")):
         small(path, KEPT / f"{name}-{path.name}")
@@ -194,7 +194,7 @@ def keep(name: str, out: Path, text: str) -> None:
 
 
 def small(path: Path, target: Path) -> None:
-    """Write a picture with fewer pixels and a palette of few colours."""
+    """Write a copy of a picture with fewer pixels and colours."""
     with Image.open(path) as large:
         picture = large.convert("RGB")
     picture.thumbnail((WIDEST, 10 * WIDEST))
@@ -202,7 +202,7 @@ def small(path: Path, target: Path) -> None:
 
 
 def scripts() -> dict[str, Path]:
-    """Return name -> file of scripts and examples."""
+    """Return the files of all scripts and examples by name."""
     return {
         path.stem: path
         for folder in ("experiments", "examples")
@@ -212,14 +212,14 @@ def scripts() -> dict[str, Path]:
 
 
 def _script_command(path: Path) -> list[str]:
-    """Return the arguments of Python that run a script or an example."""
+    """Return the arguments with which Python runs a script or an example."""
     module = ["-m", f"experiments.{path.stem}"]
     where = module if path.parent.name == "experiments" else [f"examples/{path.name}"]
     return [*where, *OPTIONS.get(path.stem, ())]
 
 
 def page() -> str:
-    """Return the page of all that is kept."""
+    """Return the page of all stored runs."""
     files = scripts()
     commits = json.loads(COMMITS.read_text(encoding="utf-8"))
     parts = [HEAD]
@@ -234,7 +234,7 @@ def page() -> str:
 
 
 def _part(name: str, files: dict[str, Path]) -> str:
-    """Return the part of the page that an experiment, script or example stands in."""
+    """Return the key in `PARTS` of an experiment, script or example."""
     folder = files[name].parent.name if name in files else COMMANDS[name].split()[-1]
     if folder != "experiments":
         return folder
@@ -246,12 +246,12 @@ def _kept(name: str) -> Path:
 
 
 def _report(name: str) -> str:
-    """Return the part of a published experiment: figures first."""
+    """Return the section of an experiment that stores a report, with its figures first."""
     text = _kept(name).read_text(encoding="utf-8").replace("| None |", "| – |")
     title, rest = text.removeprefix("# ").split("\n", 1)
     pictures = re.findall(r"^!\[.*\]\((.*)\)$\n?", rest, flags=re.MULTILINE)
     rest = re.sub(r"^!\[.*\]\(.*\)$\n?", "", rest, flags=re.MULTILINE)
-    shown = [f"![{Path(one).stem}](experiments/{one})" for one in pictures]
+    shown = [f"![{Path(name).stem}](experiments/{name})" for name in pictures]
     rest = re.sub(r"^## (.*)$", r"**\1**", rest, flags=re.MULTILINE)
     command = " ".join([COMMANDS[name], name, *OPTIONS.get(name, ())])
     lines = [f"### {name}", f"`{command}`", *shown, rest.strip()]
@@ -261,7 +261,7 @@ def _report(name: str) -> str:
 
 
 def _script(path: Path) -> str:
-    """Return the part of a script: what it is for, its figure, and what it prints."""
+    """Return the section of a script: its purpose, command, figure and output."""
     about = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
     printed = _kept(path.stem).read_text(encoding="utf-8")
     lines = [f"### {path.stem}", about.split("\n\n")[0]]
@@ -276,7 +276,7 @@ def _script(path: Path) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run what is named, and write the page."""
+    """Run the chosen experiments, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     known = [*COMMANDS, *scripts()]
     parser.add_argument("names", nargs="*", choices=[[], *known], metavar="NAME")

@@ -1,4 +1,4 @@
-"""Replace comments of pages by text of the program while the site is built.
+"""Replace comments in pages by generated text while MkDocs builds the site.
 
 <!-- command line -->             the help of all commands
 <!-- benchmarks -->               the help of all benchmarks
@@ -26,27 +26,27 @@ Schema = Mapping[str, Any]
 PROJECT = Path(__file__).resolve().parents[1]
 
 DEFINED = "#/$defs/"
-BOUND = '`[low, high]`, `"<= number"` or `">= number"`'  # what the validator of `expect` reads
+BOUND = '`[low, high]`, `"<= number"` or `">= number"`'  # forms that `expect` accepts
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Fill a page in; MkDocs calls this for each of them."""
+    """Replace the comments in a page; MkDocs calls this hook for each page."""
     for comment, write in WRITERS.items():
         if comment in markdown:
             markdown = markdown.replace(comment, write())
-    return re.sub(r"<!-- members of (\S+) -->", lambda found: members(found[1]), markdown)
+    return re.sub(r"<!-- members of (\S+) -->", lambda match: members(match[1]), markdown)
 
 
 def command_line(module: str = "livepde.cli", name: str = "livepde") -> str:
-    """Return the help of all commands of a program, as Typer writes it."""
+    """Return the help of all commands of a program in the Markdown that Typer writes."""
     command = [sys.executable, "-m", "typer", module, "utils", "docs", "--name", name]
     done = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, check=True)
     text = done.stdout
-    # What every command has, and lists of commands with their words cut off, are of no use here.
+    # Drop the lists of commands, whose help Typer truncates, and the options of every command.
     text = re.sub(r"^\*\*Commands\*\*:\n\n(\*.*\n)+\n?", "", text, flags=re.MULTILINE)
     text = text.replace("* `--help`: Show this message and exit.\n", "")
     text = text.replace("**Options**:\n\n\n", "").split("\n\n", 1)[1]
-    # Examples are words to Typer: a line for each, and as code.
+    # Typer writes examples as running text: set each on its own line, as code.
     example = r"^(.*?)(Example|Your own|Replay|Service): +(\S.*)$"
     return re.sub(example, r"\1\n\n\2: `\3`", text, flags=re.MULTILINE)
 
@@ -57,7 +57,7 @@ def commands() -> str:
 
 
 def below(text: str) -> str:
-    """Return text with its headings one rank lower."""
+    """Return text with its headings one level deeper."""
     return re.sub(r"^##", "###", text, flags=re.MULTILINE)
 
 
@@ -72,7 +72,7 @@ def experiments() -> str:
 
 
 def members(package: str) -> str:
-    """Return a directive for mkdocstrings that shows what only this package exports."""
+    """Return a mkdocstrings directive for the exports of a package that livepde lacks."""
     names = [name for name in import_module(package).__all__ if name not in livepde.__all__]
     hidden = {"show_root_heading": False, "show_root_toc_entry": False}
     options = {"heading_level": 3, "members": names, **hidden}
@@ -80,13 +80,13 @@ def members(package: str) -> str:
 
 
 def keys_of_a_case() -> str:
-    """Return what each table of a case file may hold, from the models that validate it."""
+    """Return tables of all keys of a case file, from the models that validate it."""
     schema = case_schema()
     return below("\n".join(_section("", schema, schema["$defs"])))
 
 
 def _section(path: str, model: Schema, models: Schema) -> Iterator[str]:
-    """Yield the section of one table, then those of the tables in it."""
+    """Yield the section of one table, then the sections of its subtables."""
     title = f"`[{path}]`" if path else "At the top"
     kind = model["properties"].get("kind", {}).get("const")
     if kind:
@@ -107,12 +107,12 @@ def _section(path: str, model: Schema, models: Schema) -> Iterator[str]:
         yield f"| {' | '.join(cells)} |"
         inner += _tables(name, value)
     yield ""
-    for where, found in inner:
-        yield from _section(where, models[found], models)
+    for subpath, name in inner:
+        yield from _section(subpath, models[name], models)
 
 
 def _alternatives(value: Schema) -> str:
-    """Return in words what a value may be."""
+    """Describe the values that a key accepts."""
     return " or ".join(dict.fromkeys(_words(value)))
 
 
@@ -142,14 +142,14 @@ def _words(value: Schema) -> Iterator[str]:
 
 
 def _values(value: Schema) -> Schema:
-    """Return what the values of a table of any names may be."""
+    """Return the schema of the values in a table whose keys are free names."""
     patterns = list(value.get("patternProperties", {}).values())
-    found = value.get("additionalProperties") or (patterns or [{}])[0]
-    return found if isinstance(found, dict) else {}
+    schema = value.get("additionalProperties") or (patterns or [{}])[0]
+    return schema if isinstance(schema, dict) else {}
 
 
 def _tables(path: str, value: Schema) -> Iterator[tuple[str, str]]:
-    """Yield the tables inside of a value, each with its path and its model."""
+    """Yield path and model name of each table inside a value."""
     if "$ref" in value:
         yield path, value["$ref"].removeprefix(DEFINED)
     for choice in value.get("anyOf", value.get("oneOf", ())):

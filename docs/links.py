@@ -1,6 +1,6 @@
-"""Look through the site that `mkdocs build` has made, with: python docs/links.py.
+"""Check the site built by `mkdocs build`, with: python docs/links.py.
 
-Nothing may be loaded from elsewhere, and every link inside of the site has to lead somewhere.
+No page may load resources from another server, and every internal link must have a target.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ LOADED = re.compile(r'<(?:script|link|img|iframe|source)\b[^>]*?(?:src|href)="(?
 
 
 def main(site: Path) -> None:
-    """Print what is wrong; then the exit code is 1."""
+    """Print the faults of a site; the exit code is 1 if there are any."""
     elsewhere = {item for page in site.rglob("*.html") for item in LOADED.findall(page.read_text())}
     if elsewhere:
         raise SystemExit("\n".join(["loaded from elsewhere:", *sorted(elsewhere)]))
-    # Started by root it would go on as a user who may not read the folders of root.
+    # If root starts it, linkchecker changes to a user who cannot read root's folders.
     linkchecker.drop_privileges = lambda: None
     options = ["--no-status", "--no-warnings", "--ignore-url=sitemap", "--output=failures"]
     sys.argv[1:] = [*options, str(site / "index.html")]

@@ -1,8 +1,8 @@
 """Write docs/peers/results.md, with: python docs/peers.py [rod heat2d ...].
 
-Runs `python -m benchmarks peers` for each problem, keeps what it prints as JSON in docs/peers/, and
-makes a page of all that is there. `--draw` measures nothing: so files of other runs can be added by
-hand, as `python -m benchmarks peers --only rod --seeds 16 --json > docs/peers/rod.json`.
+Runs `python -m benchmarks peers` for each problem, stores its JSON in docs/peers/, and writes the
+page from all files there. `--draw` measures nothing, so that a file can also be added by hand, such
+as with `python -m benchmarks peers --only rod --seeds 16 --json > docs/peers/rod.json`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ DOCS = Path(__file__).resolve().parent
 MEASURED = DOCS / "peers"
 PROBLEMS = ("rod", "rod-source", "seed", "seed-excited", "heat2d", "burgers-varying", "wall")
 SEEDS: Mapping[str, int] = {"rod": 16, "rod-source": 16}
-FEW = 4  # seeds of the others
+FEW = 4  # seeds of the other problems
 
 PAGE = """\
 # Comparison with peers: results
@@ -31,7 +31,7 @@ explains the rows and columns.
 
 
 def measure(names: Iterable[str]) -> None:
-    """Run the benchmark on problems, and keep what it prints."""
+    """Run the benchmark on each problem, and store its JSON output."""
     MEASURED.mkdir(exist_ok=True)
     for name in names:
         seeds = str(SEEDS.get(name, FEW))
@@ -40,22 +40,22 @@ def measure(names: Iterable[str]) -> None:
 
 
 def section(name: str, content: Mapping[str, Any]) -> str:
-    """Return what was printed of a problem as a section of the page."""
+    """Format the stored output of a problem as a section of the page."""
     text = report(name, {**content, "notes": []})
     lines = [f"#{line}" if line.startswith("#") else line for line in text.splitlines()]
     return "\n".join([lines[0], "", measured(content), *lines[1:]]) + "\n"
 
 
 def write(folder: Path = DOCS) -> None:
-    """Make the page of what was measured."""
+    """Write the page from the stored measurements."""
     files = [folder / "peers" / f"{name}.json" for name in PROBLEMS]
-    found = {path.stem: json.loads(path.read_text()) for path in files if path.exists()}
-    parts = [PAGE, *(section(name, content) for name, content in found.items())]
+    stored = {path.stem: json.loads(path.read_text()) for path in files if path.exists()}
+    parts = [PAGE, *(section(name, content) for name, content in stored.items())]
     (folder / "peers" / "results.md").write_text("\n".join(parts))
 
 
 def main() -> None:
-    """Measure, and write the page."""
+    """Measure the chosen problems, and write the page."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("names", nargs="*", help=f"of {', '.join(PROBLEMS)}; default all")
     options.add_argument("--draw", action="store_true", help="measure nothing")

@@ -1,7 +1,7 @@
 """Check that README and docs are plain English, with: python docs/plain_english.py [PAGE ...].
 
-Reports phrases with a simpler form, sentences of more than 30 words, and pages of the user guide of
-more than 1500 words. Code, generated pages and the gallery are not checked.
+Reports phrases that have a simpler form, sentences of more than 30 words, and pages of the user
+guide of more than 1500 words. Skips code, generated pages and the gallery.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ GUIDE = {
     *("own-data", "first-hour", "cases", "unknowns", "sensors", "trust", "python", "mistakes"),
     *("service", "formats", "fleet"),
 }
-# Folder -> why its pages are not checked.
+# Folder -> why its pages are skipped.
 SKIPPED = {
     "gallery": "numbers and captions of runs, which commands write",
     "api": "docstrings",
@@ -52,7 +52,7 @@ EXCEPTIONS: dict[tuple[str, str], str] = {}
 
 
 def blocks(text: str) -> Iterator[tuple[int, str]]:
-    """Yield the line number and the text of each paragraph, item of a list and cell of a table."""
+    """Yield line number and text of each paragraph, list item and table cell."""
     text = re.sub(r"^```.*?^```$", lambda code: "\n" * code[0].count("\n"), text, flags=re.M | re.S)
     text = re.sub(r"^ {4}.*$", "", text, flags=re.M)  # formulas
     text = re.sub(r"^<!--.*?-->$", "", text, flags=re.M)
@@ -70,13 +70,13 @@ def blocks(text: str) -> Iterator[tuple[int, str]]:
 
 
 def plain(text: str) -> str:
-    """Return text without targets of links, attributes and inline code, which is one word."""
+    """Remove link targets and attributes, and replace inline code by the word X."""
     text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)|\{[ #:][^}]*\}", r"\1", text)
     return re.sub(r"(?<!`)(`+)(?!`).+?(?<!`)\1(?!`)", "X", text)
 
 
 def problems(page: Path) -> Iterator[str]:
-    """Yield each problem of a page, as file:line: phrase -> advice."""
+    """Yield each problem of a page in the form file:line: phrase -> advice."""
     name = str(page.relative_to(ROOT) if page.is_relative_to(ROOT) else page)
     count = 0
     for line, text in blocks(page.read_text(encoding="utf-8")):
@@ -102,7 +102,7 @@ def pages() -> list[Path]:
 
 
 def main(chosen: list[str]) -> None:
-    """Print the problems of these pages, default all; then the exit code is 1."""
+    """Print the problems of the chosen pages, by default all; the exit code is 1 if any."""
     checked = [Path(name).resolve() for name in chosen] or pages()
     found = [problem for page in checked for problem in problems(page)]
     if found:

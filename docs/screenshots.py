@@ -1,6 +1,6 @@
 """Take the picture of the live page in docs/service.md, with: python docs/screenshots.py.
 
-Runs a case of the project on real data, and takes a screenshot of its page in headless Chromium.
+Runs a case on real data, and takes a screenshot of its live page in headless Chromium.
 Requires $LIVEPDE_DATA, and Chromium with its driver (Debian: chromium chromium-driver).
 """
 
@@ -26,12 +26,12 @@ from livepde.runs.web import Address
 PROJECT = Path(__file__).resolve().parents[1]
 IMAGES = PROJECT / "docs" / "images"
 PATIENCE = 180.0  # seconds
-PAINTED = 2.0  # seconds until what was drawn is on the screen
-LIVE = 400  # samples after which the run that goes on is photographed
+PAINTED = 2.0  # seconds until the browser has painted the plots
+LIVE = 400  # samples after which the page of the live run is photographed
 
 
 def command(case: str, folder: Path, *options: str) -> list[str]:
-    """Return the command that makes a run of a case."""
+    """Return the command line that runs a case."""
     words = ["run", str(PROJECT / "cases" / case), "--out", str(folder), *options]
     return [sys.executable, "-m", "livepde", *words]
 
@@ -53,7 +53,7 @@ def browser() -> webdriver.Chrome:
 
 
 def facts(page: webdriver.Chrome) -> int:
-    """Return how many samples the page speaks of."""
+    """Return the number of samples that the page reports."""
     words = str(page.execute_script("return document.getElementById('facts').innerText")).split()
     return int(words[0]) if words else 0
 
@@ -65,14 +65,14 @@ def take(
     size: tuple[int, int],
     ready: Callable[[webdriver.Chrome], Any],
 ) -> None:
-    """Photograph the page of a run.
+    """Save a screenshot of a run's page as a PNG file.
 
     Parameters
     ----------
     size
-        Width and height.
+        Width and height in pixels.
     ready
-        What must be true before.
+        Condition on the page to wait for before the screenshot.
     """
     server = serve(folder, Address())
     screen = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
@@ -87,7 +87,7 @@ def take(
 
 
 def main() -> None:
-    """Take the picture of a live run."""
+    """Save the screenshot of a live run."""
     page = browser()
     with tempfile.TemporaryDirectory() as scratch:
         soil = Path(scratch) / "soil"
