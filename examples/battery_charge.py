@@ -1,4 +1,4 @@
-"""Charge a battery particle as fast as its surface allows, while its diffusivity is learned."""
+"""Charge a battery particle as fast as its surface allows while estimating its diffusivity."""
 
 import numpy as np
 
@@ -8,12 +8,12 @@ from livepde.models import battery_particle
 from livepde.models.battery import FARADAY
 
 R, AREA, FULL = 5e-6, 1.0, 30555.0  # m, m^2, mol/m^3
-ONE = FARADAY * FULL * AREA * R / 3 / 3600.0  # A, fills the particle in an hour
-PERIOD, NOISE, LIMIT = 30.0, 2e-3, 0.85  # s, V, filling at the surface
+ONE = FARADAY * FULL * AREA * R / 3 / 3600.0  # A, the current that fills the particle in an hour
+PERIOD, NOISE, LIMIT = 30.0, 2e-3, 0.85  # s, V, largest filling at the surface
 
 
 def particle(cells: int) -> lp.Model:
-    """Return the particle, on a mesh that is finer towards the surface."""
+    """Return the particle model on a mesh that is finer towards the surface."""
     mesh = lp.fem.line((R * (1.0 - np.linspace(1.0, 0.0, cells + 1) ** 2)).tolist())
     D = lp.LogNormal(6e-15, std=3e-15)
     return battery_particle(mesh, D, area=AREA, c_max=FULL)
@@ -28,7 +28,7 @@ def voltage(c):
 
 
 class Cell:
-    """The truth, which nobody sees: a finer mesh, shorter steps, noise, a slower diffusion."""
+    """Simulated cell with a finer mesh, shorter steps, noise and slower diffusion."""
 
     def __init__(self, D: float) -> None:
         self.model, self.D, self.t = particle(60), D, 0.0
@@ -36,7 +36,7 @@ class Cell:
         self.rng = np.random.default_rng(0)
 
     def run(self, current: float) -> None:
-        """Go on for one period."""
+        """Simulate one period."""
         times = (self.t + np.linspace(0.0, PERIOD, 11)).tolist()
         control, held = lp.Advance(lp.ImplicitEuler()), lambda t: {"I": current}
         *_, (self.t, self.c) = lp.simulate(
@@ -44,12 +44,12 @@ class Cell:
         )
 
     def measure(self) -> np.ndarray:
-        """Return the voltage."""
+        """Return the voltage with noise."""
         return voltage(self.c[-1:]) + self.rng.normal(0.0, NOISE, 1)
 
 
 def main(D: float = 3e-15) -> dict[str, float]:
-    """Charge a cell from 30 to 75 %; return what was reached, and the estimate over the truth."""
+    """Charge a cell from 30 to 75 %; return D and std over the truth, and the fillings reached."""
     model, cell = particle(24), Cell(D)
     sensor = lp.observation.Transformed(lp.Points({"V": R}), voltage, noise=NOISE)
     identifier = lp.Identifier(
@@ -58,7 +58,7 @@ def main(D: float = 3e-15) -> dict[str, float]:
         lp.SensitivityLaw(),
         u0=0.3 * FULL,
         scheme=lp.Alexander2(),
-        between={"I": "next"},  # the current since the sample before
+        between={"I": "next"},  # the current since the previous sample
     )
 
     seen = lp.observation.Functionals(

@@ -1,4 +1,4 @@
-"""A run beside a process from Python: rows from your own source, estimates to your own sink."""
+"""A live run in Python with rows from your own source and estimates to your own sink."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from livepde.streams import Rows
 
 
 def measured(path: Path) -> Iterator[dict[str, str]]:
-    """Yield rows, column -> value, as a process brings them: now and then something is wrong."""
+    """Yield rows, column -> value, as from a live process; some values are malformed."""
     with path.open(newline="") as file:
         for k, row in enumerate(csv.DictReader(file)):
             if k % 50 == 7:
@@ -25,28 +25,28 @@ def measured(path: Path) -> Iterator[dict[str, str]]:
 
 
 class Printer(Sink):
-    """Prints every fiftieth estimate."""
+    """Sink that prints every fiftieth estimate."""
 
     def __init__(self) -> None:
         self.count = 0
 
     def put(self, estimate: Estimate) -> None:
-        """Take one estimate."""
+        """Process one estimate."""
         if self.count % 50 == 0:
             value, std = estimate.parameters["alpha"]
             print(f"t = {estimate.t:6.0f} s: alpha = {value:.3g} ± {std:.1g} m^2/s")
         self.count += 1
 
     def close(self) -> None:
-        """Let go of what it holds: nothing."""
+        """Release resources; this sink has none."""
 
 
 def main() -> dict[str, tuple[float, float]]:
-    """Run the case of `livepde init`, and say what was irregular."""
+    """Run the case of `livepde init`, and print the counts of irregular rows."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         case, data = write_template(folder)
-        # A journal that is there already is gone on with, also after a crash.
+        # If the journal exists, the run resumes from it, also after a crash.
         with LiveCase(load(case), Rows(measured(data)), path=folder / "journal.sqlite") as wiring:
             live = wiring.live([Printer()])
             live.run()

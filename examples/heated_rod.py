@@ -1,4 +1,4 @@
-"""livepde in a control loop: a heated rod of unknown conductivity, which jumps after an hour."""
+"""Control of a heated rod whose unknown conductivity jumps after an hour."""
 
 import numpy as np
 from skfem import ElementLineP1
@@ -25,30 +25,30 @@ def rod(cells: int) -> lp.Model:
 
 
 class Plant:
-    """The truth, which nobody sees: a finer mesh, shorter steps, noise, another conductivity."""
+    """Simulated rod with a finer mesh, shorter steps, noise and a different conductivity."""
 
     def __init__(self) -> None:
         self.model, self.u, self.t = rod(100), np.full(101, ROOM), 0.0
         self.rng = np.random.default_rng(0)
 
     def run(self, heater: float) -> None:
-        """Go on for one period."""
+        """Simulate one period."""
         q = np.log([26.0 if self.t < 3600.0 else 12.0])
         times = self.t + np.linspace(0.0, PERIOD, 13)
         control, held = lp.Advance(lp.ImplicitEuler()), lambda t: {"heater": heater}
         *_, (self.t, self.u) = lp.simulate(self.model, q, self.u, times.tolist(), control, held)
 
     def measure(self) -> np.ndarray:
-        """Return two thermocouples, at 5 and 10 cm."""
+        """Return the noisy readings of two thermocouples, at 5 and 10 cm."""
         return np.interp([0.05, 0.10], self.model.mesh.p[0], self.u) + self.rng.normal(0.0, 0.2, 2)
 
 
 def main() -> dict[str, tuple[float, float]]:
-    """Let the tip follow 45 and 60 degrees in turn; neither tip nor hot face is measured."""
+    """Control the tip to 45 and then 60 degrees; neither the tip nor the hot face is measured."""
     model, plant = rod(30), Plant()
     sensors = lp.Points({"T_5": 0.05, "T_10": 0.10}, noise=0.2)
     law = lp.SensitivityLaw(jumps=lp.Jumps())
-    applied = {"heater": "next"}  # since the sample before
+    applied = {"heater": "next"}  # each input was applied since the previous sample
     identifier = lp.Identifier(
         model, sensors, law, u0=ROOM, between=applied, scheme=lp.Alexander2()
     )

@@ -1,4 +1,4 @@
-"""Live rods on Dask: a task for each batch, which may run again where its worker was killed."""
+"""Live rods on Dask with one task per batch, which runs again if its worker is killed."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,19 +20,19 @@ def new_shard(name):
 
 
 def advance(folder, name, offset, batch, before):
-    """Take a batch of the log; `before` is the task before it, so that they come in order."""
+    """Process a batch of the log; `before` is the previous task, which keeps the order."""
     shard, dump = new_shard(name), folder / f"{name}.bin"
     if dump.exists():
         shard.load(dump.read_bytes())
-    if shard.offset < offset + len(batch):  # else an earlier attempt came to its end
+    if shard.offset < offset + len(batch):  # otherwise an earlier attempt was complete
         table = shard.step(offset, batch).to_arrow()
-        pq.write_table(table, folder / f"{name}-{offset:06d}.parquet")  # the same at any attempt
-        write_bytes(dump, shard.dump(), sync=True)  # whole or not at all, and last
+        pq.write_table(table, folder / f"{name}-{offset:06d}.parquet")  # equal at each attempt
+        write_bytes(dump, shard.dump(), sync=True)  # atomic, and last
     return shard.offset
 
 
 def main(folder, client):
-    """Send the batches of two shards, as a reader of the log of record would."""
+    """Submit the batches of two shards in the order of the log."""
     tails = dict.fromkeys(["north", "south"])
     for k in range(BATCHES):
         z = np.exp(-0.4 * k) + 0.01 * np.random.default_rng(k).standard_normal((RODS, 2))

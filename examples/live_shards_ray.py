@@ -1,4 +1,4 @@
-"""Live rods on Ray: an actor for each shard, which goes on from its dump where it was killed."""
+"""Live rods on Ray with one actor per shard, which resumes from its dump if it is killed."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +16,7 @@ RODS, BATCHES = 20, 30
 
 @ray.remote(max_restarts=-1, max_task_retries=-1)
 class LiveShard:
-    """A shard on a worker."""
+    """Actor with one shard on a worker."""
 
     def __init__(self, folder, name):
         model = heat(lp.interval(0, 1, 99), lp.Normal(0.5, 0.2), {"left": 0.0, "right": 0.0})
@@ -29,16 +29,16 @@ class LiveShard:
             self.shard.load(self.dump.read_bytes())
 
     def advance(self, offset, batch, before):
-        """Take a batch of the log; `before` is the call before it, so that they come in order."""
+        """Process a batch of the log; `before` is the previous call, which keeps the order."""
         if self.shard.offset < offset + len(batch):
             table = self.shard.step(offset, batch).to_arrow()
-            pq.write_table(table, self.estimates.format(offset))  # the same at any attempt
-            write_bytes(self.dump, self.shard.dump(), sync=True)  # whole or not at all, and last
+            pq.write_table(table, self.estimates.format(offset))  # equal at each attempt
+            write_bytes(self.dump, self.shard.dump(), sync=True)  # atomic, and last
         return self.shard.offset
 
 
 def main(folder):
-    """Send the batches of two shards, as a reader of the log of record would."""
+    """Submit the batches of two shards in the order of the log."""
     shards = {name: LiveShard.remote(folder, name) for name in ("north", "south")}
     tails = dict.fromkeys(shards)
     for k in range(BATCHES):

@@ -1,4 +1,4 @@
-"""An update law of your own: the paper's law, but explicit in q. Instructive; prefer ours."""
+"""Your own update law: the paper's law, but explicit in q. For instruction only."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from livepde.streams import Twin
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What evolves: a frozen dataclass of arrays, so that saving it is checkpointing."""
+    """State of the law, a frozen dataclass of arrays that a checkpoint can save."""
 
     u: np.ndarray
     q: np.ndarray
@@ -27,11 +27,11 @@ class ExplicitLaw(lp.laws.Law):
     pull: float = 1.0
 
     def prepare(self, problem):
-        """Return what is computed once."""
+        """Return everything that is computed once."""
         return problem, ForwardStage(problem.model)
 
     def init(self, work, q0, u0):
-        """Return the state at the start."""
+        """Return the initial state."""
         return State(u0, q0)
 
     def step(self, work, state, interval):
@@ -41,7 +41,7 @@ class ExplicitLaw(lp.laws.Law):
         h = interval.t1 - interval.t0
         u = forward.solve(state.u, state.q, h, interval.end)
         predicted = observed.predict(u, state.q, interval.end)
-        split = observed.split(interval.present)  # missing samples shrink G
+        split = observed.split(interval.present)  # G without the rows of missing readings
         boundary = model.impose(np.zeros_like(u), interval.end)
         r = split.R @ u - split.reconstruct(interval.z1, boundary)
         q = state.q + h * self.gain * model.A(u, interval.end).adjoint(r)
@@ -49,12 +49,12 @@ class ExplicitLaw(lp.laws.Law):
         return new, lp.laws.Report(lp.laws.Status(), predicted, steps=1)
 
     def belief(self, work, state):
-        """Return the estimates; a law with a covariance gives its square roots too."""
+        """Return the estimates; a law with a covariance also returns its square roots."""
         return lp.laws.Belief(state.q, state.u)
 
 
 def problem() -> tuple[lp.Model, lp.Subdomain]:
-    """Return a rod with an unknown reaction q(x), seen on its middle."""
+    """Return a rod with an unknown reaction q(x), observed on its middle."""
     mesh = lp.interval(0.0, 1.0, 20)
     model = lp.Model(
         state=lp.Field(mesh, ElementLineP1(), dirichlet={"boundary": 0.0}),
@@ -67,7 +67,7 @@ def problem() -> tuple[lp.Model, lp.Subdomain]:
 
 
 def main() -> CheckReport:
-    """Check the law on a short stream of made-up samples."""
+    """Check the law on a short stream of simulated samples."""
     model, sensors = problem()
     twin = Twin(
         scheme=lp.ImplicitEuler(),

@@ -1,4 +1,4 @@
-"""A PDE of your own: a rod that conducts and radiates, C u_t = k u_xx - 2/R eps s (u^4 - a^4)."""
+"""Your own PDE: a rod that conducts and radiates, C u_t = k u_xx - 2/R eps s (u^4 - a^4)."""
 
 import numpy as np
 from skfem import ElementLineP2
@@ -8,7 +8,7 @@ from livepde.streams import AbsoluteNoise, Twin
 
 
 def radiating_rod(mesh, unknowns, dirichlet, R=0.005, C=3.9e6):
-    """Return the model; the surroundings' temperature a is a channel of the stream."""
+    """Return the model; the ambient temperature a is a channel of the stream."""
     loss = 2 / R * 5.67e-8
     return lp.Model(
         state=lp.Field(mesh, ElementLineP2(), dirichlet=dirichlet, unit="K", quadrature=10),
@@ -23,7 +23,7 @@ def radiating_rod(mesh, unknowns, dirichlet, R=0.005, C=3.9e6):
 
 
 def main():
-    """Check the model, then find k = 21 and eps = 0.8 from three thermometers."""
+    """Check the model, then estimate k = 21 and eps = 0.8 from three thermometers."""
     k = lp.Scalar(lp.LogNormal(15.0, std=10.0), unit="W/(m K)")
     eps = lp.LogitNormal(0.5, std=0.2, bounds=(0.0, 1.0))
     model = radiating_rod(lp.interval(0.0, 0.2, 40), {"k": k, "eps": eps}, {"left": 900.0})

@@ -1,4 +1,4 @@
-"""A sensor of your own: a differential thermometer, z = u(a) - u(b)."""
+"""Your own sensor: a differential thermometer, z = u(a) - u(b)."""
 
 from dataclasses import dataclass
 
@@ -17,14 +17,14 @@ class Differences(lp.observation.Observation):
     pairs: tuple[tuple[float, float], ...]
 
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
-        """Return G, one row for each pair; `state.probe` evaluates the state at points."""
+        """Return G, one row per pair; `state.probe` evaluates the state at points."""
         first = state.probe([[a for a, _ in self.pairs]])
         second = state.probe([[b for _, b in self.pairs]])
         return sp.csr_array(first - second)
 
 
 def main() -> CheckReport:
-    """Bind the sensor to a model and check it: R and P are projections, G^+ reconstructs."""
+    """Check the sensor with a model, such as that R and P are projections and G^+ reconstructs."""
     model = lp.Model(
         state=lp.Field(lp.interval(0.0, 1.0, 50), ElementLineP1(), dirichlet={"left": 0.0}),
         parameter=lp.Normal(1.0),

@@ -1,4 +1,4 @@
-"""Conductivity and loss of a plate from three thermometers, on many ranks, by the filter.
+"""Filter on many ranks: conductivity and loss of a plate from three thermometers.
 
 On four ranks: mpirun -n 4 python -m mpi4py examples/petsc_heat.py.
 """
@@ -15,7 +15,7 @@ STEP, NOISE, TRUTH = 0.05, 0.002, [0.4, 1.5]
 
 
 def plate(cells=60):
-    """Return u_t - k laplace(u) + s u = 3 (1 + x) with u = 1 on the left, read at three points."""
+    """Return u_t - k laplace(u) + s u = 3 (1 + x), u = 1 on the left, measured at three points."""
     domain = mesh.create_unit_square(MPI.COMM_WORLD, cells, cells)
     V = fem.FunctionSpace(domain, ("Lagrange", 1))
 
@@ -34,7 +34,7 @@ def plate(cells=60):
 
 
 def main(cells=60, samples=40):
-    """Return estimate and standard deviation of k and s."""
+    """Run the filter; return estimate and standard deviation of k and s."""
     model = plate(cells)
     prior, modes = model.parameter([0.3, 1.0]), petsc.number_modes(model.create_q(), [0.1, 0.5])
     law = petsc.PetscFilter(model, prior, modes, NOISE, lower=0.01)

@@ -1,6 +1,6 @@
-"""A reaction q(x) on a plate that is seen everywhere, on many ranks, by the paper's law.
+"""The paper's law on many ranks: a reaction q(x) on a fully observed plate.
 
-Half way the state is saved and loaded again, which another number of ranks could do, too:
+Halfway, the state is saved and loaded; another number of ranks could also load it. On four ranks:
 mpirun -n 4 python -m mpi4py examples/petsc_reaction.py.
 """
 
@@ -30,7 +30,7 @@ def plate(cells):
 
 
 def main(cells=60, samples=60, folder=None):
-    """Return the relative L2 error of q at the beginning and at the end."""
+    """Run the law; return the relative L2 error of q at the beginning and at the end."""
     model = plate(cells)
     law = petsc.PetscObserver(model, gain=1000.0, lower=0.0)
     u, truth = model.interpolate(lambda x: 2.0), model.parameter(lambda x: 1.0 + x[0] * x[1])

@@ -1,4 +1,4 @@
-"""A room behind a wall whose layers nobody knows: warm by day, at the least cost of heat."""
+"""Heat a room behind a wall of unknown layers: warm by day, at the lowest energy cost."""
 
 import numpy as np
 
@@ -6,8 +6,8 @@ import livepde as lp
 import livepde.control as ct
 
 HOUR, PERIOD, POWER, COLD = 3600.0, 1800.0, 40.0, 8.0  # s, s, W for each m^2 of wall, degC
-# End in m, conductivity of the data sheet in W/(m K), heat capacity in J/(m^3 K). The room is a
-# layer that conducts so well that it has one temperature; the film of air holds no heat.
+# End in m, data-sheet conductivity in W/(m K), heat capacity in J/(m^3 K). The room is a layer that
+# conducts so well that it has one temperature; the air film has almost no heat capacity.
 LAYERS = {
     "room": (0.02, 10.0, 6e5),
     "film": (0.03, 0.08, 1.2e3),
@@ -17,7 +17,7 @@ LAYERS = {
 }
 ENDS, SHEET, CAPACITY = np.array([*LAYERS.values()]).T
 WALL = ["masonry", "insulation", "render"]
-TRUE = {"masonry": 1.4, "insulation": 1.7, "render": 1.0}  # over the data sheets
+TRUE = {"masonry": 1.4, "insulation": 1.7, "render": 1.0}  # conductivities over data sheets
 
 
 def layer(x, name):
@@ -26,12 +26,12 @@ def layer(x, name):
 
 
 def each(x, values, names=tuple(LAYERS)):
-    """Return a value in each layer."""
+    """Return a function of x that is constant in each layer."""
     return sum(value * layer(x, name) for name, value in zip(names, values, strict=True))
 
 
 def room(cells: int) -> lp.Model:
-    """Return room and wall; unknown are the conductivities of the wall over the data sheets'."""
+    """Return room and wall; the wall's conductivities over the data sheets are unknown."""
     nodes = [np.linspace(a, b, cells + 1)[1:] for a, b in zip([0.0, *ENDS], ENDS, strict=False)]
     mesh = lp.fem.line([0.0, *np.concatenate(nodes)]).with_subdomains(
         {"air": lambda x: x[0] < 0.02}
@@ -44,7 +44,7 @@ def room(cells: int) -> lp.Model:
         A=lambda q, u, v, x: q.k * each(x, SHEET) * lp.dot(lp.grad(u), lp.grad(v)),
         B=[
             lambda u, v, x: each(x, SHEET[:2], ("room", "film")) * lp.dot(lp.grad(u), lp.grad(v)),
-            lp.On("air", lambda u, v, x: 0.6 / 0.02 * u * v),  # fresh air takes 0.6 W/(m^2 K)
+            lp.On("air", lambda u, v, x: 0.6 / 0.02 * u * v),  # ventilation loss, 0.6 W/(m^2 K)
             lp.On("right", lambda u, v, x: 20.0 * u * v),
         ],
         f=[
@@ -58,20 +58,20 @@ def room(cells: int) -> lp.Model:
 
 
 def outside(t):
-    """Return the temperature outside, which is measured and foreseen."""
+    """Return the outside temperature, which is measured and forecast."""
     return 1.0 + 5.0 * np.sin(2.0 * np.pi * (t / HOUR - 9.0) / 24.0)
 
 
 def least(t):
-    """Return the least temperature of the air: people are there from 6 to 18 h."""
+    """Return the lowest allowed air temperature; people are present from 6 to 18 h."""
     return np.where((t / HOUR % 24 >= 6) & (t / HOUR % 24 < 18), 20.0, 15.0)
 
 
 def main(days: int = 4) -> dict[str, tuple[float, float]]:
-    """Heat a cold building; return the estimates, and how long it was too cold on the last day."""
+    """Heat a cold building; return the estimates, and the hours too cold on the last day."""
     model, truth = room(4), room(10)
     sensors = lp.Points({"air": 0.0, "face": 0.03}, noise=0.1)
-    applied = {"heater": "next", "outside": "next"}  # since the sample before
+    applied = {"heater": "next", "outside": "next"}  # inputs applied since the previous sample
     identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=COLD, between=applied)
     reduced = ct.reduce(model, lp.Points({"air": 0.0}), ["heater"], sensors=sensors, u=COLD)
     goal = ct.Goal(
@@ -80,7 +80,7 @@ def main(days: int = 4) -> dict[str, tuple[float, float]]:
         inputs={"heater": (0.0, POWER)},
         limits={"air": (15.0, 24.0)},
         price={"heater": 1.0 / POWER},
-        penalty=5.0,  # of a kelvin too cold for half an hour, over that of full power
+        penalty=5.0,  # cost of 1 K too cold for half an hour, over the cost of full power
     )
     controller = ct.MPC(reduced, goal, PERIOD, horizon=18)
     loop = ct.Loop(identifier, controller, ct.Trust(spread=2.0))

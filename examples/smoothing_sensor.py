@@ -1,7 +1,7 @@
-"""Sensors that blur: a G whose range is not closed, where G^+ fails and G_alpha works.
+"""Blurring sensors: a G whose range is not closed, so that G^+ fails and G_alpha works.
 
-Every sensor sees the state through an optic, z_k = integral of k(x_k - y) u(y) dy. A small error of
-z may stand for a large one of u, so G^+ z is useless as soon as there is any noise (section 3.2).
+Each sensor measures the blurred state, z_k = integral of k(x_k - y) u(y) dy. A small error of z can
+correspond to a large error of u, so G^+ z is useless with any noise (section 3.2).
 """
 
 import numpy as np
@@ -12,18 +12,18 @@ from livepde.observation import Discrepancy, Pseudoinverse, Tikhonov
 from livepde.streams import AbsoluteNoise, Twin
 
 NOISE = 1e-3  # the state is of size 1
-WIDTH = 0.08  # of the optic
+WIDTH = 0.08  # of the blur
 
 
 def u_true(x, t):
-    """Return a state that keeps moving."""
+    """Return the true state, which is persistently excited."""
     return (1 + np.sin(t) / 2) * np.sin(np.pi * x[0]) + np.cos(0.7 * t) / 2 * np.sin(
         2 * np.pi * x[0]
     )
 
 
 def q_true(x):
-    """Return the reaction that is sought."""
+    """Return the true reaction."""
     return 2 + 3 * np.sin(np.pi * x[0]) ** 2
 
 
@@ -36,13 +36,13 @@ def f(x, t):
 
 
 def blur(nodes: np.ndarray) -> np.ndarray:
-    """Return the matrix G of sensors at every node, by the trapezoidal rule."""
+    """Return the matrix G of sensors at all nodes, by the trapezoidal rule."""
     kernel = np.exp(-((nodes[:, None] - nodes[None, :]) ** 2) / (2 * WIDTH**2))
     return kernel / (WIDTH * np.sqrt(2 * np.pi)) * np.gradient(nodes)
 
 
 def main() -> dict[str, tuple[float, float]]:
-    """Return name -> (relative error of the reconstructed state, of q at the end)."""
+    """Run each reconstruction; return the relative errors of the state and of q at the end."""
     mesh = lp.interval(0.0, 1.0, 30)
     model = lp.Model(
         state=lp.Field(mesh, ElementLineP1(), dirichlet={"boundary": 0.0}),

@@ -1,4 +1,4 @@
-"""Ten lines: two unknown numbers of a heated rod, found while the samples come."""
+"""Two unknown numbers of a heated rod in ten lines, estimated as the samples arrive."""
 
 import numpy as np
 from skfem import ElementLineP2
@@ -17,7 +17,7 @@ sensors = lp.Points({"T_1": 0.3, "T_2": 0.6}, noise=0.01)
 
 
 def main() -> dict[str, tuple[float, float]]:
-    """Run it on made-up data: k = 0.8 and s = 1.5, noise of 0.01."""
+    """Run on simulated data with k = 0.8, s = 1.5 and noise 0.01."""
     stream = Twin(
         model=model,
         observation=sensors,
