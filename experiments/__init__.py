@@ -1,5 +1,5 @@
-"""Studies beside the package: what needs the truth or hindsight, which the library must never see.
+"""Studies that use the truth or hindsight, which the library must never see. Not installed.
 
-`python -m experiments NAME`, in the folder of the project, runs a study, whose numbers are checked;
-`python -m experiments.NAME` a script, which prints a table. Nothing here is installed.
+Run both in the project folder. `python -m experiments NAME` runs a study and checks its numbers;
+`python -m experiments.NAME` runs a script, which prints a table.
 """

@@ -1,4 +1,4 @@
-"""Studies: each a command with the checks of its numbers."""
+"""Commands that run a study and check its numbers."""
 
 from __future__ import annotations
 

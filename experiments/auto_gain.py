@@ -1,16 +1,15 @@
-"""`GradientLaw(gain="auto")` against the best of a grid of gains, chosen by the truth.
+"""Compare `GradientLaw(gain="auto")` with the best constant gain of a grid, chosen by the truth.
 
-For `seed` and `seed-excited`, discrete truth, with 0, 1, 5 and 10 % noise that is white in L2. The
-law that tunes itself is told nothing: neither a gain nor the noise level nor how to smooth. The
-other is the same law with constant gains: for each seed of the noise, the smallest error of the
-grid, with Tikhonov in the V~ norm by the discrepancy principle with the exact level. Errors are
-relative L2 errors of q after the last sample, t = 60; q = 0 has 1. The prior deviation of `seed` is
-0.01, that of `seed-excited` 1.
+Data of `seed` and `seed-excited`, discrete truth, with 0, 1, 5 and 10 % noise that is white in L2.
+The self-tuning law gets no gain, noise level or smoothing. The best constant gain has the smallest
+error of the grid for each noise seed, with Tikhonov smoothing in the V~ norm by the discrepancy
+principle with the exact level. Errors are relative L2 errors of q after the last sample, t = 60;
+q = 0 has error 1. The prior standard deviation is 0.01 for `seed` and 1 for `seed-excited`.
 
     python -m experiments.auto_gain
 
-takes the seeds 100 to 109 and about a quarter of an hour; `python -m experiments.auto_gain seed 100
-101` runs one example with these seeds.
+runs seeds 100 to 109 in about a quarter of an hour; `python -m experiments.auto_gain seed 100 101`
+runs one example with these seeds.
 """
 
 from __future__ import annotations
@@ -33,9 +32,9 @@ from livepde.streams import Twin
 LEVELS = (0.0, 0.01, 0.05, 0.10)
 SEEDS = tuple(range(100, 110))
 TARGET = 1.3
-STEPS = FailedSteps()  # of the law that tunes itself
+STEPS = FailedSteps()  # of the self-tuning law
 EXAMPLES: dict[str, tuple[Any, float, tuple[float, ...], tuple[float, ...]]] = {
-    # module, prior deviation of q, gains, c1; a gain counts in units of 1/std^2
+    # module, prior standard deviation of q, gains in units of 1/std^2, c1
     "seed": (seed, 0.01, (1e2, 1e4, 1e6, 1e8), (0.1, 1.0, 10.0, 100.0)),
     "seed-excited": (
         seed_excited,
@@ -47,7 +46,7 @@ EXAMPLES: dict[str, tuple[Any, float, tuple[float, ...], tuple[float, ...]]] = {
 
 
 def final(twin: Twin, samples: Any, observation: Any, law: GradientLaw, u0: Any) -> float:
-    """Return the relative L2 error of q after the last sample; infinity if that step failed."""
+    """Run a law; return the relative L2 error of q at the end, infinity if the last step failed."""
     identifier = Identifier(twin.model, observation, law, q0=0.0, u0=u0)
     error = np.inf
     for sample in samples:
@@ -59,7 +58,7 @@ def final(twin: Twin, samples: Any, observation: Any, law: GradientLaw, u0: Any)
 
 
 def smoothed(observation: Any, level: float) -> Any:
-    """Return the sensors with the smoothing that constant gains are given."""
+    """Return the observation with the smoothing used for constant gains."""
     how = Tikhonov("V", Discrepancy(1.0, level=level))
     if isinstance(observation, Full):
         return Full(reconstruction=how)
@@ -67,7 +66,7 @@ def smoothed(observation: Any, level: float) -> Any:
 
 
 def compare(name: str, level: float, number: int) -> tuple[float, float]:
-    """Print and return the error of the law that tunes itself, and the best of the grid."""
+    """Print and return the error of the self-tuning law and the smallest error of the grid."""
     module, std, gains, damping = EXAMPLES[name]
     twin = module.twin_of(std)
     observation, u0 = twin.observation, module.start
@@ -89,12 +88,12 @@ def compare(name: str, level: float, number: int) -> tuple[float, float]:
 
 
 def main(names: Sequence[str], seeds: Sequence[int]) -> None:
-    """Print the table."""
+    """Print the table of median errors and their ratios."""
     rows = []
     for name, level in product(names, LEVELS):
-        found = np.array([compare(name, level, k) for k in (seeds if level else (0,))])
-        ratio = found[:, 0] / found[:, 1]
-        own, best = np.median(found, axis=0)
+        errors = np.array([compare(name, level, k) for k in (seeds if level else (0,))])
+        ratio = errors[:, 0] / errors[:, 1]
+        own, best = np.median(errors, axis=0)
         rows.append(
             f"{name:14s} {level:4.0%}  {own:9.5f}  {best:9.5f}  {np.median(ratio):6.2f} "
             f"({ratio.min():.2f} to {ratio.max():.2f})  "

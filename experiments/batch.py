@@ -1,9 +1,9 @@
-"""Fits with hindsight of cases that are given more freedom than they take: what their pages quote.
+"""Least-squares fits of cases with more unknowns than the cases have, as quoted on their pages.
 
-The case's own forward model and data, all samples at once, least squares without a prior.
-    column     the three depths without and with immobile water
+Each fit uses the forward model and all samples of a case at once, without a prior.
+    column     three depths, without and with immobile water
     streambed  one uniform bed
-    borehole   heat capacities of fluid and grout unknown, too (rho_c and share with their priors)
+    borehole   unknown heat capacities of fluid and grout (rho_c and share keep their priors)
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ CASES = Path(__file__).parents[1] / "cases"
 
 
 class Forward:
-    """A case with its data, z: what it predicts for given numbers."""
+    """Forward model of a case, with its readings z of shape (times, sensors)."""
 
     def __init__(self, name: str, settings: Mapping[str, Any]) -> None:
         self.case = case = load(CASES / f"{name}.toml", allow_code=True, settings=settings)
@@ -38,7 +38,7 @@ class Forward:
         self.inputs = dict(readings)
 
     def __call__(self, numbers: Mapping[str, Any], u0: Any = None) -> np.ndarray:
-        """Return predictions, shape (times, sensors)."""
+        """Return the predictions for given unknowns, shape (times, sensors)."""
         q = self.model.initial_parameter(numbers)
         start = self.prepared.u0 if u0 is None else u0
         control = Advance(self.case.scheme, self.case.dt_max)
@@ -50,15 +50,15 @@ class Forward:
 def fit(
     residual: Callable[[Any], Any], start: Any, high: Any = np.inf, low: float = 1e-6
 ) -> tuple[Any, float]:
-    """Return numbers between bounds, and the root mean square of what is left."""
+    """Fit parameters within bounds; return them and the root mean square of the residuals."""
 
     def finite(p: Any) -> Any:  # without missing samples
         misses = np.ravel(residual(p))
         return misses[np.isfinite(misses)]
 
     scale = np.abs(start)
-    found = least_squares(finite, start, bounds=(low, high), x_scale=scale, diff_step=[1e-5])
-    return found.x, float(np.sqrt(np.mean(found.fun**2)))
+    solution = least_squares(finite, start, bounds=(low, high), x_scale=scale, diff_step=[1e-5])
+    return solution.x, float(np.sqrt(np.mean(solution.fun**2)))
 
 
 def column() -> None:

@@ -1,19 +1,19 @@
-"""Section 4.1 beyond D = 1: D that varies, vanishes on a part, or is negative on a part.
+"""The equation of section 4.1 with a D that varies, vanishes on a part, or is negative on a part.
 
     u_t - (D u_x)_x + q u = f on (0, 1),   u = 0 at the ends,   z = u on omega = (0.3, 1)
 
 with q* and u* of the excited twin, Q = H^1, q^(0) = 0 and the operators M and N of (MN1), (MN2).
 
 - varying: D = 1 + 0.8 sin(2 pi x).
-- degenerate: D = 2 max(x - 1/2, 0), zero on the whole unobserved part and on some of omega.
-- antidiffusion: D = -0.05 outside of omega, 1 on it. The true process is ill-posed: its modes in
-  the unobserved part grow, the faster the shorter they are. So it cannot be simulated, and the data
-  come from the manufactured state u*, which a discrete source makes an exact discrete solution.
+- degenerate: D = 2 max(x - 1/2, 0), zero on the whole unobserved part and on a part of omega.
+- antidiffusion: D = -0.05 outside omega, 1 on it. The true process is ill-posed: its modes in the
+  unobserved part grow, and shorter modes grow faster. It cannot be simulated, so the data come from
+  the manufactured state u*, which a discrete source makes an exact discrete solution.
 
-Each is run with nu = 0, 0.1 and 2. The term nu P N P u attracts P u to zero and not to P u*, so p
-grows with nu where D >= 0: there the dynamics themselves damp p. The error of q does not follow p:
-for the varying D, nu = 0.1 improves it and nu = 2 worsens it; where D vanishes nu = 2 is the best
-of the three. For D < 0 only nu P N P u bounds p, and only for nu > 1, since N has |D|.
+Each D is run with nu = 0, 0.1 and 2. The term nu P N P u attracts P u to zero instead of P u*.
+Where D >= 0, the dynamics damp p by themselves, and p grows with nu. The error of q does not follow
+p: for the varying D, nu = 0.1 improves it and nu = 2 worsens it; for the degenerate D, nu = 2 is
+the best of the three. For D < 0 only nu P N P u bounds p, and only for nu > 1, since N has |D|.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ FAILED = 1e3
 
 
 def omega(x: Any) -> Any:
-    """Observed part of the domain, as a predicate."""
+    """Return whether x is in the observed part of the domain."""
     return x[0] > OMEGA - 1e-9
 
 
 @dataclass(frozen=True)
 class DiffusionCase:
-    """Diffusivity, with time step and gain of its runs."""
+    """Diffusivity D, with the time step h, number of steps, gain and c_1 of its runs."""
 
     D: Callable[[Any], Any]
     h: float
@@ -66,8 +66,8 @@ class DiffusionCase:
 PROCESSES = {
     "varying": DiffusionCase(lambda x: 1 + 0.8 * np.sin(2 * np.pi * x[0]), 0.02, 500, 1e3, 10.0),
     "degenerate": DiffusionCase(lambda x: 2 * np.maximum(x[0] - 0.5, 0.0), 0.02, 500, 1e3, 10.0),
-    # The steps are so small that implicit Euler resolves the growth of every mode (h lambda < 1/2):
-    # with larger steps it would damp growing modes.
+    # With larger steps, implicit Euler would damp growing modes. This step resolves the growth of
+    # every mode: h lambda < 1/2.
     "antidiffusion": DiffusionCase(
         lambda x: np.where(x[0] < OMEGA, -0.05, 1.0), 0.002, 1500, 100.0, 1000.0
     ),
@@ -76,7 +76,7 @@ PROCESSES = {
 
 @dataclass(frozen=True, eq=False)
 class DiffusionRun:
-    """One run: times, relative errors of q, ||p||_X, ||e||_Q^2/gain + ||r||_X^2, final estimate."""
+    """Run with errors of q, ||p||_X as `hidden`, ||e||_Q^2/gain + ||r||_X^2 as `energy`."""
 
     result: Result
     times: Array
@@ -87,7 +87,7 @@ class DiffusionRun:
 
     @property
     def failed(self) -> int:
-        """Number of failed steps: a run ends with the first."""
+        """Number of failed steps, at most 1: a run ends at its first failed step."""
         return int(not self.last.status.ok)
 
     @property
@@ -151,12 +151,12 @@ def identify(
 
 
 def degenerate(*, quick: bool = False, progress: bool = False) -> Outcome:
-    """Run all processes with every nu.
+    """Run each D with every nu, and check the errors.
 
     Parameters
     ----------
     quick
-        Run the process whose D varies, and no other.
+        Run only the process with the varying D.
     progress
         Show a progress bar for every run.
     """
@@ -236,7 +236,7 @@ def _table(courses: dict[tuple[str, float], DiffusionRun]) -> Table:
 
 
 def _antidiffusion(held: DiffusionRun, lost: DiffusionRun) -> list[Check]:
-    """Return the checks where D < 0: lost with nu = 0, bounded with the largest nu."""
+    """Check that, where D < 0, p is lost with nu = 0 and bounded with the largest nu."""
     return [
         Check("largest |p|, antidiffusion, nu = 0", float(lost.hidden.max()), FAILED, ">="),
         Check(f"largest |p|, antidiffusion, nu = {NU:g}", float(held.hidden.max()), BOUNDED, "<="),
@@ -251,7 +251,7 @@ def _antidiffusion(held: DiffusionRun, lost: DiffusionRun) -> list[Check]:
 
 
 def _figure(courses: dict[tuple[str, float], DiffusionRun]) -> Any:
-    """Draw ||p|| over time of all runs."""
+    """Plot ||p||_X of all runs over time."""
     drawn, axes = plots.figure()
     series = {f"{n}, nu = {nu:g}": (c.times, c.hidden) for (n, nu), c in courses.items()}
     plots.history(series, ylabel="|p| in X", ax=axes[0])
@@ -259,8 +259,8 @@ def _figure(courses: dict[tuple[str, float], DiffusionRun]) -> Any:
 
 
 # Expected results: for each (D, nu) the relative L2 error of q at the end, and bounds on |p|.
-# "varying" was also measured with the dense implementation in reference.py, its error against the
-# interpolant of q*: 0.1963 with nu = 0, 0.1160 with nu = 0.1.
+# For "varying", the dense implementation in reference.py gives errors against the interpolant of q*
+# of 0.1963 with nu = 0 and 0.1160 with nu = 0.1.
 NUS = (0.0, 0.1, 2.0)
 NU = 2.0
 EXPECTED = {

@@ -1,4 +1,4 @@
-"""Section 4.1 in one, two and three dimensions: Q = H^2, boundary values g(t, x), any omega.
+"""Convergence of the method of section 4.1 in 1D, 2D and 3D, with Q = H^2 and any g(t, x), omega.
 
     u_t - div(grad u) + q u = f on (0, 1)^d,   u = g on the boundary,   z = u on omega
 
@@ -6,22 +6,22 @@
     u* = 2 + x_1 (1 + t/2) + (1 + t)/2 times the product of sin(pi x_k),   g = u*
 
 with Q = H^2 and a correlation length of 0.2, so s = 2 > d/2 for d <= 3; q^(0) = 0. u* is linear in
-t, so implicit Euler makes no error in time, and only the spatial error remains. Errors are measured
-against the formulas, in L^2.
+t, so implicit Euler is exact in time, and only the spatial error remains. Errors are relative L^2
+errors against the formulas.
 
-Data of the same discretisation ("discrete") leave the errors of the elements in u: of order 2 with
-first order elements, 3 with second order ones, 4 with Bogner-Fox-Schmit. Cubic Hermite elements on
-a line are so accurate that u does not reach their accuracy until t = 1.5: on 16 cells the error of
-u is 1.7e-5, that of the elements 3e-7. The difference is r, which is not zero as long as q still
-changes: it vanishes at t = 6, or at t = 1.5 with a gain of 1e7. A second table shows both.
+With data of the same discretisation ("discrete"), u has the projection error of the elements: of
+order 2 with linear, 3 with quadratic and 4 with Bogner-Fox-Schmit elements. Cubic Hermite elements
+on a line are so accurate that u does not reach their accuracy by t = 1.5: on 16 cells the error of
+u is 1.7e-5, the projection error 3e-7. The difference is r, which is nonzero while q still changes.
+It vanishes at t = 6, or at t = 1.5 with a gain of 1e7. A second table shows both.
 
-The error of q also exceeds that of the elements, permanently: q is observed through the integrals
-of q u v, and every v vanishes on the boundary, so that parts of q next to it are unobserved (A(u) e
-is 1e-7 of A(u) q* for the error e on 16 cells at t = 3) and extended smoothly, as outside of omega.
+The error of q permanently exceeds the projection error: q is observed through integrals of q u v,
+and every v vanishes on the boundary. So parts of q next to the boundary are unobserved (A(u) e is
+1e-7 of A(u) q* for the error e on 16 cells at t = 3); they are extended smoothly, as outside omega.
 
-Data of the exact u* ("analytic") enter B(w), which takes two derivatives of them: this costs q one
-order of convergence with first order elements, with a large constant. Elements of class C^1 do
-better: the paper chose them for "the required regularity on arguments of the operators M, N".
+Data of the exact u* ("analytic") enter B(w), which takes two derivatives of them. With linear
+elements this costs q one order of convergence, with a large constant. C^1 elements are better: the
+paper chose them for "the required regularity on arguments of the operators M, N".
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ INNER = Sobolev(2.0, length=0.2)
 
 
 def q_true(x: Any) -> Any:
-    """The exact parameter q*."""
+    """Return the exact parameter q*."""
     return 1.0 + np.prod([np.sin(np.pi * x[k]) ** 2 for k in range(len(x))], axis=0)
 
 
@@ -73,7 +73,7 @@ def _bump(x: Any) -> Any:
 
 
 def u_true(x: Any, t: float) -> Any:
-    """The exact state u*, which is also the boundary value g(t, x)."""
+    """Return the exact state u*, which is also the boundary value g(t, x)."""
     return 2.0 + x[0] * (1.0 + t / 2) + (1.0 + t) / 2 * _bump(x)
 
 
@@ -82,7 +82,7 @@ def source(d: int) -> Callable[[Any, float], Any]:
 
     def f(place: Any, t: float) -> Any:
         x = np.array([place[k] for k in range(d)])
-        # Each of the d second derivatives of the product of sines is -pi^2 times it.
+        # Each of the d second derivatives of the product of sines is -pi^2 times the product.
         laplace = -d * np.pi**2 * (1.0 + t) / 2 * _bump(x)
         return (x[0] + _bump(x)) / 2 - laplace + q_true(x) * u_true(x, t)
 
@@ -90,12 +90,12 @@ def source(d: int) -> Callable[[Any, float], Any]:
 
 
 def ball(x: Any) -> Any:
-    """Observed ball about the centre, as a predicate."""
+    """Return whether x is in the observed ball about the centre."""
     return sum((x[k] - 0.5) ** 2 for k in range(len(x))) < 0.4**2
 
 
 def corner(x: Any) -> Any:
-    """Observed L-shape, as a predicate: the square without one of its corners."""
+    """Return whether x is in the observed L-shape, the square without one corner."""
     return (x[0] < 0.6) | (x[1] < 0.6)
 
 
@@ -114,7 +114,7 @@ class MeshFamily:
     state, parameter
         Functions from the mesh to the elements of state and parameter.
     u_order, q_order
-        Expected orders minus 0.4; None: not checked.
+        Smallest accepted orders, 0.4 below the expected ones; None: not checked.
     omega
         Predicate of the observed part; default the whole domain.
     """
@@ -168,7 +168,7 @@ class MeshErrors:
     u, q, everywhere
         Relative errors of u, of q on omega, and of q on all of Omega.
     elements
-        Projection error of u* onto the elements.
+        Relative error of the L2 projection of u* onto the elements.
     failed
         Number of failed steps.
     """
@@ -205,7 +205,7 @@ def identify(
     gain: float = GAIN,
     end: float = END,
 ) -> MeshErrors:
-    """Run the paper's method on one mesh."""
+    """Run the paper's method on one mesh, and return its errors."""
     times = STEP * np.arange(round(end / STEP) + 1)
     model, sensors = build(setting, cells)
     twin = Twin(
@@ -220,17 +220,17 @@ def identify(
     identifier = paper.identifier(
         model, sensors, gain=gain, damping=ResidualDamping(1.0), u0=lambda x: u_true(x, 0.0)
     )
-    found = track(identifier, twin, what, progress)
+    run = track(identifier, twin, what, progress)
     q, u = next(iter(model.parameter_space.fields.values())), model.state_block
     exact = partial(u_true, t=end)
     return MeshErrors(
         model.X.dim,
         model.Q.dim,
-        distance(u, found.last.u, exact),
-        distance(q, found.last.q, q_true, setting.omega),
-        distance(q, found.last.q, q_true),
+        distance(u, run.last.u, exact),
+        distance(q, run.last.q, q_true, setting.omega),
+        distance(q, run.last.q, q_true),
         distance(u, u.interpolate(exact), exact),
-        int(np.isnan(found.errors).sum()),
+        int(np.isnan(run.errors).sum()),
     )
 
 
@@ -253,14 +253,14 @@ def dimensions(
     quick: bool = False,
     progress: bool = False,
 ) -> Outcome:
-    """Run all families on all of their meshes.
+    """Run each family on all its meshes, and check the orders of convergence.
 
     Parameters
     ----------
     truth
-        Origin of the data: the same discretisation, or the exact state.
+        Origin of the data: "discrete", the same discretisation, or "analytic", the exact state.
     quick
-        Run the first families of one and of two dimensions only.
+        Run only the first 1D and the first 2D family.
     progress
         Show a progress bar for every run.
     """
@@ -280,7 +280,7 @@ def dimensions(
         for what, value, bound in zip("uq", orders[name], pair, strict=True)
         if bound is not None
     ]
-    failed = sum(found.failed for group in errors.values() for found in group)
+    failed = sum(run.failed for group in errors.values() for run in group)
     checks.append(Check("failed steps", float(failed), 0.0, "<="))
     if truth == "discrete":
         late, more = _in_time(errors["1D Hermite"][-1], progress)
@@ -329,7 +329,7 @@ def _tables(
 
 
 def _in_time(first: MeshErrors, progress: bool) -> tuple[Table, list[Check]]:
-    """Return table and checks of the finest line mesh for longer runs and a higher gain."""
+    """Rerun the finest line mesh longer and with a higher gain; return table and checks."""
     setting = SETTINGS["1D Hermite"]
     runs = {(GAIN, END): first}
     for gain, end in ((GAIN, 2 * END), (GAIN, SETTLED), (100 * GAIN, END)):
@@ -353,7 +353,7 @@ def _in_time(first: MeshErrors, progress: bool) -> tuple[Table, list[Check]]:
 
 
 def _figure(errors: dict[str, list[MeshErrors]]) -> Any:
-    """Draw the errors of q over the cells per side."""
+    """Plot the errors of q over the cells per side."""
     drawn, axes = plots.figure()
     for name, group in errors.items():
         axes[0].loglog(SETTINGS[name].cells, [found.q for found in group], "o-", label=name)
@@ -363,7 +363,7 @@ def _figure(errors: dict[str, list[MeshErrors]]) -> Any:
     return drawn
 
 
-# Expected results: error of q on omega on the finest mesh; orders of q with analytic data.
+# Upper bounds on the error of q on omega on the finest mesh; lower bounds on its analytic orders.
 EXPECTED = {"2D P1": 0.002, "2D P1, ball": 0.004, "2D P1, L-shape": 0.004, "3D P1": 0.03}
 ANALYTIC = {"1D Hermite": 1.6, "2D P1": 0.8, "2D Bogner-Fox-Schmit": 1.6, "3D P1": 0.8}
 ORDERS: dict[str, dict[str, tuple[float | None, float | None]]] = {  # of (u, q)
@@ -377,8 +377,7 @@ NOTES = {
     "vanish: there the law only extends q smoothly.",
     "analytic": "Data of the exact u* pass through two derivatives: that costs q one order.",
 }
-# In time: error of u over the projection error of cubic elements on a line; measured 55, 1.11,
-# 1.004.
+# Error of u over the projection error of cubic elements on a line; measured 55, 1.11, 1.004.
 SETTLED = 6.0
 UNSETTLED = 50.0
 OF_ELEMENTS = 1.15

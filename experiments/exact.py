@@ -1,15 +1,15 @@
 """Comparison of the law with an independent implementation of Boiger and Kaltenbacher (2016).
 
-`experiments.reference` implements the method in NumPy, with its own elements, matrices and
-solver. Both get the same data here: the same basis functions, loads F_k and measurements, omega a
-union of elements, and undivided steps. So differences are due to the law alone: to the solution of
-each step, strict (`livepde.paper.STRICT`) or by default.
+`experiments.reference` implements the method in NumPy, with its own elements, matrices and solver.
+Both implementations use the same basis functions, loads F_k and measurements, an omega that is a
+union of elements, and undivided steps. So differences come only from how the law solves each step,
+strictly (`livepde.paper.STRICT`) or by default.
 
-Settings without a reference, in two dimensions, with a degenerate D and with noise, compare the
-default with strict solves (`experiments.strict`).
+For settings without a reference (2D, degenerate D, noise), `experiments.strict` compares default
+with strict solves.
 
-Then follow the statements on nu and on the norms of the unobserved part, mesh by mesh, and the
-energy ||e||_Q^2 / gain + ||r||_X^2, which never grows with full, exact data.
+The study also checks the effect of nu and the norms of the unobserved part on several meshes, and
+the energy ||e||_Q^2 / gain + ||r||_X^2, which never grows with full, exact data.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ class Loaded(Model):
     Parameters
     ----------
     loads
-        Dual vectors in X*, a row for each time, shape (samples, n).
+        Dual vectors in X*, one row per time, shape (samples, n).
     h
-        Step.
+        Time step.
     forms
-        Forms as for `Model`, without f.
+        Weak forms as in `Model`, without f.
     """
 
     def __init__(self, loads: Array, h: float, **forms: Any) -> None:
@@ -73,7 +73,7 @@ class Loaded(Model):
 
 @dataclass(frozen=True, eq=False)
 class ReferenceSamples:
-    """Data of a setting from the reference; array rows are free and fixed coefficients.
+    """Data of a setting from the reference; vectors contain free and fixed coefficients.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class ReferenceSamples:
 
     @classmethod
     def of(cls, setting: Setting) -> ReferenceSamples:
-        """Return the data of a setting."""
+        """Generate the data of a setting."""
         at = Discretisation(setting)
         times = setting.h * np.arange(setting.steps + 1.0)
         q, U, F = reference.truth(at, times)
@@ -128,7 +128,7 @@ class ReferenceSamples:
             "zero": {"dirichlet": {"boundary": 0.0}},
             "clamped": {"dirichlet": {"boundary": 0.0}, "clamped": True},
         }
-        # A Gauss rule of so many points is exact to this order: both integrate with the same rule.
+        # The order up to which the reference's Gauss rule is exact selects the same rule here.
         exact = 2 * setting.points - 1
         q: Field | Normal = Normal()
         if setting.parameter != "constant":
@@ -154,14 +154,14 @@ class ReferenceSamples:
 
 @dataclass(frozen=True, eq=False)
 class LawRun:
-    """Run of the law: estimates after each sample, and mask of samples with status ok.
+    """Estimates of the law after each sample.
 
     Attributes
     ----------
     Q, U
-        Shapes (samples, m) and (samples, n).
+        Estimates of q and u, shapes (samples, m) and (samples, n).
     ok
-        Shape (samples,).
+        Mask of samples with status ok, shape (samples,).
     """
 
     Q: Array
@@ -175,7 +175,7 @@ class LawRun:
 
 
 def law(setting: Setting, newton: Newton) -> GradientLaw:
-    """Return the law of a setting; q is never held, as in the paper."""
+    """Return the law of a setting; without a gate, so that q is never held, as in the paper."""
     rule: Damping = ResidualDamping(setting.c1)
     if setting.mu:
         rule = ConstantDamping(setting.mu, setting.floor)
@@ -197,7 +197,7 @@ def follow(samples: ReferenceSamples, law: GradientLaw, halvings: int = 0) -> La
     return LawRun(np.array(Q), np.array(U), np.array(ok))
 
 
-# --- beside the reference ------------------------------------------------------------------------
+# --- comparison with the reference ---------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,14 +207,14 @@ class Agreement:
     Attributes
     ----------
     samples
-        The data of both.
+        Data that both implementations use.
     strict, default
         Runs of the law with `livepde.paper.STRICT` and with the default `Newton`.
     of_strict, of_default
-        Differences of q and of u: the largest |q - q_ref| over x and all samples with status ok,
-        over the largest |q_ref| or |q*|, whichever is larger; u likewise.
+        Relative differences of q and u: the largest |q - q_ref| over x and all samples with status
+        ok, divided by the larger of max |q_ref| and max |q*|; u likewise.
     residual
-        The largest relative residual of a strict run in the equations of the reference.
+        Largest relative residual of the strict run in the equations of the reference.
     """
 
     samples: ReferenceSamples
@@ -226,12 +226,12 @@ class Agreement:
 
     @property
     def failed(self) -> int:
-        """Number of failed steps of both runs."""
+        """Number of failed steps in both runs."""
         return self.strict.failed + self.default.failed
 
     @property
     def apart(self) -> float:
-        """Largest |q - q_strict| of the default run, over samples with status ok."""
+        """Largest |q - q_strict| of the default run over samples with status ok in both runs."""
         ok, q = self.default.ok & self.strict.ok, self.samples.q
         return float(np.abs(q(self.default.Q[ok] - self.strict.Q[ok])).max())
 
@@ -244,19 +244,19 @@ class Agreement:
 def compare(setting: Setting) -> Agreement:
     """Run the reference and the law on the same data."""
     setting = replace(setting, cut=False)
-    samples, found = ReferenceSamples.of(setting), reference.run(setting)
+    samples, dense = ReferenceSamples.of(setting), reference.run(setting)
     strict = follow(samples, law(setting, paper.STRICT))
     default = follow(samples, law(setting, Newton()))
-    left = reference.residuals(samples.at, strict.Q, strict.U, found.Z, found.F)
-    scale_q = _largest(samples.q(found.Q), samples.q(found.q_true))
-    scale_u = _largest(samples.u(found.U), samples.u(found.U_true))
+    residuals = reference.residuals(samples.at, strict.Q, strict.U, dense.Z, dense.F)
+    scale_q = _largest(samples.q(dense.Q), samples.q(dense.q_true))
+    scale_u = _largest(samples.u(dense.U), samples.u(dense.U_true))
 
     def differences(run: LawRun) -> tuple[float, float]:
         ok = run.ok
-        of_q, of_u = samples.q(run.Q - found.Q)[ok], samples.u(run.U - found.U)[ok]
+        of_q, of_u = samples.q(run.Q - dense.Q)[ok], samples.u(run.U - dense.U)[ok]
         return _largest(of_q) / scale_q, _largest(of_u) / scale_u
 
-    residual = _largest(left)
+    residual = _largest(residuals)
     return Agreement(samples, strict, default, differences(strict), differences(default), residual)
 
 
@@ -278,14 +278,14 @@ def errors(samples: ReferenceSamples, course: LawRun) -> tuple[float, float]:
 
 
 def agreements(names: Iterable[str], progress: bool = False) -> dict[str, Agreement]:
-    """Compare the law with the reference in settings by their names."""
+    """Compare the law with the reference in the named settings."""
     chosen = list(names)
     shown = watched(chosen, len(chosen), "settings") if progress else chosen
     return {name: compare(SETTINGS[name]) for name in shown}
 
 
 def agreement_table(found: Mapping[str, Agreement]) -> Table:
-    """Return the table of differences, a row for each setting."""
+    """Return the table of differences, one row per setting."""
     return Table(
         "largest differences from the reference, relative to |q|, |u|: strict, and by default",
         ["setting", "q strict", "u strict", "q", "u", "failed"],
@@ -297,7 +297,7 @@ def agreement_table(found: Mapping[str, Agreement]) -> Table:
 
 
 def agreement_checks(found: Mapping[str, Agreement]) -> list[Check]:
-    """Return checks of the differences, and of consequences of the same runs."""
+    """Return checks of the differences, failed steps and residuals of the runs."""
     checks = [
         Check(f"difference, {name}, {how}", max(differences), bound, "<=")
         for name, item in found.items()
@@ -326,7 +326,7 @@ def agreement_checks(found: Mapping[str, Agreement]) -> list[Check]:
 
 
 def _nu_checks(found: Mapping[str, Agreement]) -> list[Check]:
-    """Return the check that nu does not harm where D varies, if both settings were compared."""
+    """Check that nu > 0 does not harm where D varies, if both settings were compared."""
     names = [f"varying D, nu = {nu}" for nu in ("0", "0.1")]
     if not found.keys() >= set(names):
         return []
@@ -344,9 +344,9 @@ class OnMesh:
     Attributes
     ----------
     kind, nodes
-        Kind of elements, and number of nodes.
+        Kind of mesh, `FITTED` or `UNIFORM`, and number of nodes.
     errors
-        For each nu the relative L2 errors of q and u at the end, strict solves.
+        nu -> relative L2 errors of q and u at the end with strict solves; NaN if a step failed.
     hidden
         ||P u*||_V^ at the start.
     lipschitz
@@ -361,24 +361,24 @@ class OnMesh:
 
     @classmethod
     def of(cls, kind: str, nodes: int) -> OnMesh:
-        """Return all results on one mesh."""
+        """Compute the results on one mesh."""
         mesh = fitted(nodes, PAPER.omega) if kind == FITTED else np.linspace(0, 1, nodes)
         setting = replace(PAPER, nodes=mesh, cut=False)
         samples = ReferenceSamples.of(setting)
-        found = {}
+        of_nu = {}
         for nu in NU:
             course = follow(samples, law(replace(setting, nu=nu), paper.STRICT))
-            found[nu] = errors(samples, course) if course.ok.all() else (np.nan, np.nan)
+            of_nu[nu] = errors(samples, course) if course.ok.all() else (np.nan, np.nan)
         model, observation = samples.build()
         observed = observation.bind(model.state_space, model.X, model.parameter_space)
         MN, start = diffusion_operator(1.0), samples.U_true[0]
         spaces = Spaces(model, observed, MN, MN)
         L_C = constants(spaces, samples.q_true, [start]).L_C
-        return cls(kind, nodes, found, spaces.hidden_part.norms(start).V, L_C)
+        return cls(kind, nodes, of_nu, spaces.hidden_part.norms(start).V, L_C)
 
 
 def mesh_table(meshes: Sequence[OnMesh]) -> Table:
-    """Return the table of errors and norms, a row for each mesh."""
+    """Return the table of errors and norms, one row per mesh."""
     of_nu = [f"{what}, {nu:g}" for nu in NU for what in ("q", "u")]
     return Table(
         "errors of q and, in %, of u by nu; |P u*| in V^; L_C (gain 100, c1 = 1)",
@@ -404,7 +404,7 @@ def _percent(errors: tuple[float, float]) -> tuple[float, float]:
 
 
 def mesh_checks(meshes: Sequence[OnMesh]) -> list[Check]:
-    """Return checks that errors and norms do not depend on the mesh."""
+    """Check that errors and norms do not depend on the mesh."""
     checks = []
     for mesh in meshes:
         where = f"{mesh.kind} mesh, {mesh.nodes} nodes"
@@ -429,7 +429,7 @@ def mesh_checks(meshes: Sequence[OnMesh]) -> list[Check]:
 
 
 def growth(samples: ReferenceSamples, course: LawRun) -> float:
-    """Return the largest growth of the energy in a step, relative to the energy at the start."""
+    """Return the largest growth of the energy in one step, relative to the initial energy."""
     at = samples.at
     e = (course.Q - samples.q_true)[:, at.Q.free]
     r = course.U[:, at.X.free] - samples.z
@@ -441,7 +441,7 @@ def growth(samples: ReferenceSamples, course: LawRun) -> float:
 
 
 def rules(samples: ReferenceSamples) -> dict[str, Damping]:
-    """Return damping rules of every kind, with bounds from the constants of the model."""
+    """Return damping rules of every kind by name, with bounds from the model's constants."""
     model, observation = samples.build()
     observed = observation.bind(model.state_space, model.X, model.parameter_space)
     MN = diffusion_operator(1.0)
@@ -459,22 +459,22 @@ def rules(samples: ReferenceSamples) -> dict[str, Damping]:
 def energies(
     settings: Mapping[str, Setting], progress: bool = False
 ) -> list[tuple[str, str, float, float]]:
-    """Return (setting, rule, growth with strict solves, growth with default solves)."""
-    found = []
+    """Return rows (setting, rule, energy growth with strict solves, growth with default solves)."""
+    rows = []
     for name, setting in settings.items():
         samples = ReferenceSamples.of(setting)
         items = rules(samples).items()
         for what, rule in watched(items, len(items), f"energy, {name}") if progress else items:
             strict = replace(law(setting, paper.STRICT), damping=rule)
             default = GradientLaw(setting.gain, rule)
-            runs = follow(samples, strict), follow(samples, default, Advance.halvings)
-            one, other = (growth(samples, run) for run in runs)
-            found.append((name, what, one, other))
-    return found
+            of_strict = growth(samples, follow(samples, strict))
+            of_default = growth(samples, follow(samples, default, Advance.halvings))
+            rows.append((name, what, of_strict, of_default))
+    return rows
 
 
 def energy_checks(found: Sequence[tuple[str, str, float, float]]) -> list[Check]:
-    """Return checks that the energy never grows."""
+    """Check that the energy never grows."""
     return [
         check
         for name, rule, strict, default in found
@@ -485,17 +485,17 @@ def energy_checks(found: Sequence[tuple[str, str, float, float]]) -> list[Check]
     ]
 
 
-# --- all of it -----------------------------------------------------------------------------------
+# --- study ---------------------------------------------------------------------------------------
 
 
 def exact(*, quick: bool = False, progress: bool = False) -> Outcome:
-    """Run all settings, meshes and rules.
+    """Compare all settings, meshes and damping rules.
 
     Parameters
     ----------
     quick
-        Three settings, two more against strict solves, the two meshes of 31 nodes, and the energy
-        of the excited twin only.
+        Run only three settings, two comparisons with strict solves, the two meshes of 31 nodes, and
+        the energy of the excited twin.
     progress
         Show progress bars.
     """
@@ -535,7 +535,7 @@ def exact(*, quick: bool = False, progress: bool = False) -> Outcome:
 
 
 def _figure(found: Mapping[str, Agreement]) -> Any:
-    """Draw the error of q over time, strict and default, in three settings."""
+    """Plot the error of q over time, strict and default, in three settings."""
     drawn, axes = plots.figure()
     series = {}
     for name in DRAWN:
@@ -549,9 +549,9 @@ def _figure(found: Mapping[str, Agreement]) -> Any:
     return drawn
 
 
-# Expected results. Differences of q and u from the reference, relative to the largest |q|, |u|.
+# Bounds on the differences of q and u from the reference, relative to the largest |q|, |u|.
 STRICT, DEFAULT = 1e-6, 1e-3
-APART = 0.01  # |q - strict| by default with 0.1 % data error, whatever the unit of u; q* is 2
+APART = 0.01  # |q - strict| of default runs with 0.1 % data error in any unit of u; q* is 2
 DRAWN = ("partial", "partial, nu = 0.01", "scaled, S = 1e3, error 0.1 %")
 
 FITTED, UNIFORM = "fitted", "uniform"
@@ -563,10 +563,10 @@ MESHES = [
 NU = (0.0, 0.01, 0.1)
 SMALL, LARGE = NU[1:]
 ERRORS = {SMALL: (0.65, 0.008)}  # of q and u
-U_LARGE = 0.07  # of u
-SPREAD = {FITTED: 1.2, UNIFORM: 1.1}  # of the error of q with SMALL, see the notes
-HIDDEN = (3.10, 0.03)  # ||P u*||_V^ by its formula, and its relative accuracy
+U_LARGE = 0.07  # bound on the error of u with LARGE
+SPREAD = {FITTED: 1.2, UNIFORM: 1.1}  # largest over smallest error of q with SMALL, see the notes
+HIDDEN = (3.10, 0.03)  # ||P u*||_V^ by its formula, and its relative tolerance
 LIPSCHITZ = 1.1
 
 ENERGIES = {"twin": replace(TWIN, steps=400), "paper": replace(FULL, steps=100)}
-GROWTH = (1e-12, 1e-6)  # of the energy in a step, relative to its start: strict, default
+GROWTH = (1e-12, 1e-6)  # of the energy in a step over the initial energy: strict, default

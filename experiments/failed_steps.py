@@ -1,4 +1,4 @@
-"""Failed steps of a study: counted, printed at its end, and checked."""
+"""Count the failed steps of a study, and fail the study if there are too many."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from livepde.estimate import Estimate
 
 
 class FailedSteps:
-    """A count of failed steps, over all runs of a study.
+    """Counter of failed steps over all runs of a study.
 
     Parameters
     ----------
     most
-        Number up to which the study is in order.
+        Largest accepted number of failed steps.
     """
 
     def __init__(self, most: int = 0) -> None:
@@ -22,17 +22,17 @@ class FailedSteps:
         self.failed = 0
 
     def seen(self, estimate: Estimate) -> Estimate:
-        """Return an estimate after it was counted."""
+        """Count the step of an estimate, and return the estimate."""
         self.add(1, 0 if estimate.status.ok else 1)
         return estimate
 
     def add(self, steps: int, failed: int) -> None:
-        """Add the count of a run."""
+        """Add the steps of a run, and how many of them failed."""
         self.steps += steps
         self.failed += failed
 
     def report(self) -> None:
-        """Print the count, and end the program with code 1 if it is too large."""
+        """Print the count; if it exceeds `most`, end the program with exit code 1."""
         ok = self.failed <= self.most
         print(
             f"\n{'ok' if ok else 'MISSED'}: {self.failed} of {self.steps} steps failed, "

@@ -1,9 +1,9 @@
-"""The grid search of section 4: gains chosen after the fact, by the observed state's true error.
+"""The grid search of section 4, which chooses gains by the true error of the observed state.
 
-Partial, exact data: min over c_1 of the integral of ||R u - R u*||_X^2. Noisy data: min over
-constant mu and nu. All from 0.1 to 1000 in decimal steps, as in the paper. Nobody can do that
-online. What it shows: the objective rewards a state that is pulled to the data, not a q that is
-learned. With exact data it picks the largest c_1 of the grid, and with it the worst q.
+Minimises the integral of ||R u - R u*||_X^2 over c_1 with partial, exact data, and over constant mu
+and nu with noisy data. Grids run from 0.1 to 1000 in decimal steps, as in the paper. Such a search
+is impossible online. The objective rewards a state that is pulled to the data rather than a correct
+q: with exact data it selects the largest c_1 of the grid, which gives the worst q.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ STEPS = FailedSteps()
 
 @dataclass(frozen=True)
 class Tried:
-    """One point of the grid: gains, objective, relative L2 error of q at the end."""
+    """Grid point with its gains, objective and relative L2 error of q at the end."""
 
     gains: tuple[float, ...]
     objective: float
@@ -37,7 +37,7 @@ class Tried:
 
 
 def try_out(twin: Twin, law: lp.GradientLaw, gains: tuple[float, ...]) -> Tried:
-    """Run a law and return its objective; infinity if a step failed."""
+    """Run a law at one grid point; the objective is infinite if a step failed."""
     X, R = twin.model.X, twin.observed.split().R
     identifier = lp.Identifier(twin.model, twin.observation, law, q0=0.0, u0=seed.start, halvings=0)
     squares = []
@@ -50,7 +50,7 @@ def try_out(twin: Twin, law: lp.GradientLaw, gains: tuple[float, ...]) -> Tried:
 
 
 def partial(gain: float, samples: int = 101, steps: tuple[float, ...] = GRID) -> list[Tried]:
-    """Search c_1 for the paper's first experiment."""
+    """Evaluate each c_1 in the paper's first experiment."""
     twin = seed.twin_of(clamped=True, times=seed.TIMES[:samples])
     laws = {c1: lp.paper.law(gain, lp.laws.ResidualDamping(c1), seed.D) for c1 in steps}
     return [try_out(twin, law, (c1,)) for c1, law in laws.items()]
@@ -63,25 +63,25 @@ def noisy(
     steps: tuple[float, ...] = GRID,
     smooth: bool = False,
 ) -> list[Tried]:
-    """Search mu and nu for the paper's second experiment, with alpha = 0 or G_alpha in V~."""
+    """Evaluate each mu and nu in the paper's second experiment, with alpha = 0 or G_alpha in V~."""
     twin = seed.twin_of(clamped=True, times=0.6 * np.arange(samples), noise=RelativeNoise(level))
     if smooth:
         rule = Tikhonov("V", Discrepancy(level=level))
         twin = replace(twin, observation=replace(twin.observation, reconstruction=rule))
-    found = []
+    tried = []
     for mu, nu in product(steps, steps):
         law = lp.paper.law(gain, lp.laws.ConstantDamping(mu), seed.D, nu)
-        found.append(try_out(twin, law, (mu, nu)))
-    return found
+        tried.append(try_out(twin, law, (mu, nu)))
+    return tried
 
 
 def best(tried: list[Tried]) -> Tried:
-    """Return the point with the least objective."""
+    """Return the grid point with the smallest objective."""
     return min(tried, key=lambda item: item.objective)
 
 
 def show(title: str, names: tuple[str, ...], tried: list[Tried]) -> None:
-    """Print a table."""
+    """Print the table of a search, with the smallest objective marked."""
     winner = best(tried)
     print(f"\n{title}")
     print("".join(f"{name:>9}" for name in names) + f"{'objective':>13}{'error of q':>12}")

@@ -1,4 +1,4 @@
-"""What a law has to forget to follow a jump: a diffusivity that rises by a fifth at t = 20.
+"""Compare how laws follow a jump: a diffusivity rises by a fifth at t = 20.
 
 python -m experiments.jumps
 """
@@ -25,30 +25,30 @@ POINTS = [0.25, 0.5, 0.75]
 
 
 def rod(a: lp.fem.Unknown) -> lp.Model:
-    """Return a rod whose left end swings."""
+    """Return a rod whose left end oscillates, with diffusivity a."""
     ends: dict[str, Any] = {"left": lambda x, t: np.sin(3 * t) + 0.0 * x[0], "right": 0.0}
     state = lp.Field(MESH, lp.fem.linear(MESH), dirichlet=ends)
     return lp.Model(state, {"a": a}, A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)))
 
 
 def truth(t: float) -> float:
-    """Return the diffusivity."""
+    """Return the true diffusivity at a time."""
     return AFTER if t >= JUMP else BEFORE
 
 
 def states() -> list[tuple[float, Any]]:
-    """Return the exact states."""
+    """Simulate the rod with the true diffusivity; return pairs of time and state."""
     model = rod(lp.Normal(BEFORE))
     forward, u = ForwardStage(model), model.initial(0.0)
-    found = [(0.0, u)]
+    path = [(0.0, u)]
     for t0, t1 in pairwise(TIMES.tolist()):
         u = forward.solve(u, np.array([truth(t1)]), t1 - t0, lp.fem.Moment(t1))
-        found.append((t1, u))
-    return found
+        path.append((t1, u))
+    return path
 
 
 def measured(law: lp.laws.Law[Any, Any], unknown: lp.fem.Unknown, exact: Any, seed: int) -> Any:
-    """Return error before the jump, time until nine tenths of it are followed, error at the end."""
+    """Return the error before the jump, the time to follow 90 % of it, and the error at the end."""
     rng, model = np.random.default_rng(seed), rod(unknown)
     sensors: lp.observation.Observation = lp.Points(POINTS, noise=NOISE)
     noise = NOISE
@@ -68,7 +68,7 @@ def measured(law: lp.laws.Law[Any, Any], unknown: lp.fem.Unknown, exact: Any, se
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the errors of all laws as a table."""
     walk = {
         rate: lp.Scalar(lp.Normal(0.2, 0.2), evolution=lp.RandomWalk(rate))
         for rate in (0.005, 0.02, 0.1)
@@ -95,8 +95,8 @@ def main() -> None:
     for column in ("law", "error before", "time to follow", "error at the end"):
         table.add_column(column)
     for name, (law, unknown) in rows.items():
-        found = np.array([measured(law, unknown, exact, seed) for seed in range(SEEDS)])
-        table.add_row(name, *(f"{value:.3g}" for value in found.mean(axis=0)))
+        scores = np.array([measured(law, unknown, exact, seed) for seed in range(SEEDS)])
+        table.add_row(name, *(f"{value:.3g}" for value in scores.mean(axis=0)))
     Console(width=100).print(table)
     STEPS.report()
 

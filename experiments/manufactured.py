@@ -1,4 +1,4 @@
-"""Manufactured solutions: a source that makes a given state the exact discrete solution."""
+"""Manufactured solutions, whose source makes a given state the exact discrete solution."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from livepde.model import Model
 
 
 class Manufactured(Model):
-    """A model with a discrete source, F_k = M (U_k - U_{k-1})/h + B(U_k) + A(U_k) q*.
+    """Model with the discrete source F_k = M (U_k - U_{k-1})/h + B(U_k) + A(U_k) q*.
 
-    U_k are the coefficients of u*(t_k), so that implicit Euler with step h has exactly U as
-    solution for q = q*, even if the process is ill-posed: with D < 0 it cannot be simulated, but it
-    can be observed.
+    U_k are the coefficients of u*(t_k). For q = q*, implicit Euler with step h has exactly U as its
+    solution, even if the process is ill-posed: a process with D < 0 cannot be simulated, but it can
+    be observed.
 
     Parameters
     ----------
     q_true, u_true
-        The exact parameter and state, functions of x and of (x, t).
+        Exact parameter and state, functions of x and of (x, t).
     h
         Time step of the estimator.
     forms
-        Forms as for `Model`, without f.
+        Weak forms as in `Model`, without f.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class Manufactured(Model):
         self._q = self.latent.inverse(self.parameter_space.interpolate(q_true))
 
     def exact(self, t: float) -> Array:
-        """Return the coefficients U of the exact state."""
+        """Return the coefficients of the exact state at a time."""
         return self.initial(lambda x: self._u_true(x, t), Moment(t))
 
     def F(self, moment: Moment = START) -> Array:

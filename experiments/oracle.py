@@ -1,8 +1,8 @@
-"""The paper's lower bounds on mu and nu with the true e and p, beside rules that use no truth.
+"""Compare the paper's lower bounds on mu and nu for the true e and p with rules that use no truth.
 
-The bounds of Assumptions cond:mu_1, cond:mu02, cond:nu and ass:mu_nu hold ||e||_Q, ||p||_V^ and
-||d||_V~, which nobody knows online. Here they are taken from the twin after every sample. This must
-never move into the library.
+The bounds of Assumptions cond:mu_1, cond:mu02, cond:nu and ass:mu_nu contain ||e||_Q, ||p||_V^ and
+||d||_V~, which are unknown online. Here the twin provides them after every sample. This must never
+move into the library.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ STEPS = FailedSteps()
 
 @dataclass(frozen=True)
 class Oracle(lp.laws.Damping):
-    """The least theta of the paper for the true errors of the sample before.
+    """The smallest theta that the paper allows for the true errors of the previous sample.
 
-    Only r is of now: r_alpha in place of r, as the bound asks, where the data are exact. Below
-    ||r||_X = FLOOR the pull is linear.
+    With exact data only r is current; with noise all errors are those of the previous sample. Below
+    ||r||_X = FLOOR the damping is linear in r.
     """
 
     constants: Constants
@@ -60,7 +60,7 @@ class Oracle(lp.laws.Damping):
 
 @dataclass(frozen=True)
 class Found:
-    """A run: its law, errors, and the relative L2 error of q at the end."""
+    """Run of a law, with its errors, the final relative L2 error of q, and the largest nu."""
 
     name: str
     law: lp.GradientLaw
@@ -70,7 +70,7 @@ class Found:
 
 
 def follow(name: str, twin: Twin, law: lp.GradientLaw, c: Constants, u0: Any, nu: bool) -> Found:
-    """Run a law on a twin; an oracle, and nu if asked, are renewed after every sample."""
+    """Run a law on a twin; update an oracle, and nu if requested, after every sample."""
     spaces = Spaces.of(twin.model, twin.observed, law)
     samples = list(twin)
     tracker = TwinTracker(twin, spaces, law.gain, law.damping)

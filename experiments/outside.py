@@ -1,14 +1,14 @@
-"""What the laws find of a field outside the part of the domain that is observed.
+"""How well the laws estimate a field outside the observed part of the domain.
 
-Two processes on [0, 1], seen at the nodes in omega = (0.3, 0.87) with 1 % noise; the true field is
-drawn from the prior for each seed, on a mesh and with steps of its own: a reaction q(x) in the
-paper's equation, excited by its source, and a diffusivity a(x), positive, heated at both ends.
+Two processes on [0, 1] are observed at the nodes in omega = (0.3, 0.87) with 1 % noise: a reaction
+q(x) in the paper's equation, excited by its source, and a positive diffusivity a(x), heated at both
+ends. For each seed the true field is drawn from the prior, on a separate mesh with its own steps.
 
-Printed are medians over the seeds of the relative error of the field inside and outside omega, the
-share of true values in 95 % intervals, and, against the distance from omega, that share and the
-mean width of the intervals as a share of the prior's. The rows named "informed" have the same
-number of directions, but those of which all data tell most instead of the leading modes of the
-prior: they are taken from the posterior of a run with all modes, with hindsight.
+Prints medians over the seeds of the relative error of the field inside and outside omega. For each
+range of the distance from omega, it prints the share of true values in 95 % intervals and the mean
+interval width as a share of the prior's. Rows named "informed" use the same number of directions,
+but the directions best determined by all data instead of the leading modes of the prior; they come
+from the posterior of a run with all modes, in hindsight.
 
     python -m experiments.outside 20
 
@@ -81,16 +81,16 @@ PROCESSES: Mapping[str, Callable[[int], Model]] = {"reaction": reaction, "rod": 
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """One truth and its samples.
+    """True field and its samples.
 
     Attributes
     ----------
     model
-        Of the estimator.
+        Model of the estimator.
     x, true
-        Vertices in order, and the true field there.
+        Sorted vertices, and the true field at the vertices.
     exact, z, noise
-        Readings without and with noise, shape (times, sensors), and the deviation of the noise.
+        Readings without and with noise, shape (times, sensors), and the noise standard deviation.
     """
 
     model: Model
@@ -115,18 +115,18 @@ class Data:
 
 
 def omega(x: Any) -> Any:
-    """Return whether x is observed."""
+    """Return whether x is in the observed part of the domain."""
     return (x[0] > OMEGA[0]) & (x[0] < OMEGA[1])
 
 
 def draw(build: Callable[[int], Model], seed: int) -> Data:
-    """Return data of a field drawn from the prior, from a finer mesh and shorter steps."""
+    """Simulate a field drawn from the prior, on a finer mesh and with shorter steps."""
     rng = np.random.default_rng(seed)
     model, fine = build(CELLS), build(FINE)
     root = np.linalg.inv(np.linalg.cholesky(fine.Q.gram.toarray())).T
     a = fine.latent.prior + root @ rng.standard_normal(fine.latent.dim)
     nodes = np.sort(model.mesh.p[0])
-    # The sensors of the estimator: nodes of elements within omega, those at its ends included.
+    # Sensors of the estimator: nodes of the elements within omega, including nodes at its ends.
     block, _ = model.state_space.component()
     sensors = block.doflocs[0, Subdomain(omega).selected(block)]
     G = Points(sensors.tolist()).matrix(fine.state_space)
@@ -140,14 +140,14 @@ def draw(build: Callable[[int], Model], seed: int) -> Data:
 
 
 def _shown(model: Model, q: Array) -> Array:
-    """Return coefficients of the field as values at the vertices in order."""
+    """Return the values of the field at the sorted vertices."""
     (block,) = model.parameter_space.fields.values()
     return np.asarray(block.at_vertices @ q)[np.argsort(model.mesh.p[0])]
 
 
 @dataclass(frozen=True)
 class Informed(SensitivityLaw):
-    """The sensitivity law in given directions, shape (m, k), Q-orthonormal."""
+    """Sensitivity law in given directions, Q-orthonormal columns of shape (m, k)."""
 
     directions: Any = None
 
@@ -164,14 +164,14 @@ class Informed(SensitivityLaw):
 
 
 def informed(belief: Belief, model: Model, count: int) -> Array:
-    """Return the directions that a belief in all modes knows most of, against its prior."""
+    """Return the directions that a belief in all modes knows best relative to its prior."""
     prior, posterior = np.asarray(belief.prior_factor), np.asarray(belief.q_factor)
-    directions, _, _ = np.linalg.svd(prior.T @ model.Q.dual(posterior))  # what is left descends
+    directions, _, _ = np.linalg.svd(prior.T @ model.Q.dual(posterior))  # most uncertain first
     return np.asarray(prior @ directions[:, ::-1][:, :count])
 
 
 def run(data: Data, law: AnyLaw, noisy: bool = True) -> Identifier:
-    """Return the identifier after all samples."""
+    """Process all samples, refit, and return the identifier."""
     seen = Subdomain(omega, noise=data.noise)
     identifier = Identifier(data.model, seen, law, u0=0.0, scheme=Alexander2())
     for t, z in zip(TIMES, data.z if noisy else data.exact, strict=True):
@@ -182,7 +182,7 @@ def run(data: Data, law: AnyLaw, noisy: bool = True) -> Identifier:
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Errors inside and outside, and at each vertex hits and widths, as a share of the prior's."""
+    """Errors inside and outside omega, hits, and widths as a share of the prior's per vertex."""
 
     error: list[float]
     hit: Array
@@ -190,7 +190,7 @@ class Score:
 
 
 def judge(data: Data, identifier: Identifier) -> Score:
-    """Return how an estimate compares with the truth."""
+    """Score the final estimate against the truth."""
     estimate, model = identifier.estimate(), data.model
     (name,) = model.parameter_space.fields
     low, high = (_shown(model, end) for end in estimate[name].interval())
@@ -202,30 +202,30 @@ def judge(data: Data, identifier: Identifier) -> Score:
 
 
 def rows(data: Data) -> dict[str, Score]:
-    """Return what each law reaches on one truth."""
+    """Return the scores of the prior and of each law for one truth."""
     model = data.model
     prior = model.latent.value(model.latent.prior)
     nothing = np.full(len(data.x), np.nan)
-    found = {"prior": Score(data.error(_shown(model, prior)), nothing, nothing)}
-    if not model.form_A.differentiates("u"):  # else the law refuses partial data
+    scores = {"prior": Score(data.error(_shown(model, prior)), nothing, nothing)}
+    if not model.form_A.differentiates("u"):  # otherwise the law refuses partial data
         gradient = GradientLaw(gain="auto")
-        found["gradient, auto, no noise"] = judge(data, run(data, gradient, noisy=False))
-        found["gradient, auto"] = judge(data, run(data, gradient))
+        scores["gradient, auto, no noise"] = judge(data, run(data, gradient, noisy=False))
+        scores["gradient, auto"] = judge(data, run(data, gradient))
     whole = run(data, SensitivityLaw(modes=CELLS + 1))
     for count in (6, 12):
         law = SensitivityLaw(modes=count)
-        found[f"sensitivity, {count} modes"] = judge(data, run(data, law))
+        scores[f"sensitivity, {count} modes"] = judge(data, run(data, law))
         directions = informed(whole._latent_belief(), model, count)
         law = Informed(directions=directions)
-        found[f"sensitivity, {count} informed"] = judge(data, run(data, law))
+        scores[f"sensitivity, {count} informed"] = judge(data, run(data, law))
     auto = SensitivityLaw(modes="auto")
-    found["sensitivity, auto"] = judge(data, run(data, auto))
-    found["sensitivity, all modes"] = judge(data, whole)
-    return found
+    scores["sensitivity, auto"] = judge(data, run(data, auto))
+    scores["sensitivity, all modes"] = judge(data, whole)
+    return scores
 
 
 def main(seeds: int) -> None:
-    """Print the tables."""
+    """Print one table for each process."""
     for process, build in PROCESSES.items():
         scores: dict[str, list[Score]] = {}
         for seed in range(seeds):
@@ -239,9 +239,9 @@ def main(seeds: int) -> None:
         print(f"{process}, {seeds} seeds; in each part: share in the 95 % interval, width")
         print(f"{'':26s}{'error':>8s}{'outside':>8s}" + "".join(f"{p:>14s}" for p in parts))
         for name, several in scores.items():
-            errors = np.median([one.error for one in several], axis=0)
-            shares = [np.mean([one.hit[at] for one in several]) for at in parts.values()]
-            widths = [np.mean([one.width[at] for one in several]) for at in parts.values()]
+            errors = np.median([score.error for score in several], axis=0)
+            shares = [np.mean([score.hit[at] for score in several]) for at in parts.values()]
+            widths = [np.mean([score.width[at] for score in several]) for at in parts.values()]
             pairs = zip(shares, widths, strict=True)
             cells = "".join(
                 f"{s:8.2f}{w:6.2f}" if np.isfinite(w) else f"{'–':>14s}" for s, w in pairs

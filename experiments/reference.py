@@ -1,13 +1,13 @@
 r"""Dense reference implementation of the method of Boiger and Kaltenbacher (2016), NumPy only.
 
-It shares no code with the rest of livepde, so that both can be compared. It treats the example of
-section 4, (PDEdiff) and (obsdiff), on a mesh of (0, 1):
+It shares no code with livepde, so that both can be compared. It solves the example of section 4,
+(PDEdiff) and (obsdiff), on a mesh of (0, 1):
 
     u_t - (D u_x)_x + q u = f,    u = 0 at both ends,    z = u on omega
 
 R u = chi_omega u and P u = chi_(Omega \ omega) u act under the integrals: w = u_alpha + P u is
-u_alpha on omega and the estimate u elsewhere. With the suffix _in for integrals over omega and _out
-for those over Omega \ omega, a step of implicit Euler for (noisy_q) and (noisy_u) reads
+u_alpha on omega and the estimate u elsewhere. With the suffixes _in for integrals over omega and
+_out for integrals over Omega \ omega, implicit Euler for (noisy_q) and (noisy_u) is
 
     G_Q (q - q_old) / (gain h) + (sigma / gain) G_Q q - A_in(u_alpha)^T (u - u_alpha) = 0
 
@@ -15,10 +15,10 @@ for those over Omega \ omega, a step of implicit Euler for (noisy_q) and (noisy_
         + theta M_op (u - u_alpha) + nu N_op u = F
 
 with (A(u) q, v) = int q u v, (B u, v) = int D u' v', the mass matrix M, M_op and N_op of (MN1) and
-(MN2), theta = mu / ||r||_V~ for r = R u - u_alpha, and the Gram matrix G_Q / gain of Q; gain = 1
-is the paper's. (est_exact_q) and (est_exact_u) are the case of exact data and alpha = sigma = 0.
+(MN2), theta = mu / ||r||_V~ for r = R u - u_alpha, and the Gram matrix G_Q / gain of Q; the paper
+has gain = 1. With exact data and alpha = sigma = 0 these are (est_exact_q) and (est_exact_u).
 
-At nu > 0 a step can have several solutions, see `Step.solve`.
+If nu > 0, a step can have several solutions, see `Step.solve`.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ Array: TypeAlias = NDArray[np.float64]
 Kind: TypeAlias = Literal["constant", "P1", "hermite"]
 Ends: TypeAlias = Literal["free", "zero", "clamped"]
 
-# Shape functions on (0, 1): a row holds the coefficients of 1, s, s^2, s^3. Those of "hermite" are
-# phi_j and psi_j of section 4, cell by cell.
+# Shape functions on (0, 1): each row has the coefficients of 1, s, s^2, s^3. The rows of "hermite"
+# are phi_j and psi_j of section 4 on one cell.
 SHAPES: dict[str, Array] = {
     "constant": np.array([[1.0]]),
     "P1": np.array([[1.0, -1], [0, 1]]),
@@ -45,8 +45,8 @@ SHAPES: dict[str, Array] = {
 }
 PER_NODE = {"constant": 0, "P1": 1, "hermite": 2}
 
-# Largest residual of a step that counts as solved, relative to the terms of its equation. Newton
-# goes on to rounding, which leaves 1e-14 on 16 nodes, 1e-13 on 61 and 1e-12 on 121.
+# Largest accepted residual of a step, relative to the terms of its equation. Newton iterates to
+# rounding level, which is 1e-14 on 16 nodes, 1e-13 on 61 and 1e-12 on 121.
 TOLERANCE = 1e-11
 
 
@@ -59,10 +59,10 @@ class LineSpace:
     nodes
         Increasing coordinates from 0 to 1: x_1, ..., x_N of section 4.
     kind
-        "P1"; "hermite": cubic, with the dofs [value, slope] node by node; "constant": one number.
+        "P1"; "hermite": cubic, with dofs [value, slope] at each node; "constant": one number.
     ends
-        "free"; "zero": no value functions at the ends of (0, 1); "clamped": neither value nor slope
-        functions there, which is the space of section 4, j = 2, ..., N - 1.
+        "free"; "zero": values vanish at the ends of (0, 1); "clamped": values and slopes vanish at
+        the ends, which is the space of section 4, j = 2, ..., N - 1.
     """
 
     nodes: Array
@@ -83,7 +83,7 @@ class LineSpace:
         return np.setdiff1d(np.arange(self.size), fixed)
 
     def basis(self, x: Array, order: int = 0) -> Array:
-        """Return derivatives of the free basis functions, shape (points, free dofs)."""
+        """Return derivatives of the free basis functions at points, shape (points, free dofs)."""
         cell = np.clip(np.searchsorted(self.nodes, x, "right") - 1, 0, len(self.nodes) - 2)
         length = np.diff(self.nodes)[cell]
         local = polyval((x - self.nodes[cell]) / length, polyder(SHAPES[self.kind].T, order))
@@ -97,14 +97,14 @@ class LineSpace:
 
     def interpolate(self, function: Callable[[Any], Any]) -> Array:
         """Return the free coefficients of the interpolant of an analytic function."""
-        # A complex step gives slopes that are exact to rounding, without a formula for them.
+        # A complex step gives slopes to rounding accuracy without a formula for the derivative.
         values = np.asarray(function(self.nodes + 1e-40j), complex) * np.ones(len(self.nodes))
         dofs = np.stack([values.real, values.imag / 1e-40], axis=1)[:, : PER_NODE[self.kind]]
-        found: Array = dofs.ravel() if self.kind != "constant" else values.real[:1]
-        return found[self.free]
+        coefficients: Array = dofs.ravel() if self.kind != "constant" else values.real[:1]
+        return coefficients[self.free]
 
     def interpolate_all(self, function: Callable[[Any, float], Any], times: Array) -> Array:
-        """Return the free coefficients of a function of (x, t), a row for each time."""
+        """Return the free coefficients of a function of (x, t), one row per time."""
 
         def row(t: float) -> Array:
             return self.interpolate(lambda x: function(x, t))
@@ -119,7 +119,7 @@ class LineSpace:
 
 
 def fitted(count: int, omega: tuple[float, float]) -> Array:
-    """Return a uniform mesh whose inner nodes nearest to the ends of omega are moved onto them."""
+    """Return a uniform mesh with the inner nodes nearest to the ends of omega moved onto them."""
     nodes = np.linspace(0, 1, count)
     for end in omega:
         if 0 < end < 1:
@@ -138,8 +138,8 @@ class Setting:
     f: Callable[[Any, float], Any] | None = None
     D: Callable[[Any], Any] = np.ones_like
 
-    # Spaces; `nodes` may be the number of nodes of a uniform mesh. 5 Gauss points in each cell are
-    # exact for products of three cubics.
+    # Spaces. An integer `nodes` is the number of nodes of a uniform mesh. Five Gauss points per
+    # cell integrate products of three cubics exactly.
     nodes: Array | int = 31
     state: Kind = "hermite"
     state_ends: Ends = "zero"
@@ -148,22 +148,22 @@ class Setting:
     inner: Literal["L2", "H1"] = "H1"
     points: int = 5
 
-    # Observed interval. If `cut`, cells that contain an end of it are divided there for the
-    # quadrature; else omega is reduced to the cells that lie in its closure.
+    # Observed interval. If `cut`, the quadrature splits cells at the ends of omega; otherwise omega
+    # is reduced to the cells in its closure.
     omega: tuple[float, float] = (0.0, 1.0)
     cut: bool = False
 
-    # Samples are taken at k h, k = 0, ..., steps. The true states are interpolants of u* if the
-    # truth is "exact", or come from implicit Euler with the same elements and steps. The error of
-    # the data is a function of (x, t) that is interpolated and added.
+    # Sample times are k h, k = 0, ..., steps. The true states are interpolants of u* if `truth` is
+    # "exact", and implicit Euler with the same elements and steps computes them if "discrete". The
+    # interpolant of `error`, a function of (x, t), is added to the data.
     h: float = 0.6
     steps: int = 100
     truth: Literal["discrete", "exact"] = "discrete"
     error: Callable[[Any, float], Any] | None = None
 
-    # The method; u starts at the true state. theta = c1 ||r||_X^2 / ||r||_VX~^2, which is the lower
-    # bound of Assumption cond:mu02, plus mu / (||r||_V~^2 + floor^2 ||u_alpha||_V~^2)^(1/2), which
-    # is a constant mu, made continuous at r = 0. The penalty belongs to alpha, see `reconstruct`.
+    # Method; u starts at the true state. theta = c1 ||r||_X^2 / ||r||_VX~^2, the lower bound of
+    # Assumption cond:mu02, plus mu / (||r||_V~^2 + floor^2 ||u_alpha||_V~^2)^(1/2), a constant mu
+    # regularised at r = 0. `reconstruct` applies `penalty` with weight alpha.
     q0: Callable[[Any], Any] = np.zeros_like
     gain: float = 1.0
     c1: float = 0.0
@@ -176,23 +176,23 @@ class Setting:
 
 
 def form(left: Array, weights: Array, right: Array) -> Array:
-    """Return the matrix of a bilinear form: sum over points p of left_pi weights_p right_pj."""
+    """Return the matrix of a bilinear form, the sum over points p of left_pi weights_p right_pj."""
     return left.T @ (weights[:, None] * right)
 
 
 class Discretisation:
-    """Spaces, quadrature, matrices and norms of a setting; all act on free dofs.
+    """Spaces, quadrature, matrices and norms of a setting, for vectors of free dofs.
 
     Attributes
     ----------
     X, Q
         Spaces of state and parameter.
     x, weights, inside
-        Quadrature points and weights, and mask of the points in omega.
+        Quadrature points, their weights, and the mask of points in omega.
     v, xi
         Basis functions of X and Q at the points.
     M, M_in, B_in, B_out, M_op, N_op, G_Q
-        Matrices of the equations above; M_in is the mass matrix of omega.
+        Matrices of the module's equations; M_in is the mass matrix over omega.
     observed
         Dofs of X whose basis functions meet omega.
     """
@@ -248,12 +248,12 @@ class Discretisation:
         return float(np.sqrt(w_out @ flux**2) + np.sqrt(w_out @ (self.v @ p) ** 2))
 
     def relative_X(self, *terms: Array) -> float:
-        """Return the norm of the sum of functionals on H^1, relative to the sum of their norms."""
+        """Return the norm of a sum of functionals on H^1, relative to the sum of their norms."""
         sizes = [np.linalg.norm(self._H1 @ term) for term in (sum(terms), *terms)]
         return float(sizes[0] / (sum(sizes[1:]) or 1.0))
 
     def relative_Q(self, *terms: Array) -> float:
-        """Return the norm of the sum of functionals on Q, relative to the sum of their norms."""
+        """Return the norm of a sum of functionals on Q, relative to the sum of their norms."""
         sizes = [np.linalg.norm(self._Q @ term) for term in (sum(terms), *terms)]
         return float(sizes[0] / (sum(sizes[1:]) or 1.0))
 
@@ -263,10 +263,10 @@ class Discretisation:
         return form(self.v[at], self.weights[at] * values[at], self.xi[at])
 
     def reconstruct(self, z: Array) -> Array:
-        """Return u_alpha = G_alpha z, G_alpha = (G* G + alpha I)^-1 G*, section 3.2.
+        """Return u_alpha = G_alpha z of section 3.2, with G_alpha = (G* G + alpha I)^-1 G*.
 
-        It minimises ||v - z||^2 + alpha |v|^2 over omega, where |v| is the norm of X = L2, so that
-        u_alpha = z / (1 + alpha), or the L2 norm of v'' (penalty "H2").
+        It minimises ||v - z||^2 + alpha |v|^2 over omega. With penalty "L2", |v| is the norm of
+        X = L2, and u_alpha = z / (1 + alpha). With penalty "H2", |v| is the L2 norm of v''.
         """
         if self.setting.penalty == "L2":
             return z / (1 + self.setting.alpha)
@@ -277,7 +277,7 @@ class Discretisation:
         return u_alpha
 
     def theta(self, r: Array, u_alpha: Array) -> tuple[float, Array]:
-        """Return theta(r) = mu / ||r||_V~ and its derivative."""
+        """Return theta(r) as defined in `Setting`, and its derivative."""
         c1, mu = self.setting.c1, self.setting.mu
         theta, derivative = 0.0, np.zeros_like(r)
         if c1 and r[self.observed].any():
@@ -293,10 +293,10 @@ class Discretisation:
 
 
 class Step:
-    """Equations of one step of implicit Euler, with their solver; all arrays in free dofs.
+    """Equations of one implicit Euler step and their solver, for vectors of free dofs.
 
-    The unknown is r = u - u_alpha, with u_alpha = 0 in the dofs that do not meet omega: as a
-    difference of two numbers r would have a rounding error that a large theta magnifies.
+    The unknown is r = u - u_alpha, with u_alpha = 0 in the dofs that do not meet omega. Computed as
+    a difference, r would have a rounding error that a large theta amplifies.
     """
 
     def __init__(self, at: Discretisation, u_old: Array, q_old: Array, z: Array, F: Array) -> None:
@@ -307,14 +307,14 @@ class Step:
         self._dq = scale * np.linalg.solve(at.G_Q, self.A_in.T)
 
     def q(self, r: Array) -> Array:
-        """Return the solution q of the equation of q, which is linear, for a given r.
+        """Solve the equation of q, which is linear, for a given r.
 
-        The equation of u with this q inserted has a scaling independent of the gain.
+        Inserting this q gives an equation of u whose scaling does not depend on the gain.
         """
         return self.q_old / (1 + self.at.setting.sigma * self.at.setting.h) + self._dq @ r
 
     def theta(self, r: Array) -> float:
-        """Return theta(r)."""
+        """Return theta at r."""
         return self.at.theta(r, self.u_alpha)[0]
 
     def terms_u(self, r: Array, q: Array, theta: float) -> list[Array]:
@@ -339,12 +339,12 @@ class Step:
         return [G_Q @ q / h, G_Q @ self.q_old / -h, decay, self.A_in.T @ -r]
 
     def residual(self, r: Array, q: Array) -> float:
-        """Return the larger residual of both equations, relative to their terms."""
+        """Return the larger residual of the two equations, relative to their terms."""
         of_u = self.at.relative_X(*self.terms_u(r, q, self.theta(r)))
         return max(of_u, self.at.relative_Q(*self.terms_q(r, q)))
 
     def jacobian(self, r: Array, theta: float | None) -> Array:
-        """Return d/dr of the equation of u with q(r), for theta(r) or a given theta."""
+        """Return the Jacobian of the equation of u with q(r), for theta(r) or a fixed theta."""
         at, h, out = self.at, self.at.setting.h, ~self.at.inside
         A = self.A_in + at.A(out * (at.v @ (self.u_alpha + r)))
         A_out_q = form(at.v[out], at.weights[out] * (at.xi[out] @ self.q(r)), at.v[out])
@@ -355,10 +355,10 @@ class Step:
         return fixed + theta * at.M_op + np.outer(at.M_op @ r, slope)
 
     def newton(self, r: Array, theta: float | None = None) -> Array:
-        """Solve the equation of u with q(r) by damped Newton, for theta(r) or a given theta.
+        """Solve the equation of u with q(r) by damped Newton, for theta(r) or a fixed theta.
 
-        The iteration ends when no fraction of a Newton step decreases the residual: the equation is
-        then solved to rounding, or the iteration has stalled. The caller has to test the residual.
+        The iteration ends when no fraction of a Newton step decreases the residual: either the
+        equation is solved to rounding, or the iteration stalled. The caller must test the residual.
         """
         at = self.at
 
@@ -372,7 +372,7 @@ class Step:
             if share <= 1e-15:
                 break
             change = np.linalg.solve(self.jacobian(r, theta), -residual)
-            # Close to rounding level, shorter steps do not help if a full one does not.
+            # Near rounding level, if the full step does not help, shorter steps do not either.
             for length in 0.5 ** np.arange(12 if share > 1e-13 else 1):
                 trial = equation(r + length * change)
                 if trial[1] < size:
@@ -383,21 +383,21 @@ class Step:
         return r
 
     def solve(self, theta: float) -> tuple[Array, Array, float]:
-        """Return r, q and their residual.
+        """Solve the step from a starting value of theta; return r, q and their residual.
 
-        For fixed theta Newton is robust, since only A_out(u) q is nonlinear. Therefore theta is
-        computed as a root of the scalar function theta(r(theta)) - theta. It is bracketed from a
-        starting value, in the direction given by the sign there; the bracket is halved until Newton
-        on the full equation, with the derivative of theta, ends within it.
+        For fixed theta, Newton is robust because only A_out(u) q is nonlinear. So theta is computed
+        as a root of the scalar function theta(r(theta)) - theta. The root is bracketed from the
+        starting value, in the direction given by the sign there. The bracket is halved until Newton
+        on the full equation, with the derivative of theta, ends inside it.
 
         There may be several roots: c1 ||r||_X^2 / ||r||_VX~^2 depends on the shape of r, which for
-        nu > 0 need not tend to zero. Starting with theta of the previous step selects the solution
-        that continues it.
+        nu > 0 need not tend to zero. The theta of the previous step as starting value selects the
+        solution that continues the previous step.
 
         Raises
         ------
         ArithmeticError
-            The residual stays above TOLERANCE.
+            If the residual stays above TOLERANCE.
         """
         old = self.u_old - self.u_alpha
         r = self._continued(np.log(theta), old) if theta > 0 else self.newton(old)
@@ -410,7 +410,7 @@ class Step:
         return r, q, residual
 
     def _continued(self, near: float, r: Array) -> Array:
-        """Return r for the root log theta next to `near`, in the direction stated in `solve`."""
+        """Return r for the root log(theta) nearest to `near`, in the direction given by `solve`."""
 
         def mismatch(log_theta: float, r: Array) -> tuple[float, Array]:
             r = self.newton(r, np.exp(log_theta))
@@ -420,10 +420,10 @@ class Step:
         far, stride = near, start
         for _ in range(60):
             far = near + np.clip(stride, -1.5, 1.5)
-            value, found = mismatch(far, r)
+            value, r_far = mismatch(far, r)
             if value * start <= 0:
                 break
-            near, r, stride = far, found, 2 * stride
+            near, r, stride = far, r_far, 2 * stride
         for k in range(60):
             if k % 3 == 0:
                 solved = self.newton(r)
@@ -432,9 +432,9 @@ class Step:
                 if between and self.residual(solved, self.q(solved)) <= TOLERANCE:
                     return solved
             middle = (near + far) / 2
-            value, found = mismatch(middle, r)
+            value, r_middle = mismatch(middle, r)
             if value * start > 0:
-                near, r = middle, found
+                near, r = middle, r_middle
             else:
                 far = middle
         return self.newton(r)
@@ -442,7 +442,7 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Estimates, data and truth at times k h: a row for each time, with zeros for fixed dofs.
+    """Estimates, data and truth at the times k h, one row per time, with zeros for fixed dofs.
 
     Attributes
     ----------
@@ -451,9 +451,9 @@ class Trajectory:
     times, Q, U
         Times, shape (samples,); estimates of q and u, shapes (samples, m) and (samples, n).
     Z
-        Data: coefficients on omega, nodes at its ends included; the other columns are zero.
+        Measured coefficients on omega, including nodes at its ends; the other columns are zero.
     theta, residuals
-        theta of each step and its relative residual.
+        theta and relative residual of each step.
     q_true, U_true, F
         Coefficients of q* and of the true states; loads F_k.
     """
@@ -486,12 +486,12 @@ def truth(at: Discretisation, times: Array) -> tuple[Array, Array, Array]:
 
 
 def run(setting: Setting) -> Trajectory:
-    """Generate the data of a setting and run the method on them.
+    """Generate the data of a setting, and run the method on them.
 
     Raises
     ------
     ArithmeticError
-        A step is not solved.
+        If a step is not solved.
     """
     at = Discretisation(setting)
     times = setting.h * np.arange(setting.steps + 1.0)
@@ -513,9 +513,9 @@ def run(setting: Setting) -> Trajectory:
 
 
 def residuals(at: Discretisation, Q: Array, U: Array, Z: Array, F: Array) -> Array:
-    """Return the relative residual of each step of any trajectory, rows as in `Trajectory`.
+    """Return the relative residual of each step of a trajectory with rows as in `Trajectory`.
 
-    If a step has several solutions, a small residual shows that a trajectory is one of them.
+    If a step has several solutions, a small residual shows that the trajectory is one of them.
     """
     q, (u, z, f) = Q[:, at.Q.free], (rows[:, at.X.free] for rows in (U, Z, F))
     steps = [Step(at, u[k - 1], q[k - 1], z[k], f[k]) for k in range(1, len(u))]

@@ -12,48 +12,48 @@ from experiments.reference import Setting
 
 
 def paper_q(x: Any) -> Any:
-    """Parameter q* of section 4."""
+    """Return the parameter q* of section 4."""
     return 0.025 * x**2 - 0.025 * x
 
 
 def paper_u(x: Any, t: float) -> Any:
-    """State u* of section 4."""
+    """Return the state u* of section 4."""
     return np.sin(np.pi * x) / (1 + t)
 
 
 def paper_f(x: Any, t: float) -> Any:
-    """Source f of section 4, for D = 1."""
+    """Return the source f of section 4, for D = 1."""
     return (np.pi**2 - 1 / (1 + t) + paper_q(x)) * paper_u(x, t)
 
 
 def twin_q(x: Any) -> Any:
-    """Parameter q* of a persistently excited process."""
+    """Return the parameter q* of a persistently excited process."""
     return 2 + 3 * np.sin(np.pi * x) ** 2
 
 
 def twin_u(x: Any, t: float) -> Any:
-    """State u* of a persistently excited process."""
+    """Return the state u* of a persistently excited process."""
     return (1 + np.sin(t) / 2) * np.sin(np.pi * x) + np.cos(0.7 * t) / 2 * np.sin(2 * np.pi * x)
 
 
 def varying_D(x: Any) -> Any:
-    """Positive diffusivity D that varies by a factor of nine."""
+    """Return a positive diffusivity D that varies by a factor of nine."""
     return 1 + 0.8 * np.sin(2 * np.pi * x)
 
 
 def wave(size: float, x: Any, t: float) -> Any:
-    """Smooth data error."""
+    """Return a smooth data error of a given size."""
     return size * np.sin(2 * np.pi * x) * np.cos(t)
 
 
 PAPER = Setting(paper_q, paper_u, paper_f, omega=(0.3, 0.87), cut=True, gain=100.0, c1=1.0)
-"""Figure 1 of the paper, with a gain and data of the discrete process."""
+"""Figure 1 of the paper, but with a gain of 100 and data of the discrete process."""
 
 FULL = replace(PAPER, omega=(0.0, 1.0))
-"""The same with full observation."""
+"""`PAPER` with full observation."""
 
 TWIN = Setting(twin_q, twin_u, parameter_ends="free", h=0.05, steps=200, gain=1000.0, c1=1.0)
-"""Full observation of a process that stays excited; its source makes u* a discrete solution."""
+"""Full observation of a persistently excited process whose source makes u* a discrete solution."""
 
 VARYING = replace(
     TWIN,
@@ -66,13 +66,13 @@ VARYING = replace(
     steps=500,
     c1=10.0,
 )
-"""Section 4.1 with D that varies."""
+"""Section 4.1 with a varying D."""
 
 
 def scaled(size: float, error: float = 0.0) -> Setting:
-    """Return a constant q* = 2 under a constant mu, with a state of a given size.
+    """Return a setting with constant q* = 2, constant mu, and a state of a given size.
 
-    Gain and mu are scaled with the state, so that the estimates of q do not depend on the size.
+    Gain and mu scale with the state, so that the estimates of q do not depend on the size.
     """
     return Setting(
         q_true=partial(np.full_like, fill_value=2.0),

@@ -1,8 +1,8 @@
-"""Two laws after the paper's description of related methods, through its coupled stage.
+"""Two related laws as the paper describes them, on the coupled stage of the paper's law.
 
-Boiger and Kaltenbacher call their method "strongly motivated" by both. The original articles were
-not read. The equations below follow the description by Boiger and Kaltenbacher: Baumeister et al.
-observe all of the state, Kügler requires a monotone C and evaluates it at the estimate.
+Boiger and Kaltenbacher call their method "strongly motivated" by both. The equations follow their
+description, not the original articles: Baumeister et al. observe the full state, Kügler requires a
+monotone C and evaluates it at the estimate.
 
                   C evaluated at          pull                      q^' = gain A(.)* r, r
     paper         u_alpha + P u^          mu R M r / ||r||_V~       R u^ - u_alpha
@@ -32,7 +32,7 @@ from livepde.stepping import Interval, Newton
 
 @dataclass(frozen=True)
 class _Linear(Damping):
-    """A pull that is linear in r: theta is a number."""
+    """Damping that is linear in r: theta is a constant."""
 
     weight: float
 
@@ -45,7 +45,7 @@ class _Linear(Damping):
 
 @dataclass(frozen=True)
 class _Relative(Law[GradientParts, GradientState]):
-    """A law on the coupled stage of the gradient law, with a linear pull."""
+    """Law on the coupled stage of the gradient law, with damping linear in r."""
 
     gain: float = 1.0
     mu: float = 1.0
@@ -61,7 +61,7 @@ class _Relative(Law[GradientParts, GradientState]):
 
     @property
     def _base(self) -> GradientLaw:
-        # The step is that of the gradient law: what differs is in `work`, from `_parts`.
+        # The gradient law makes the steps; only `work`, which `_parts` builds, differs.
         return GradientLaw(self.gain, _Linear(self.mu), newton=self.newton)
 
     def _parts(self, problem: Problem, pull: Any) -> GradientParts:
@@ -85,17 +85,17 @@ class _Relative(Law[GradientParts, GradientState]):
 
 @dataclass(frozen=True)
 class BaumeisterLaw(_Relative):
-    """The adaptive observer as the paper describes Baumeister, Scondo, Demetriou and Rosen (1997).
+    """The adaptive observer of Baumeister, Scondo, Demetriou and Rosen (1997), as in the paper.
 
-    SIAM Journal on Control and Optimization 35, 678-713. All of the state is measured, z = u:
+    SIAM Journal on Control and Optimization 35, 678-713. The full state is measured, z = u:
 
         q' = gain A(z)* (u^ - z)
         M u^' + B(z) + A(z) q^ + mu A_0 (u^ - z) = F
 
-    with a coercive operator A_0 that draws u^ to the measured state; both equations are solved
-    together in one implicit step. It is (est_exact_q), (est_exact_u) for R = I, P = 0, with the
-    coercive A_0 instead of mu M / ||r||_V~: Boiger and Kaltenbacher added P u^ where nothing
-    is measured, and a pull whose size mu adapts.
+    with a coercive operator A_0 that pulls u^ towards the measured state; one implicit step solves
+    both equations together. These are (est_exact_q), (est_exact_u) for R = I, P = 0, with A_0
+    instead of mu M / ||r||_V~. Boiger and Kaltenbacher added P u^ where nothing is measured, and
+    damping whose size mu adapts.
 
     Parameters
     ----------
@@ -111,8 +111,8 @@ class BaumeisterLaw(_Relative):
     Raises
     ------
     LawError
-        From `prepare`: some of the state is not observed. A sample that lacks sensors is no error:
-        the part of the state without a reading is estimated as by the paper's law.
+        From `prepare`, if the sensors do not determine the full state. Missing readings of a sample
+        are no error: the law then estimates the unobserved part as the paper's law does.
     """
 
     A_0: Any = h1_form
@@ -131,7 +131,7 @@ class BaumeisterLaw(_Relative):
 
 
 class _FormsAtEstimate(StageForms):
-    """Forms with A and B at the estimate over omega, too: w = u^."""
+    """Stage forms that evaluate A and B at the estimate on omega as well: w = u^."""
 
     def argument(self, u: Array, r: Array) -> Array:
         return u
@@ -142,12 +142,12 @@ class _FormsAtEstimate(StageForms):
 
 
 class _PartsAtEstimate(GradientParts):
-    """Parts of the gradient law whose stages have such forms."""
+    """Parts of the gradient law whose stages use `_FormsAtEstimate`."""
 
     @classmethod
     def of(cls, parts: GradientParts) -> GradientParts:
         given = {part.name: getattr(parts, part.name) for part in fields(parts)}
-        # The stages that `parts` has kept have the forms of the paper's law.
+        # The stages cached in `parts` use the forms of the paper's law.
         del given["_stages"]
         return cls(**given).prepared()
 
@@ -158,7 +158,7 @@ class _PartsAtEstimate(GradientParts):
 
 @dataclass(frozen=True)
 class KueglerLaw(_Relative):
-    """The law for monotone C, evaluated at the estimate, as the paper describes Kügler (2010).
+    """The law of Kügler (2010), as in the paper, for a monotone C evaluated at the estimate.
 
     Inverse Problems 26, 035004: "Online parameter identification without Ricatti-type equations in
     a class of time-dependent partial differential equations: an extended state approach with
@@ -167,11 +167,11 @@ class KueglerLaw(_Relative):
         q' = gain A(u^)* r                       r = R u^ - u_alpha
         M u^' + B(u^) + A(u^) q^ + mu G* (G u^ - z) = F
 
-    both solved together in one implicit step. With ||z||_Z = ||G^+ z||_X the pull mu G* (G u^ - z)
-    is mu R^T M r. Against (est_exact_q), (est_exact_u): u^ stands for u_alpha + P u^, so the data
-    enter through r alone and noise is never differentiated by B; in return the energy balance
-    (align:neplusnr) holds the term (C(q*, u^) - C(q*, u*), u^ - u*), which must not be negative.
-    With partial data (A(u^) e, P u^ - P u*) does not cancel, so nothing is proved then.
+    One implicit step solves both equations together. With ||z||_Z = ||G^+ z||_X, mu G* (G u^ - z)
+    is mu R^T M r. Compared with (est_exact_q), (est_exact_u), u^ replaces u_alpha + P u^. So data
+    enter through r alone, and B does not differentiate noise. In return, the energy balance
+    (align:neplusnr) contains (C(q*, u^) - C(q*, u*), u^ - u*), which must be nonnegative. With
+    partial data, (A(u^) e, P u^ - P u*) does not cancel, and there is no proof.
 
     Parameters
     ----------
@@ -184,5 +184,5 @@ class KueglerLaw(_Relative):
     """
 
     def prepare(self, problem: Problem) -> GradientParts:
-        # Without M_op the pull is mu R^T M r.
+        # Without M_op the damping term is mu R^T M r.
         return _PartsAtEstimate.of(self._parts(problem, None))

@@ -1,8 +1,8 @@
-"""Scratch assays fitted with hindsight: what the choice of start, weights and equation does.
+"""Least-squares fits of scratch assays, for several choices of initial state, weights and equation.
 
-Least squares over all samples with livepde's forward model (`batch.py`), no prior: from the first
-sample as it is; the same with the published weights, u^-0.2 (so that what is left is smaller), and
-without their outlier on the left; with the density that every position starts from unknown as well.
+Each fit uses livepde's forward model (`batch.py`) and all samples, without a prior. "as measured"
+starts from the first sample; "weighted" also uses the published weights u^-0.2, which reduce the
+residuals, without the outlier on the left; "fitted, too" estimates the initial density.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""T* with truth beside its online surrogate: first violation of (cond_d), mean of five seeds.
+"""Compare T*, the first violation of (cond_d), with its online surrogate; mean of five seeds.
 
-The excited twin from a wrong initial state (u = 0; from the exact one r = 0 and T* = 0 at once),
-gain 1000, G_alpha = Tikhonov in V~ by the discrepancy principle or with a fixed alpha.
+The excited twin starts from a wrong initial state, u = 0; with the exact one, r = 0 and T* = 0 at
+once. The gain is 1000; G_alpha is Tikhonov in V~ by the discrepancy principle or a fixed alpha.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ WITHIN = 2.0
 
 @dataclass(frozen=True)
 class Setting:
-    """One row of the table: noise level, c_1, alpha (None: discrepancy principle), step, end."""
+    """Table row: noise level, c_1, alpha (None: discrepancy principle), step, number of samples."""
 
     level: float
     c1: float
@@ -41,8 +41,8 @@ SETTINGS = [
     for c1 in (10.0, 100.0)
     for alpha in (1e-5, None)
 ] + [
-    # Where it is not as good: the smoothing's own error decides, or a first violation that only
-    # some seeds meet early, the others seventeen times later.
+    # Settings with a poor surrogate: either the smoothing error dominates, or some seeds violate
+    # (cond_d) early and the others seventeen times later.
     Setting(0.001, 100.0, 1e-5),
     Setting(0.001, 100.0, 1e-6),
     Setting(0.01, 10.0, 1e-5, 0.05, 201),
@@ -64,7 +64,7 @@ def twin(setting: Setting, seed: int, samples: int) -> Twin:
 
 
 def run(setting: Setting, seed: int, samples: int | None = None) -> tuple[float, float]:
-    """Return (T*, its surrogate) of one seed; infinity if not reached."""
+    """Return T* and its surrogate for one seed; infinity if (cond_d) is not violated."""
     data = twin(setting, seed, samples or setting.samples)
     law = lp.GradientLaw(gain=GAIN, damping=lp.laws.ResidualDamping(setting.c1))
     identifier = lp.Identifier(data.model, data.observation, law, q0=0.0, u0=0.0)
@@ -80,7 +80,7 @@ def run(setting: Setting, seed: int, samples: int | None = None) -> tuple[float,
 
 
 def table(settings: list[Setting] = SETTINGS, samples: int | None = None) -> list[tuple[Any, ...]]:
-    """Return (setting, mean T*, mean surrogate, their quotient, within) for each setting."""
+    """Return rows (setting, mean T*, mean surrogate, surrogate / T*, within factor `WITHIN`)."""
     rows = []
     for setting in settings:
         pairs = np.array([run(setting, seed, samples) for seed in SEEDS])

@@ -1,9 +1,9 @@
-"""What unfinished steps cost: the law by default against the same law solved to rounding.
+"""Compare the law with its default stopping rule to the same law solved to rounding.
 
-By default a predicted stage counts as solved early (`Newton`), and the next stage makes up for what
-it left. `livepde.paper.STRICT` solves every stage to 1e-12. Both run here on the same data, with
-the same undivided steps, where little damps a difference: in two dimensions, with a diffusivity
-that vanishes on a part, and with noise that is independent in every coefficient.
+By default `Newton` accepts a predicted stage early, and the next stage corrects the remaining
+residual. `livepde.paper.STRICT` solves every stage to 1e-12. Both run on the same data with the
+same undivided steps, in settings that barely damp a difference: in two dimensions, with a
+diffusivity that vanishes on a part, and with noise that is independent in every coefficient.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from livepde.streams import RelativeNoise, Twin
 
 TIMES = 0.05 * np.arange(101)
 CELLS = {1: 30, 2: 8}
-PROMISE = 1e-2  # of `Newton.ceiling`
-TIGHT, KEPT = Newton(ceiling=1e-4), 1e-3  # a tenth of the ceiling, a tenth of the differences
+PROMISE = 1e-2  # largest difference that the default `Newton.ceiling` allows
+TIGHT, KEPT = Newton(ceiling=1e-4), 1e-3  # a tenth of the ceiling and of the allowed difference
 
 
 @dataclass(frozen=True)
 class Square:
-    """A setting: dimension, whether D vanishes for x < 1/2, observation, noise level and gain.
+    """Setting: dimension, whether D vanishes for x < 1/2, observation, noise level and gain.
 
-    `cells` on a side are those of `CELLS` if they are zero.
+    `cells` is the number of cells per side; zero selects the number in `CELLS`.
     """
 
     d: int = 2
@@ -82,14 +82,14 @@ class Square:
 
 @dataclass(frozen=True)
 class Apart:
-    """Largest |q - strict| and |u - strict|, over the largest |q|, |u|, and failed steps of both.
+    """Differences between a run and the strict run.
 
     Attributes
     ----------
     q, u
-        Over all samples.
+        Largest |q - strict|, |u - strict| over samples with both ok, over the largest |q|, |u|.
     failed
-        Of both runs.
+        Number of failed steps in both runs.
     """
 
     q: float
@@ -98,7 +98,7 @@ class Apart:
 
 
 def apart(setting: Square, newton: Newton | None = None) -> Apart:
-    """Run the law as `newton` solves it and strictly, and return how far they are apart."""
+    """Run the law with `newton` and strictly, and return the differences."""
     model, observation = setting.build()
     twin = Twin(
         model=model,
@@ -111,18 +111,18 @@ def apart(setting: Square, newton: Newton | None = None) -> Apart:
         seed=0,
     )
     law = GradientLaw(setting.gain, newton=newton or Newton(), gate=None)
-    found, strict = _run(twin, law), _run(twin, replace(law, newton=STRICT))
-    ok: Mask = found[2] & strict[2]
+    loose, strict = _run(twin, law), _run(twin, replace(law, newton=STRICT))
+    ok: Mask = loose[2] & strict[2]
     q, u = (
-        float(np.abs(one - other)[ok].max() / np.abs(other).max())
-        for one, other in zip(found[:2], strict[:2], strict=True)
+        float(np.abs(values - exact)[ok].max() / np.abs(exact).max())
+        for values, exact in zip(loose[:2], strict[:2], strict=True)
     )
-    failed = 2 * len(ok) - int(found[2].sum()) - int(strict[2].sum())
+    failed = 2 * len(ok) - int(loose[2].sum()) - int(strict[2].sum())
     return Apart(q, u, failed)
 
 
 def _run(twin: Twin, law: GradientLaw) -> tuple[Array, Array, Mask]:
-    """Return q, u and whether each step was taken."""
+    """Return q and u after each sample, and the mask of samples with status ok."""
     identifier = Identifier(twin.model, twin.observation, law, q0=0.0, u0=0.0, halvings=0)
     estimates = [identifier.step(sample.t, sample.z) for sample in twin]
     q, u, ok = zip(*((e.q, e.u, e.status.ok) for e in estimates), strict=True)
