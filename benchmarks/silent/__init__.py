@@ -1,7 +1,7 @@
-"""Results that were wrong without a word: each with its right value from a separate computation.
+"""Checks of results that were once wrong without a warning.
 
-A part is a module with a function `checks` that returns its checks. It computes the right value
-without livepde, or knows it by definition.
+Each part is a module whose function `checks` returns its checks. The correct value comes from a
+computation without livepde, or from a definition.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ PARTS = {
 
 
 def _part(name: str) -> list[Check]:
-    found: list[Check] = import_module(f"benchmarks.silent.{name}").checks()
-    return found
+    checks: list[Check] = import_module(f"benchmarks.silent.{name}").checks()
+    return checks
 
 
 def silent(names: Sequence[str], workers: int | None = None, *, progress: bool = False) -> Outcome:
-    """Return the checks of some parts, in the order of `PARTS`."""
+    """Run the named parts, and return their checks in the order of the names."""
     jobs = [(name,) for name in names]
     done = dict(each(_part, jobs, "parts", workers=workers or 2, progress=progress))
     return Outcome(checks=[check for (name,) in jobs for check in done[(name,)]])

@@ -1,7 +1,7 @@
-"""A checkpoint continues the problem that it was saved by, and is refused by any other.
+"""A checkpoint is accepted by the problem that saved it, and refused by every other problem.
 
-What is right is known by definition: a problem whose model, prior, sensors, options or start differ
-is another one, and one that is built again from the same numbers is the same one.
+Two problems differ if their models, priors, sensors, options or initial states differ; a problem
+rebuilt from the same numbers is the same problem.
 """
 
 from __future__ import annotations
@@ -71,24 +71,24 @@ def _samples() -> list[tuple[float, list[float]]]:
 
 
 def checks() -> list[Check]:
-    """Return the checks of this part."""
-    who = _rod()
-    result = who.run(_samples())
-    saved = who.dump()
-    taken = [
+    """Return the checks of checkpoints, shards and pickled results."""
+    original = _rod()
+    result = original.run(_samples())
+    saved = original.dump()
+    loaded = [
         name for name, changed in OTHERS.items() if not _refuses(_rod(**changed).restore, saved)
     ]
-    again = _rod()
-    again.restore(saved)
-    one, other = who.step(1.1, [0.55]), again.step(1.1, [0.55])
-    apart = np.abs(np.concatenate([one.q - other.q, one.u - other.u])).max()
+    rebuilt = _rod()
+    rebuilt.restore(saved)
+    expected, actual = original.step(1.1, [0.55]), rebuilt.step(1.1, [0.55])
+    error = np.abs(np.concatenate([actual.q - expected.q, actual.u - expected.u])).max()
     near = _rod(factor=1.0 + 1e-12, left=1.0 - 1e-12)
     read = pickle.loads(pickle.dumps(result))
     same = read.to_xarray().identical(result.to_xarray())
     return [
-        Check(f"checkpoints of {len(OTHERS)} other problems that are loaded", len(taken), 0, "<="),
+        Check(f"checkpoints of {len(OTHERS)} other problems that are loaded", len(loaded), 0, "<="),
         Check("shards of other problems that are loaded", _shards(), 0, "<="),
-        Check("the same problem built again: difference of the next estimate", apart, 0.0, "<="),
+        Check("the same problem built again: difference of the next estimate", error, 0.0, "<="),
         Check("sums that round differently are refused", _refuses(near.restore, saved), 0, "<="),
         Check("a result that was pickled has another dataset", not same, 0, "<="),
     ]

@@ -1,7 +1,7 @@
 """Exact Kalman filter and smoother of u' = s - decay u, with s a random walk or mean-reverting.
 
-No code of livepde: transition and process noise between two samples are those of van Loan's block
-exponential (1978), so that they are exact whatever the distance of the samples.
+Uses no code of livepde. Transition and process noise between two samples come from van Loan's block
+exponential (1978), so that they are exact for any spacing of the samples.
 """
 
 from __future__ import annotations
@@ -13,32 +13,32 @@ from scipy.linalg import expm
 
 
 def mean_and_end(rate: float, h: float, gained: float) -> np.ndarray:
-    """Return the covariance of mean and end value of the noise of a walk or a relaxation in h.
+    """Return the covariance of the mean over h and the end value of a walk's or relaxation's noise.
 
-    By van Loan's block exponential of (integral, value); `gained` is the variance at the end.
+    Uses van Loan's block exponential of (integral, value); `gained` is the variance at the end.
     """
     A, Q = np.array([[0.0, 1.0], [0.0, -rate]]), np.diag([0.0, 1.0])
     block = expm(h * np.block([[-A, Q], [np.zeros((2, 2)), A.T]]))
     P = block[2:, 2:].T @ block[:2, 2:]
     scale = np.diag([1.0 / h, 1.0])
-    found: np.ndarray = gained / P[1, 1] * scale @ (P + P.T) @ scale / 2
-    return found
+    covariance: np.ndarray = gained / P[1, 1] * scale @ (P + P.T) @ scale / 2
+    return covariance
 
 
 @dataclass(frozen=True)
 class Exact:
-    """The process, and one reading of u at each sample.
+    """The process with one reading of u at each sample.
 
     Attributes
     ----------
     decay
-        Rate at which u forgets.
+        Decay rate of u.
     std
         Prior standard deviation of s; u is known at the start.
     noise
-        Standard deviation of a reading.
+        Standard deviation of the noise of a reading.
     rate
-        Of a random walk of s; None: s is mean-reverting with the prior as stationary law.
+        Rate of the random walk of s; None: s is mean-reverting, its prior is stationary.
     time
         Relaxation time of a mean-reverting s.
     """
@@ -50,10 +50,10 @@ class Exact:
     time: float = np.inf
 
     def interval(self, h: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return transition and process noise of (u, s) in a time h."""
+        """Return the transition matrix and process noise of (u, s) over a time h."""
         A = np.array([[-self.decay, 1.0], [0.0, -1.0 / self.time]])
         spread = self.rate**2 if self.rate else 2.0 * self.std**2 / self.time
-        # A short part, doubled: the block exponential of a stiff process overflows.
+        # Double a short interval, because the block exponential of a stiff process overflows.
         doublings = max(int(np.ceil(np.log2(np.abs(A).max() * h))), 0) if h else 0
         Q, zero = np.diag([0.0, spread]), np.zeros((2, 2))
         block = expm(np.block([[-A, Q], [zero, A.T]]) * (h / 2**doublings))
@@ -64,7 +64,7 @@ class Exact:
         return F, (gained + gained.T) / 2
 
     def drawn(self, h: float, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Return a path of (u, s) at equidistant samples, from the prior, shape (count, 2)."""
+        """Draw a path of (u, s) at equidistant samples from the prior, shape (count, 2)."""
         F, Q = self.interval(h)
         root, x = np.linalg.cholesky(Q), np.array([0.0, self.std * rng.standard_normal()])
         path = [x]
@@ -74,11 +74,11 @@ class Exact:
         return np.array(path)
 
     def read(self, path: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Return the readings of a path."""
+        """Return noisy readings of u along a path."""
         return path[:, 0] + self.noise * rng.standard_normal(len(path))
 
     def filtered(self, h: float, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return means and covariances of (u, s) after each sample; NaN is no reading."""
+        """Return filtered means and covariances of (u, s); a NaN in z is a missing reading."""
         F, Q = self.interval(h)
         x, P, means, spreads = np.zeros(2), np.diag([0.0, self.std**2]), [], []
         for k, value in enumerate(z):
@@ -92,7 +92,7 @@ class Exact:
         return np.array(means), np.array(spreads)
 
     def smoothed(self, h: float, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return means and covariances of (u, s) at each sample given all of them."""
+        """Return smoothed means and covariances of (u, s) at each sample, given all readings."""
         F, Q = self.interval(h)
         means, spreads = self.filtered(h, z)
         for k in range(len(z) - 2, -1, -1):

@@ -1,13 +1,13 @@
-"""Unknowns that move between sparse samples: their standard deviations, coverage, and empty rows.
+"""Time-varying unknowns between sparse samples: standard deviations, coverage and empty rows.
 
-A state that is the same everywhere, u' = s - decay u, is read with noise at equidistant samples;
-s is a random walk or mean-reverting. Right are the numbers of the Kalman filter of (u, s) whose
-transition and process noise between two samples are exact (`exact_walk`), and a coverage of 0.95.
+A spatially constant state, u' = s - decay u, is measured with noise at equidistant samples; s is a
+random walk or mean-reverting. The correct estimates are those of a Kalman filter of (u, s) with
+exact transition and process noise between samples (`exact_walk`); the correct coverage is 0.95.
 
-The time scale of s is its relaxation time, or the time in which the walk gains the variance of its
-prior. A member has a path and readings of its own, and a start drawn from the prior. Successive
-samples of a member depend on each other, members do not: so the standard error of a coverage is
-that of the mean over members, a check of its own.
+The time scale of s is its relaxation time, or the time in which the walk gains its prior variance.
+Each member has its own path, readings and initial value drawn from the prior. Samples of one member
+are correlated, but members are independent. So the standard error of a coverage is computed from
+the mean over members, and checked separately.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ KINDS = {
     "mean-reverting": Exact(decay=0.0, std=STD, noise=0.1, time=SCALE),
     "mean-reverting, fast state": Exact(decay=20.0, std=STD, noise=0.0015, time=SCALE),
 }
-# The first report of this: standard deviations of 0.97, 0.82 and 0.31 of those of the exact filter.
+# The first reported case had standard deviations of 0.97, 0.82 and 0.31 times the exact ones.
 REPORTED, REPORTED_SPACINGS = Exact(decay=0.0, std=2.0, noise=0.05, rate=0.3), (0.1, 0.5, 2.0)
 MEMBERS, SAMPLES = 100, 32
-EMPTY, FEW = 11, 10  # rows between two samples, and members that have them
-# The filter alone: safeguards, gate and refits do nothing here but cost time.
+EMPTY, FEW = 11, 10  # empty rows between two samples, and members of these runs
+# The filter alone, because safeguards, gate and refits have no effect here and cost time.
 LAW = lp.SensitivityLaw(shadows=None, guards=None, gate=np.inf, refit=None, verdict=False)
 
 
@@ -47,20 +47,20 @@ def checks() -> list[Check]:
 
 
 class _Run(NamedTuple):
-    """A fleet against the exact filter.
+    """Comparison of a fleet with the exact filter.
 
     Attributes
     ----------
     ratio
-        Standard deviation of s, over the exact one, shape (samples,).
-    off
-        Largest distance of an estimate from that of the exact filter, in standard deviations.
+        Smallest standard deviation of s over the members, over the exact one, shape (samples,).
+    error
+        Largest difference between an estimate and the exact one, in standard deviations.
     covered
-        Share of the samples of each member whose interval holds the truth, shape (members,).
+        Share of samples of each member whose interval contains the truth, shape (members,).
     """
 
     ratio: Array
-    off: float
+    error: float
     covered: Array
 
 
@@ -87,15 +87,15 @@ def _run(exact: Exact, h: float) -> _Run:
     fleet, (truth, z) = _fleet(exact, MEMBERS), _drawn(exact, h, MEMBERS)
     means = np.array([exact.filtered(h, row)[0][:, 1] for row in z])
     std = np.sqrt(exact.filtered(h, z[0])[1][:, 1, 1])
-    ratio, off, inside = [], 0.0, []
+    ratio, error, inside = [], 0.0, []
     for k in range(SAMPLES):
-        found, found_std = fleet.step(k * h, z[:, k : k + 1]).parameters["s"]
-        # Innovations that seem to be correlated, by chance, widen the intervals of some members:
-        # the narrowest ones are those of the filter itself.
-        ratio.append(float(found_std.min()) / std[k])
-        off = max(off, float(np.abs(found - means[:, k]).max()) / std[k])
-        inside.append(np.abs(found - truth[:, k]) <= 1.96 * found_std)
-    return _Run(ratio=np.array(ratio), off=off, covered=np.mean(inside, axis=0))
+        s, s_std = fleet.step(k * h, z[:, k : k + 1]).parameters["s"]
+        # Innovations that are correlated by chance widen the intervals of some members; the
+        # narrowest intervals are those of the filter itself.
+        ratio.append(float(s_std.min()) / std[k])
+        error = max(error, float(np.abs(s - means[:, k]).max()) / std[k])
+        inside.append(np.abs(s - truth[:, k]) <= 1.96 * s_std)
+    return _Run(ratio=np.array(ratio), error=error, covered=np.mean(inside, axis=0))
 
 
 def _narrowest(name: str, ratios: list[float]) -> Check:
@@ -103,15 +103,15 @@ def _narrowest(name: str, ratios: list[float]) -> Check:
 
 
 def _sparse(name: str, exact: Exact) -> Iterator[Check]:
-    """Yield the checks of a process, each about the worst spacing."""
+    """Yield the checks of a process, each for its worst spacing."""
     runs = [_run(exact, share * SCALE) for share in SPACINGS]
     shares = [float(run.covered.mean()) for run in runs]
     errors = [float(run.covered.std(ddof=1)) / MEMBERS**0.5 for run in runs]
     widest = max(float(run.ratio.max()) for run in runs)
     yield _narrowest(name, [float(run.ratio.min()) for run in runs])
     yield Check(f"{name}: standard deviation over exact, largest", widest, 1.02, "<=")
-    off = max(run.off for run in runs)
-    yield Check(f"{name}: standard deviations off the exact estimate", off, 0.1, "<=")
+    error = max(run.error for run in runs)
+    yield Check(f"{name}: standard deviations off the exact estimate", error, 0.1, "<=")
     yield Check(f"{name}: coverage of 95 % intervals, lowest", min(shares), 0.93, ">=")
     yield Check(f"{name}: coverage of 95 % intervals, highest", max(shares), 0.97, "<=")
     text = f"{name}: three standard errors of a coverage, largest"
@@ -119,16 +119,16 @@ def _sparse(name: str, exact: Exact) -> Iterator[Check]:
 
 
 def _empty(name: str, exact: Exact) -> Iterator[Check]:
-    """Yield the checks of rows without a reading, at the widest spacing."""
+    """Yield the checks that rows without a reading change nothing, at the widest spacing."""
     h, nothing = SPACINGS[-1] * SCALE, np.full((FEW, 1), np.nan)
     plain, filled, z = _fleet(exact, FEW), _fleet(exact, FEW), _drawn(exact, h, FEW)[1]
     wider, moved = 0.0, 0.0
     for k in range(SAMPLES // 4):
         for j in range(1, EMPTY + 1) if k else ():
             filled.step((k - 1 + j / (EMPTY + 1)) * h, nothing)
-        one, other = (each.step(k * h, z[:, k : k + 1]).parameters["s"] for each in (plain, filled))
-        std = float(one[1].min())
-        wider = max(wider, abs(float(other[1].min()) / std - 1.0))
-        moved = max(moved, float(np.abs(one[0] - other[0]).max()) / std)
+        s, std = plain.step(k * h, z[:, k : k + 1]).parameters["s"]
+        s_filled, std_filled = filled.step(k * h, z[:, k : k + 1]).parameters["s"]
+        wider = max(wider, abs(float(std_filled.min()) / float(std.min()) - 1.0))
+        moved = max(moved, float(np.abs(s - s_filled).max()) / float(std.min()))
     yield Check(f"{name}: share by which empty rows change a deviation", wider, 0.01, "<=")
     yield Check(f"{name}: deviations by which they move an estimate", moved, 0.01, "<=")

@@ -1,4 +1,4 @@
-"""The paper's law: stages whose root is far from the start, checks that can fail, linearisation."""
+"""Checks of the paper's law: roots far from the start, the figure's shift, reduced models."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from livepde.observation import Points
 from livepde.reproduce import boiger2016, seed
 
 FAR = (3, 106)  # seed of the noise, and samples up to a stage whose root is 1.7e6 from its start
-DENSE = 1e-7  # residual in the equations below over their largest term; 3e-9 is measured
+DENSE = 1e-7  # bound on the residual in dense equations over their largest term; measured 3e-9
 STATIC = 0.01  # relative error of a static response, on 16 cells
 
 
 def checks() -> list[Check]:
-    """Return the checks."""
+    """Return the checks of the paper's law."""
     return [*_far(), *_shift(), *_reduced()]
 
 
@@ -32,12 +32,12 @@ def checks() -> list[Check]:
 
 @dataclass(frozen=True)
 class Dense:
-    """Cubic Hermite functions of section 4 on (0, 1), by dense matrices: value, slope per node."""
+    """Cubic Hermite functions of section 4 on (0, 1) as dense matrices; value, slope per node."""
 
     cells: int = seed.N - 1
 
     def rows(self) -> tuple[Array, Array, Array, Array]:
-        """Return points, weights, and values and slopes of all functions at the points."""
+        """Return quadrature points and weights, and values and slopes of all basis functions."""
         xi, w = np.polynomial.legendre.leggauss(6)
         s, h = 0.5 * (xi + 1.0), 1.0 / self.cells
         local = [
@@ -56,14 +56,14 @@ class Dense:
         return x, np.tile(0.5 * h * w, self.cells), v, dv
 
     def residual(self, before: tuple[Any, Any], after: tuple[Any, Any], z: Any, t: float) -> float:
-        """Return the residual of a step 0.6 with gain 100 and a constant mu = 1.
+        """Return the residual of a step of size 0.6 with gain 100 and constant mu = 1.
 
         Parameters
         ----------
         before, after
-            (u, q) at both ends.
+            (u, q) at the start and at the end of the step.
         z
-            Data: coefficients on omega, zero elsewhere.
+            Measured coefficients on omega, zero elsewhere.
         """
         (x, weights, v, dv), h, gain, mu, floor = self.rows(), 0.6, 100.0, 1.0, 1e-3
         # omega is the union of the cells within (0.3, 0.87).
@@ -108,7 +108,7 @@ class Dense:
 
 
 def _far() -> list[Check]:
-    """Return the checks of a run with nodal noise of 1 % and a constant mu."""
+    """Check a run with 1 % nodal noise and constant mu, whose last root is far from its start."""
     number, count = FAR
     case, variant = boiger2016.paper_case(), boiger2016.PAPER["nodal, mu = 1"]
     twin = case.twin
@@ -116,23 +116,23 @@ def _far() -> list[Check]:
         twin.model, twin.observation, variant.law, q0=0.0, u0=case.start, halvings=0
     )
     samples = list(case.samples(variant.noise, boiger2016.LEVELS[0], number))[:count]
-    found = [identifier.step(sample.t, np.asarray(sample.z)) for sample in samples]
-    before, after = ((np.asarray(e.u), np.asarray(e.q)) for e in found[-2:])
+    estimates = [identifier.step(sample.t, np.asarray(sample.z)) for sample in samples]
+    before, after = ((np.asarray(e.u), np.asarray(e.q)) for e in estimates[-2:])
     z = np.asarray(twin.observed.G.T @ np.asarray(samples[-1].z))
-    left = Dense().residual(before, after, z, samples[-1].t)
-    failed = sum(not estimate.status.ok for estimate in found)
+    size = Dense().residual(before, after, z, samples[-1].t)
+    failed = sum(not estimate.status.ok for estimate in estimates)
     return [
         Check(f"paper, nodal noise 1 %: failed steps of {count}", float(failed), 0.0, "<="),
-        Check("paper, root 1.7e6 from the start: residual in dense equations", left, DENSE, "<="),
+        Check("paper, root 1.7e6 from the start: residual in dense equations", size, DENSE, "<="),
     ]
 
 
 def _shift() -> list[Check]:
-    """Return the checks that q = 0 and q* do not pass for the figure of the paper."""
+    """Check that q = 0, q* and a small shifted q* fail the test of the paper's figure."""
     x, (low, high) = np.linspace(0.0, 1.0, 61), seed.SHIFTED
     nothing, exact = np.zeros(61), seed.q_true([x])
     passed = [low <= seed.shift(x, q) <= high for q in (nothing, exact, 1e-3 * (exact - x * exact))]
-    # A parabola whose zeros are 0.06 and 1: its first moment about 1/2 is known.
+    # The first moment about 1/2 of a parabola with zeros 0.06 and 1 is known.
     moved = 0.025 * (x - 0.06) * (x - 1.0)
     integral = 0.025 * np.array([(1 / 4 - 1.06 / 3 + 0.03), (1 / 3 - 1.06 / 2 + 0.06)])
     right = (integral[0] - 0.5 * integral[1]) / (-0.025 / 6)
@@ -148,9 +148,9 @@ def _shift() -> list[Check]:
 
 
 def _reduced() -> list[Check]:
-    """Return the checks of a reduced model of u_t = (D0 (1 + b u) u_x)_x, about its steady state.
+    """Check a reduced model of u_t = (D0 (1 + b u) u_x)_x about its steady state.
 
-    With u = hot at the left and 0 at the right, u + b u^2/2 is linear in x in a steady state.
+    In the steady state with u = hot at the left and u = 0 at the right, u + b u^2/2 is linear in x.
     """
     mesh, D0, b, hot = interval(0.0, 1.0, 16), 0.1, 0.5, 1.0
     model = Model(
@@ -180,7 +180,7 @@ def _reduced() -> list[Check]:
     K, E, f = small.system(np.array([b]))
     response = (small.outputs.C @ np.linalg.solve(K, E) + small.outputs.D)[0, 0]
     middle = float(steady(np.array(0.5)))
-    # d/dhot of u + b u^2/2 = (hot + b hot^2/2)/2, and d/db of the same.
+    # Derivatives of u + b u^2/2 = (hot + b hot^2/2)/2 with respect to hot and b.
     by_hot = 0.5 * (1.0 + b * hot) / (1.0 + b * middle)
     by_b = (hot**2 / 4 - middle**2 / 2) / (1.0 + b * middle)
     c, change = np.array([hot]), 1e-3
@@ -188,7 +188,7 @@ def _reduced() -> list[Check]:
     for value in (b - change, b + change):
         K, E, f = small.system(np.array([value]))
         ends.append(small.outputs(np.linalg.solve(K, E @ c + f), c)[0])
-    found = (ends[1] - ends[0]) / (2 * change)
+    slope = (ends[1] - ends[0]) / (2 * change)
     return [
         Check(
             "reduce: models linearised without an operating point, or where b vanishes",
@@ -202,5 +202,5 @@ def _reduced() -> list[Check]:
             (1 - STATIC, 1 + STATIC),
             "in",
         ),
-        Check("reduce: static response to b / exact", found / by_b, (1 - STATIC, 1 + STATIC), "in"),
+        Check("reduce: static response to b / exact", slope / by_b, (1 - STATIC, 1 + STATIC), "in"),
     ]

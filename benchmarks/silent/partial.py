@@ -1,4 +1,4 @@
-"""`GradientLaw(gain="auto")` on partial data: refused with derivatives of u, unsmoothed without."""
+"""Checks of `GradientLaw(gain="auto")`: refused partial data, near-best gain, full data."""
 
 from __future__ import annotations
 
@@ -26,38 +26,36 @@ from livepde.model import Model
 from livepde.observation import Full
 from livepde.stepping import Alexander2
 
-DIFFUSIVITY = 0.1  # of the data that `benchmarks.partial` makes with q = 0
-CLOSE = 0.05  # relative error of it from full data: 0.027 is measured
+DIFFUSIVITY = 0.1  # of the data that `benchmarks.partial` generates for q = 0
+CLOSE = 0.05  # bound on its relative error from full data; measured 0.027
 
 
 def checks() -> list[Check]:
-    """Return the checks."""
+    """Return the checks of the self-tuning gradient law."""
     return [*refused(), *_reaction(), _full()]
 
 
 def _reaction() -> list[Check]:
-    """Return the checks of one noisy run: near the best gain, no growth, no smoothing."""
+    """Check that a noisy run is close to the best gain, does not drift, and is not smoothed."""
     data, level = Readings.drawn(PROCESSES["line, field"], 0), LEVELS[-1]
     states = data.noisy(level, 0)
-    found = follow(data, states, GradientLaw(gain="auto"))
+    run = follow(data, states, GradientLaw(gain="auto"))
     return [
         Check(
             "partial, 1 % noise: error / best constant gain",
-            found.last / best(data, states),
+            run.last / best(data, states),
             RATIO,
             "<=",
         ),
-        Check(
-            "partial, 1 % noise: error at the end / at half", found.last / found.half, GROWTH, "<="
-        ),
-        Check("partial, 1 % noise: error / that of the prior mean", found.last, 1.0, "<="),
-        Check("partial, 1 % noise: failed steps", float(found.failed), 0.0, "<="),
-        Check("partial, 1 % noise: largest alpha of a smoothing", found.alpha, 0.0, "<="),
+        Check("partial, 1 % noise: error at the end / at half", run.last / run.half, GROWTH, "<="),
+        Check("partial, 1 % noise: error / that of the prior mean", run.last, 1.0, "<="),
+        Check("partial, 1 % noise: failed steps", float(run.failed), 0.0, "<="),
+        Check("partial, 1 % noise: largest alpha of a smoothing", run.alpha, 0.0, "<="),
     ]
 
 
 def _full() -> Check:
-    """Return the check that full data still give a diffusivity."""
+    """Check that the law estimates a diffusivity from full data."""
     process = Reaction(1, 40)
     mesh = interval(0.0, 1.0, process.cells)
 

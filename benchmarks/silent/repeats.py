@@ -1,8 +1,8 @@
-"""Rows that arrive twice, clocks that go back, bits that flip, and variables that a case asks for.
+"""Checks of repeated rows, clocks set back, flipped bits, and environment variables in a case.
 
-A rod's end is warmed and cooled; rows 200 to 299 come again after row 299, by a file, by standard
-input and by a broker. Right are the estimates of the run without the repeat, to the bit, and by a
-fit that does not use livepde (finite differences, Crank-Nicolson, `scipy.optimize.least_squares`).
+One end of a rod is heated and cooled; rows 200 to 299 arrive twice, by file, standard input and
+broker. Estimates must equal the run without repeats to the bit, and this run must agree with a fit
+without livepde (Crank-Nicolson finite differences, `scipy.optimize.least_squares`).
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from livepde.runs import RunWriter
 from livepde.runs import open as open_run
 from livepde.runs.backlog import Sink
 
-COUNT, FIRST, END = 600, 200, 300  # rows, and those of them that come again
+COUNT, FIRST, END = 600, 200, 300  # number of rows; rows FIRST to END - 1 are repeated
 ALPHA, STEP, NOISE = 2e-5, 60.0, 0.05  # m^2/s, s, K
 CELLS, SUBSTEPS = 120, 4  # of the finite differences
-BACK, EVERY = 3.5, 30  # steps by which the clock goes back, and how often
+BACK, EVERY = 3.5, 30  # steps by which the clock is set back, and rows between two setbacks
 FLIPS = 200
-PATIENCE = 60.0  # seconds for the run of a broker
+PATIENCE = 60.0  # time limit of a run with a broker, in seconds
 _CASE = """equation = "heat"
 initial = "interpolate"
 
@@ -72,25 +72,25 @@ Row = dict[str, float]
 
 
 def checks() -> list[Check]:
-    """Return the checks of repeated rows, clocks, flipped bits and variables."""
+    """Return the checks of repeated rows, clocks, flipped bits and environment variables."""
     rows = rod()
     repeated = [*rows[:END], *rows[FIRST:END], *rows[END:]]
     back = [{**row, "time": row["time"] - BACK * STEP * (k // EVERY)} for k, row in enumerate(rows)]
     with TemporaryDirectory() as name:
         folder = Path(name)
         right = _from_file(folder / "right", rows)
-        found = [
+        checks = [
             *_fitted(right, fit(rows)),
             *_repeats("file", _from_file(folder / "file", repeated), right),
             *_repeats("standard input", _from_lines(folder / "lines", repeated), right),
             *_from_topic(folder / "topic", repeated, right),
             *_went_back(_from_file(folder / "back", back), back),
         ]
-        return [*found, *_flips(folder / "flips", right.data), *_variables(folder / "variables")]
+        return [*checks, *_flips(folder / "flips", right.data), *_variables(folder / "variables")]
 
 
 def rod() -> list[Row]:
-    """Return the rows of a rod by finite differences, with white noise on its sensors."""
+    """Simulate a rod by finite differences; return its rows with white noise on the sensors."""
     rng = np.random.default_rng(36)
     times = STEP * np.arange(COUNT)
     left = 20.0 + 5.0 * np.sin(2e-4 * times) + 3.0 * np.sin(9e-4 * times)
@@ -100,12 +100,12 @@ def rod() -> list[Row]:
 
 
 def simulated(alpha: float, left: Array) -> Array:
-    """Return the temperatures at 0.3 and 0.6 m of a rod at 20 degrees whose left end is given."""
+    """Return temperatures at 0.3 and 0.6 m of a rod, initially at 20 degrees, for its left end."""
     h, dt = 1.0 / CELLS, STEP / SUBSTEPS
     r = 0.5 * alpha * dt / h**2
     bands = np.zeros((3, CELLS - 1))
     bands[0], bands[1], bands[2] = -r, 1.0 + 2.0 * r, -r
-    u, found = np.full(CELLS + 1, 20.0), []
+    u, readings = np.full(CELLS + 1, 20.0), []
     places = [round(0.3 * CELLS), round(0.6 * CELLS)]
     for k, end in enumerate(left):
         start = left[max(k - 1, 0)]
@@ -115,25 +115,25 @@ def simulated(alpha: float, left: Array) -> Array:
             b[0] += r * u[0]
             b[-1] += r * u[-1]
             u[1:-1] = solve_banded((1, 1), bands, b)
-        found.append(u[places].copy())
-    return np.array(found)
+        readings.append(u[places].copy())
+    return np.array(readings)
 
 
 def fit(rows: Sequence[Row]) -> float:
-    """Return the diffusivity by least squares on all rows."""
+    """Estimate the diffusivity by least squares on all rows."""
     left = np.array([row["left"] for row in rows])
     measured = np.array([[row["T_3"], row["T_6"]] for row in rows])
 
     def residual(p: Array) -> Array:
-        off: Array = (simulated(1e-5 * float(p[0]), left) - measured).ravel() / NOISE
-        return off
+        scaled: Array = (simulated(1e-5 * float(p[0]), left) - measured).ravel() / NOISE
+        return scaled
 
-    answer = least_squares(residual, [3.0])
-    return 1e-5 * float(answer.x[0])
+    solution = least_squares(residual, [3.0])
+    return 1e-5 * float(solution.x[0])
 
 
 class _Done:
-    """What is kept of a run: its dataset, counts, times and events."""
+    """Dataset, counts, sample times and event messages of a finished run."""
 
     def __init__(self, live: Any) -> None:
         self.data = live.result.to_xarray()
@@ -148,13 +148,13 @@ class _Done:
 
 
 class _Last(Sink):
-    """Stops a run, which a broker never ends, at its last estimate."""
+    """Sink that stops a run with a broker, which never ends by itself, at its last estimate."""
 
     def __init__(self, stopping: threading.Event) -> None:
         self._stopping = stopping
 
     def put(self, estimate: Estimate) -> None:
-        """Take one estimate."""
+        """Request the stop once the last row was estimated."""
         if estimate.t >= STEP * (COUNT - 1):
             self._stopping.set()
 
@@ -210,19 +210,19 @@ def _from_topic(folder: Path, rows: Sequence[Row], right: _Done) -> list[Check]:
 
 
 def _fitted(right: _Done, alpha: float) -> list[Check]:
-    """Return whether the run without the repeat agrees with the fit of another code."""
+    """Check that the run without repeats agrees with the independent fit."""
     value, std = right.alpha
-    off = abs(value - alpha) / std
-    return [Check("no repeats: alpha, standard deviations off the fit", off, 2.0, "<=")]
+    error = abs(value - alpha) / std
+    return [Check("no repeats: alpha, standard deviations off the fit", error, 2.0, "<=")]
 
 
 def _none(what: str, value: float) -> Check:
-    """Return the check that something does not occur."""
+    """Return a check that a count is zero."""
     return Check(what, value, 0, "<=")
 
 
 def _repeats(source: str, found: _Done, right: _Done) -> list[Check]:
-    """Return whether a run with repeated rows is the run without them."""
+    """Check that a run with repeated rows equals the run without them, and counts the repeats."""
     invented = set(found.times) - set(right.times)
     same = [np.array_equal(found.data[n], right.data[n]) for n in ("alpha", "alpha_std", "time")]
     counted = abs(found.counts.get(("repeated", ""), 0) - (END - FIRST))
@@ -236,7 +236,7 @@ def _repeats(source: str, found: _Done, right: _Done) -> list[Check]:
 
 
 def _went_back(found: _Done, rows: Sequence[Row]) -> list[Check]:
-    """Return whether the samples are those rows that are later than all before, and it is said."""
+    """Check that the samples are the rows later than all before, and that the rest is reported."""
     newest = np.maximum.accumulate([row["time"] for row in rows])
     kept = [0.0, *newest[1:][np.diff(newest) > 0].tolist()]
     late = sum(n for (kind, name), n in found.counts.items() if name == "left")
@@ -250,7 +250,7 @@ def _went_back(found: _Done, rows: Sequence[Row]) -> list[Check]:
 
 
 def _flips(folder: Path, data: Any) -> list[Check]:
-    """Return how many changed bits of the files of a finished run are not detected."""
+    """Check that every changed bit in the estimates of a finished run is detected."""
     writer = RunWriter.create(folder, version="1", command=[], title="flips")
     writer.finish(status="finished", dataset=data)
     path, rng = folder / "estimates.nc", np.random.default_rng(36)
@@ -269,7 +269,7 @@ def _flips(folder: Path, data: Any) -> list[Check]:
 
 @contextmanager
 def _variable(name: str) -> Iterator[None]:
-    """Set an environment variable for a while."""
+    """Set an environment variable within a context."""
     os.environ[name] = "a secret"
     try:
         yield
@@ -278,7 +278,7 @@ def _variable(name: str) -> Iterator[None]:
 
 
 def _variables(folder: Path) -> list[Check]:
-    """Return how often a case gets a variable that the command line has not allowed."""
+    """Check that a case never gets a variable that the command line does not allow."""
     sent = 0
     for name, allowed in (("MY_SECRET", ()), ("MY_SECRET", ("OTHER",)), ("LIVEPDE_TOKEN", ())):
         source = f'mqtt = {{ rows = ["a"], port = 1, password_env = "{name}" }}'

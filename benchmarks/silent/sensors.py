@@ -1,7 +1,7 @@
-"""Sensors that fail for a while, and wild first rows: what was learned stays.
+"""Checks that temporary sensor failures and outliers in the first row do not spoil the estimates.
 
-The truth is by construction: readings of a rod come from finite differences of our own, and those
-of a slab from the series of the exact solution.
+Readings of a rod come from independent finite differences, and readings of a slab from the series
+of the exact solution, so that the truth is known.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from livepde.models import heat
 
 ALPHA, LENGTH, STEP, NOISE = 1e-4, 0.4, 20.0, 0.05
 AT = (0.1, 0.2, 0.3)
-SLAB, FREQUENCY = 0.04, 2.0  # diffusivity of the slab, and of its driven end
-WITHIN = 4.0  # standard deviations between estimate and truth
-WIDER = 1.2  # times the interval without the broken readings
+SLAB, FREQUENCY = 0.04, 2.0  # diffusivity of the slab, and angular frequency at its driven end
+WITHIN = 4.0  # largest error of an estimate, in standard deviations
+WIDER = 1.2  # largest ratio to the standard deviation without bad readings
 
 
 def _left(t: float) -> float:
@@ -31,7 +31,7 @@ def _left(t: float) -> float:
 
 
 def _rod(rows: int) -> Array:
-    """Return noisy readings by Crank-Nicolson on 160 cells with 8 steps a row, (rows, 3)."""
+    """Return noisy readings by Crank-Nicolson, 160 cells, 8 steps per row, shape (rows, 3)."""
     cells, parts = 160, 8
     u, h = np.full(cells + 1, 20.0), STEP / parts
     r = 0.5 * ALPHA * h / (LENGTH / cells) ** 2
@@ -51,10 +51,10 @@ def _rod(rows: int) -> Array:
 
 
 def _slab(t: Array) -> Array:
-    """Return readings at x = 0.3 and 0.6 of a slab on (0, 1) from zero, its left end at sin(w t).
+    """Return exact readings at x = 0.3 and 0.6 of a slab on (0, 1), u = 0 at the start.
 
-    The series u = (1 - x) sin wt + sum c_n(t) sin(n pi x) with c_n' + l c_n = -2 w cos(wt)/(n pi),
-    l = alpha (n pi)^2.
+    With u = sin(w t) at the left and u = 0 at the right, u = (1 - x) sin(w t) + sum c_n(t) sin(n pi
+    x), where c_n' + l c_n = -2 w cos(w t)/(n pi) and l = alpha (n pi)^2.
     """
     x, n = np.array([0.3, 0.6]), np.arange(1, 400)[:, None]
     w, rate = FREQUENCY, SLAB * (n * np.pi) ** 2
@@ -73,7 +73,7 @@ def _checked(name: str, estimate: Any, reference: Any, truth: float) -> list[Che
 
 
 def _unplugged(count: int) -> list[Check]:
-    """One of three sensors reads -127 for some rows, then 50 good ones follow."""
+    """Check a run in which one of three sensors reads -127 for `count` rows, 50 before the end."""
     first, z = 200, _rod(250 + count)
     ends = {"left": lp.Channel("T_left"), "right": 20.0}
 
@@ -91,7 +91,7 @@ def _unplugged(count: int) -> list[Check]:
 
 
 def _nines() -> list[Check]:
-    """One of two sensors of a slab reads -9999 for 20 rows, then 130 good ones follow."""
+    """Check a run in which one of two slab sensors reads -9999 for 20 rows, 130 before the end."""
     t = 0.05 * np.arange(300.0)
     z = _slab(t) + 0.01 * np.random.default_rng(1).standard_normal((len(t), 2))
 
@@ -110,7 +110,7 @@ def _nines() -> list[Check]:
 
 
 def _case(rows: Array, left: dict[int, float]) -> Any:
-    """Return the last estimate of a case file, whose initial state is made of the first row."""
+    """Run a case with the initial state from the first row, and return the last estimate."""
     sensors = "\n".join(
         f'T_{k + 1} = {{ role = "sensor", column = "T_{k + 1}", at = {x}, noise = {NOISE} }}'
         for k, x in enumerate(AT)
@@ -140,7 +140,7 @@ T_right = {{ role = "boundary", column = "T_right", at = "right" }}
 
 
 def _first_rows() -> list[Check]:
-    """A sensor reads 85 in the first row, or a boundary value is 9999 there."""
+    """Check runs in which, in the first row, a sensor reads 85 or a boundary value is 9999."""
     z = _rod(150)
     reference, hot = _case(z, {}), z.copy()
     hot[0, 1] = 85.0
@@ -151,5 +151,5 @@ def _first_rows() -> list[Check]:
 
 
 def checks() -> list[Check]:
-    """Return the checks of sensors that fail."""
+    """Return the checks of failing sensors."""
     return [*_unplugged(12), *_unplugged(50), *_nines(), *_first_rows()]

@@ -1,7 +1,7 @@
-"""The smoother weighs each reading by its own noise, as the filter does.
+"""Checks that the smoother, like the filter, weights each reading by its own noise.
 
-A source in a rod is a regression on one number, which gives the right values. A furnace wall is run
-as a case, with a column of noise and `output.smoothed`; its truth comes from finite volumes.
+Estimating a source in a rod is a regression on one number, which gives the exact values. A furnace
+wall is run as a case with a noise column and `output.smoothed`; its data are from finite volumes.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from livepde.diagnostics.check_report import Check
 Array = NDArray[Any]
 
 CELLS, STEP, COUNT = 10, 0.1, 60
-SENSOR, FINE, ROUGH = 5, 0.001, 0.5  # node of the sensor, and the noise of readings in turn
-STD = 2.0  # of the prior of the source
+SENSOR, FINE, ROUGH = 5, 0.001, 0.5  # node of the sensor, and its two alternating noise levels
+STD = 2.0  # prior standard deviation of the source
 ROUGH_KELVIN = 3.0  # noise of every second row of the furnace
-EVERY = 40  # rows of the furnace
+EVERY = 40  # every 40th row of the furnace is used
 
 
 def checks() -> list[Check]:
-    """Return the checks of this part."""
+    """Return the checks of the smoother."""
     return [*_source(), *_furnace()]
 
 
@@ -38,7 +38,7 @@ def checks() -> list[Check]:
 
 
 def _transition() -> Array:
-    """Return F of (u, s) over a step: implicit Euler for u_t = 0.3 u_xx + s, zero at both ends."""
+    """Return F of (u, s) by implicit Euler for u_t = 0.3 u_xx + s, with u = 0 at both ends."""
     h, n = 1.0 / CELLS, CELLS + 1
     M = h / 6.0 * (4.0 * np.eye(n) + np.eye(n, k=1) + np.eye(n, k=-1))
     K = 0.3 / h * (2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
@@ -52,7 +52,7 @@ def _transition() -> Array:
 
 
 def _readings() -> tuple[Array, Array]:
-    """Return what the sensor shows of s = 1, and the noise of each reading."""
+    """Return noisy readings for s = 1, and the noise standard deviation of each reading."""
     rng, F, x = np.random.default_rng(0), _transition(), np.zeros(CELLS + 2)
     x[-1] = 1.0
     std = np.where(np.arange(COUNT) % 2, FINE, ROUGH)
@@ -64,9 +64,9 @@ def _readings() -> tuple[Array, Array]:
 
 
 def _exact(z: Array, std: Array) -> tuple[float, float, Array]:
-    """Return mean and deviation of s given all readings, and the states for s = 1.
+    """Return mean and standard deviation of s given all readings, and the states for s = 1.
 
-    The state is known at the start, so that it is s times its response: a regression on one number.
+    The initial state is zero, so that the state is s times its response: a regression on s.
     """
     F, x, states = _transition(), np.append(np.zeros(CELLS + 1), 1.0), []
     for _ in z:
@@ -99,7 +99,7 @@ def _source() -> list[Check]:
     last, data = result.last, result.smoothed()
     if last is None:
         raise RuntimeError("the run has no estimate")
-    # Intervals are widened where innovations are correlated, by one factor for all times.
+    # If innovations are correlated, all intervals are widened by one common factor.
     widened = float(data["s_std"][-1]) / deviation
     states, spread = data["u"].values - exact * response, data["u_std"].values / widened
     spread = spread - deviation * np.abs(response)
@@ -163,12 +163,12 @@ def _furnace() -> list[Check]:
 
 
 def _alike(data: xr.Dataset, name: str, truth: float) -> list[Check]:
-    """Return checks of an unknown at the last sample."""
+    """Check the smoothed estimate of an unknown at the last sample."""
     mean, std, smooth, smooth_std = (
         float(data[f"{name}{end}"][-1]) for end in ("", "_std", "_smoothed", "_smoothed_std")
     )
     return [
-        # The smoother is linear about another trajectory, which changes little.
+        # The smoother linearises about a different trajectory, which changes little.
         Check(
             f"furnace, {name}: last smoothed less last filtered, in deviations",
             abs(smooth - mean) / std,

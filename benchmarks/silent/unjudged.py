@@ -1,12 +1,12 @@
-"""A run that was not tested is not trusted, and tests of the gradient law that can fail.
+"""Checks that untested runs are not trusted, and that the gradient law detects wrong models.
 
-The data are those of finite differences of our own, Crank-Nicolson on 200 cells, of
+The data come from independent finite differences, Crank-Nicolson on 200 cells, of
 
     u_t = D u_xx - q u + f,    D = 1,  q = 5,
 
-with noise or without. A model with D = 1 is right; one with D = 2, D = 1.3 or half of the source is
-wrong by definition, and no value of q makes it right. A field a(x) that is observed in a part of
-the rod was lost by the law of the time: its estimate had more than the error of the prior.
+with or without noise. A model with D = 1 is correct. No value of q corrects a model with D = 2,
+D = 1.3 or half of the source. For a field a(x) observed on a part of the rod, the gradient law once
+returned an estimate with a larger error than the prior.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from livepde.diagnostics.check_report import Check
 from livepde.errors import LawError
 from livepde.runs import verdict, verdict_table
 
-CELLS, DT, EVERY, SAMPLES = 200, 0.005, 10, 200  # of the data, and steps from sample to sample
+CELLS, DT, EVERY, SAMPLES = 200, 0.005, 10, 200  # of the data; EVERY steps between two samples
 D, Q = 1.0, 5.0
 LAWS = {
     "auto": lp.GradientLaw(gain="auto"),
     "gain 100": lp.GradientLaw(gain=100.0),
     "gain 10": lp.GradientLaw(gain=10.0),
 }
-NOISES = (0.0, 0.002, 0.01)  # of readings of size 1
+NOISES = (0.0, 0.002, 0.01)  # standard deviations, for readings of size 1
 WRONG = {"D = 2": (2.0, 1.0), "D = 1.3": (1.3, 1.0), "half of the source": (1.0, 0.5)}
 
 
 def source(x: Any, t: float) -> Any:
-    """Return f."""
+    """Return the source f."""
     first = 20 * np.sin(np.pi * x) * (1 + np.sin(2 * t))
     return first + 60 * np.cos(3 * t) * np.sin(2 * np.pi * x)
 
 
 @cache
 def data() -> list[tuple[float, Any]]:
-    """Return time and state at all 201 points of each sample."""
+    """Return the time and the state at all 201 points for each sample."""
     a = np.full(CELLS, D)
     return list(_differences(a, lambda x, t: source(x, t), Q, DT, np.zeros(CELLS + 1)))
 
@@ -50,7 +50,7 @@ def data() -> list[tuple[float, Any]]:
 def _differences(
     a: Any, f: Callable[[Any, float], Any], q: float, dt: float, u: Any
 ) -> Iterator[tuple[float, Any]]:
-    """Yield samples of u_t = (a u_x)_x - q u + f by Crank-Nicolson; a has a value for each cell."""
+    """Yield samples of u_t = (a u_x)_x - q u + f by Crank-Nicolson; a has one value per cell."""
     x, h = np.linspace(0.0, 1.0, CELLS + 1), 1.0 / CELLS
     left, right, inner = a[:-1] / h**2, a[1:] / h**2, u[1:-1].copy()
     bands = np.zeros((3, CELLS - 1))
@@ -66,7 +66,7 @@ def _differences(
 
 
 def model(diffusivity: float = D, share: float = 1.0) -> lp.Model:
-    """Return the model with some diffusivity, and a share of the source."""
+    """Return a model with a given diffusivity and a given share of the source."""
     mesh = lp.interval(0.0, 1.0, 40)
     return lp.Model(
         lp.Field(mesh, lp.linear(mesh), dirichlet={"boundary": 0.0}),
@@ -80,7 +80,7 @@ def model(diffusivity: float = D, share: float = 1.0) -> lp.Model:
 def judged(
     law: Any, noise: float, seed: int, of: lp.Model | None = None, *, part: bool = False
 ) -> Any:
-    """Return the result of a run: of all of the rod, or of its part."""
+    """Return the result of a run that observes the whole rod, or a part of it."""
     of = model() if of is None else of
     stated = noise or None
     sensors: Any = lp.Full(noise=stated)
@@ -93,7 +93,7 @@ def judged(
 
 
 class Own(lp.laws.Law):  # type: ignore[type-arg]
-    """A law of one's own that makes no tests: it keeps what it begins with."""
+    """Custom law without tests, which keeps its initial estimates."""
 
     def prepare(self, problem: Any) -> Any:
         return problem
@@ -110,7 +110,7 @@ class Own(lp.laws.Law):  # type: ignore[type-arg]
 
 
 def _field() -> bool:
-    """Return whether a field that is worse than its prior is trusted; a refusal is no trust."""
+    """Return whether a field estimate that is worse than its prior is trusted, not refused."""
     mesh, x = lp.interval(0.0, 1.0, 40), (np.arange(CELLS) + 0.5) / CELLS
     a = (
         0.06
@@ -141,7 +141,7 @@ def _field() -> bool:
 
 
 def _shown(result: Any) -> int:
-    """Return in how many places a run is not shown as "not judged"; right is none."""
+    """Count the places in which a run is not reported as "not judged"."""
     stored = result.to_xarray()
     shown = [
         result.verdict.level,
@@ -153,7 +153,7 @@ def _shown(result: Any) -> int:
 
 
 def checks() -> list[Check]:
-    """Return the checks of this part."""
+    """Return the checks of wrong models, correct models and untested runs."""
     wrong = {
         f"{name}, {law}": judged(LAWS[law], 0.01, 0, model(*of)).verdict.level
         for name, of in WRONG.items()
