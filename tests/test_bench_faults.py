@@ -1,4 +1,4 @@
-"""The benchmarks of runs for months, in small: they measure what they say, and can fail."""
+"""Small versions of the fault and soak benchmarks detect faults, and pass without them."""
 
 import shutil
 from collections import Counter
@@ -32,16 +32,16 @@ def test_broken_messages_reach_the_real_command():
 
 
 @pytest.mark.process
-def test_damaged_journals_are_told():
+def test_damaged_journals_are_reported():
     outcome = faults.faults(samples=100, flips=10, only=["journals"], seed=1)
     assert not failed(outcome)
-    ((flips, told, plain, different),) = outcome.tables[0].rows
+    ((flips, detected, plain, different),) = outcome.tables[0].rows
     assert (flips, different) == (10, 0)
-    assert 0 < told <= flips
-    assert plain == flips - told
+    assert 0 < detected <= flips
+    assert plain == flips - detected
 
 
-def test_clock_faults_that_do_harm_are_seen():
+def test_harmful_clock_faults_fail_the_checks():
     rows = rod.rod_rows(clocks.COUNT)
     fault = clocks.FAULTS["one row 10 years ahead"]
     right = clocks._right(fault, rows)
@@ -49,24 +49,24 @@ def test_clock_faults_that_do_harm_are_seen():
     doubt = {"ok": False, "ailment": "clock"}
     estimates = {60.0 * k: (2e-5, 1e-7) for k in range(clocks.COUNT)}
     seen = clocks._Seen(right, {}, doubt, well, "trusted", estimates)
-    told = clocks._Told()
-    told.add("none", seen, fault, rows)
-    assert all(check.ok for check in told.checks())
+    tally = clocks._Tally()
+    tally.add("none", seen, fault, rows)
+    assert all(check.ok for check in tally.checks())
     lost = {key: value for key, value in right.items() if key != (600.0, "left")}
     moved = {t: (2.1e-5, half) for t, (_, half) in estimates.items()}
-    told.add(
+    tally.add(
         "harm", clocks._Seen(lost | {(1e9, "T_3"): 20.0}, {}, well, doubt, "", moved), fault, rows
     )
     never = clocks.FAULTS["back by 3.5 steps every 30 rows"]
-    told.add("trusted", replace(seen, after=doubt, values=clocks._right(never, rows)), never, rows)
-    assert [check.value for check in told.checks()] == [1, 1, pytest.approx(10.0), 1, 1, 1]
+    tally.add("trusted", replace(seen, after=doubt, values=clocks._right(never, rows)), never, rows)
+    assert [check.value for check in tally.checks()] == [1, 1, pytest.approx(10.0), 1, 1, 1]
 
 
 @pytest.mark.process
-def test_hostile_cases_are_answered(monkeypatch):
+def test_hostile_cases_are_refused_with_one_sentence(monkeypatch):
     few = ("unit, powers of powers", "1e12 cells")
     monkeypatch.setattr(hostile, "HOSTILE", {name: hostile.HOSTILE[name] for name in few})
-    monkeypatch.setattr(hostile, "SOONEST", 60.0)  # no timed test
+    monkeypatch.setattr(hostile, "SOONEST", 60.0)  # the duration is not tested
     outcome = faults.faults(only=["cases"])
     assert not failed(outcome)
     assert [row[0] for row in outcome.tables[0].rows] == [*few]
@@ -102,25 +102,25 @@ def found(*records: Record, state: bytes = b"x") -> damage.Found:
         (found(record(0.0), record(1.0), state=b"y"), 0, 0, 1),
     ],
 )
-def test_damage_is_seen(other, lost, doubled, different):
-    seen = damage.Damage()
-    seen.compare(other, found(record(0.0), record(1.0)))
-    assert (seen.lost, seen.doubled, seen.different) == (lost, doubled, different)
-    assert all(check.ok for check in seen.checks("x")) == (lost + doubled + different == 0)
+def test_lost_doubled_and_different_samples_are_counted(other, lost, doubled, different):
+    counted = damage.Damage()
+    counted.compare(other, found(record(0.0), record(1.0)))
+    assert (counted.lost, counted.doubled, counted.different) == (lost, doubled, different)
+    assert all(check.ok for check in counted.checks("x")) == (lost + doubled + different == 0)
 
 
 def test_a_last_fit_that_was_skipped_is_no_damage():
-    """If both runs report the same, the last estimate counts."""
+    """The last estimates are compared unless exactly one run reports an unfinished fit."""
     other = found(record(0.0), record(1.0, 2.0))
-    seen = damage.Damage()
-    seen.compare(replace(other, events=Counter(unfinished=1)), found(record(0.0), record(1.0)))
-    assert seen.different == 0
-    seen.compare(other, found(record(0.0), record(1.0)))
-    assert seen.different == 1
+    counted = damage.Damage()
+    counted.compare(replace(other, events=Counter(unfinished=1)), found(record(0.0), record(1.0)))
+    assert counted.different == 0
+    counted.compare(other, found(record(0.0), record(1.0)))
+    assert counted.different == 1
 
 
 @pytest.mark.slow
-def test_a_row_that_is_not_counted_is_seen(tmp_path, monkeypatch):
+def test_malformed_rows_are_counted_by_reason(tmp_path, monkeypatch):
     (tmp_path / "case.toml").write_text(rod.case_text())
     monkeypatch.setattr(broken, "JSON", {"right": lambda row, write, rng: write(dict(row))})
     monkeypatch.setattr(broken, "BYTES", {})
@@ -135,24 +135,24 @@ def test_a_row_that_is_not_counted_is_seen(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_soak_in_small(monkeypatch):
-    law = partial(lp.SensitivityLaw, refit=None)  # which takes most of the time
+def test_a_short_soak_counts_its_faults_and_keeps_all_samples(monkeypatch):
+    law = partial(lp.SensitivityLaw, refit=None)  # refits take most of the time
     law.scheme = lp.SensitivityLaw.scheme
     monkeypatch.setattr(soak, "SensitivityLaw", law)
     monkeypatch.setattr(soak, "WARM", 300)
     monkeypatch.setattr(soak, "BLOCK", 100)
-    # All faults in 700 rows, each of a few rows.
+    # All faults fit into 700 rows, with a few rows each.
     few = {
         name: (60 + 40 * k, min(count, 8), change)
         for k, (name, (_, count, change)) in enumerate(soak.FAULTS.items())
     }
     monkeypatch.setattr(soak, "FAULTS", few)
     outcome = soak.soak(700)
-    told = {(kind, channel): number for kind, channel, number in outcome.tables[1].rows}
-    assert told["repeated", ""] >= 60
-    assert told["leap", ""] == 1 + 8 + 8
-    assert told["malformed", ""] == told["malformed", "a"] == 5
-    assert told["missing", "b"] == told["missing", "left"] == 8
+    counts = {(kind, channel): number for kind, channel, number in outcome.tables[1].rows}
+    assert counts["repeated", ""] >= 60
+    assert counts["leap", ""] == 1 + 8 + 8
+    assert counts["malformed", ""] == counts["malformed", "a"] == 5
+    assert counts["missing", "b"] == counts["missing", "left"] == 8
     checks = {check.name.split(":")[0]: check for check in outcome.checks}
     assert checks["memory"].ok
     assert checks["steps that failed"].ok
@@ -162,7 +162,7 @@ def test_soak_in_small(monkeypatch):
         soak.soak(100)
 
 
-def test_soak_sees_what_grows():
+def test_a_soak_whose_costs_grow_fails_its_checks():
     steps = range(soak.WARM, 3 * soak.WARM, soak.BLOCK)
     meter = soak.Meter(None, lambda: 1e-3)
     flat = soak.Reading(0, 1e-3, 1e-3, 1e8, 2e8, 5e6, 4e6)

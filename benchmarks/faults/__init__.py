@@ -1,17 +1,16 @@
-"""What a run survives: kills at any moment, brokers and sources that go away, rows that are broken.
+"""Fault injection for live runs: kills, outages, failing disks, wrong clocks, malformed input.
 
-Kills: `livepde run --resume` takes a few thousand rows from a file that grows, from standard input
-or from a broker, is killed with SIGKILL again and again, and ends as a run does that nobody
-disturbed: bit by bit. The moments are drawn at random: while it starts and resumes, while it steps,
-right when its journal grows, and while it ends.
+Kills: `livepde run --resume` reads a few thousand rows from a growing file, standard input or a
+broker. It is repeatedly killed with SIGKILL, and must end with the same bits as an undisturbed run.
+The moments are random: at start and resume, during steps, while the journal grows, and at the end.
 
-Disks that are full or fail, and work again: the same holds.
+Disks that are full or fail for a while: the result must also equal the undisturbed run.
 
-Journals that are damaged, clocks that are wrong, visitors that ask slowly, cases that ask for too
-much: each is told, and no run ends or goes silent.
+Damaged journals, wrong clocks, slow clients and excessive cases: each is reported, and no run ends
+or stops responding.
 
-Broken rows: real and generated rows, mutated in every way that we could think of, between rows that
-are right. Each is counted with a reason, and what is right arrives.
+Malformed rows: real and generated rows are mutated in many ways and sent between valid rows. Each
+is counted with a reason, and every valid row arrives.
 """
 
 from __future__ import annotations
@@ -62,20 +61,20 @@ def faults(
     workers: int = 1,
     progress: bool = False,
 ) -> Outcome:
-    """Do harm to runs, and count what was lost.
+    """Inject faults into runs, and count lost, duplicated and different samples.
 
     Parameters
     ----------
     kills, samples
-        Kills in all, spread over those parts that kill, of runs with so many samples.
+        Total number of kills, shared by the parts that kill, and samples per run.
     malformed
-        Rows and messages that are broken.
+        Number of malformed rows and messages.
     flips
-        Journals that are damaged.
+        Number of damaged journals.
     only
-        Some of `PARTS`.
+        Names in `PARTS` to run; default all.
     workers
-        Runs that are killed at a time.
+        Number of runs that are killed in parallel.
     """
     tables: list[Table] = []
     checks: list[Check] = []

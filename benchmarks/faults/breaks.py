@@ -1,4 +1,4 @@
-"""Every way to break a row that we could think of."""
+"""Mutations that turn a valid row into a malformed one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.faults.rod import Row
 
-LONG_ONES = 0.02  # share of the lines of 2 MB that are written
+LONG_ONES = 0.02  # share of the drawn lines of 2 MB that are written
 
 Break: TypeAlias = Callable[[Row, Callable[[Row], bytes], np.random.Generator], bytes]
 
@@ -22,7 +22,7 @@ def broken_line(
     write: Callable[[Row], bytes],
     rng: np.random.Generator,
 ) -> tuple[str, bytes]:
-    """Return a kind and one line of it, which is never blank; the very long are rare."""
+    """Draw a kind of mutation; return it with a mutated line, never blank and rarely very long."""
     kind = one_of([*breaks])(rng)
     if kind == "very long" and rng.random() > LONG_ONES:
         kind = "truncated"
@@ -41,12 +41,12 @@ def csv_line(row: Row) -> bytes:
 
 
 def one_of(options: Sequence[Any]) -> Callable[[np.random.Generator], Any]:
-    """Return a draw of one of `options`."""
+    """Return a function that draws one of `options`."""
     return lambda rng: options[int(rng.integers(len(options)))]
 
 
 def _value(*options: Any) -> Break:
-    """Put something else where a number should be: in one column, or in all."""
+    """Return a mutation that replaces the numbers in one column or all by one of `options`."""
     choose = one_of(options)
 
     def broken(row: Row, write: Callable[[Row], bytes], rng: np.random.Generator) -> bytes:
@@ -58,7 +58,7 @@ def _value(*options: Any) -> Break:
 
 
 def _time(*options: Any) -> Break:
-    """Put something else where the time should be."""
+    """Return a mutation that replaces the time by one of `options`."""
     choose = one_of(options)
 
     def broken(row: Row, write: Callable[[Row], bytes], rng: np.random.Generator) -> bytes:
@@ -68,7 +68,7 @@ def _time(*options: Any) -> Break:
 
 
 def _ahead(row: Row, write: Callable[[Row], bytes], rng: np.random.Generator) -> bytes:
-    """A clock that is wrong by a hundred to some thousand years."""
+    """Move the time ahead by a hundred to some thousand years."""
     name = next(iter(row))
     moment = datetime.fromisoformat(row[name])
     years = float(10.0 ** rng.uniform(2.0, 3.8))
@@ -81,7 +81,7 @@ def _truncated(row: Row, write: Callable[[Row], bytes], rng: np.random.Generator
 
 
 def _spoilt(row: Row, write: Callable[[Row], bytes], rng: np.random.Generator) -> bytes:
-    """Invalid UTF-8 somewhere."""
+    """Insert invalid UTF-8 at a random place."""
     text = write(row)
     k = int(rng.integers(0, len(text)))
     wrong: bytes = one_of((b"\xff", b"\xc3\x28", b"\xed\xa0\x80", b"\xfe"))(rng)

@@ -1,4 +1,4 @@
-"""Rows and messages that are broken, between those that are right."""
+"""Malformed rows and messages between valid ones."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from livepde.samples import Sample
 from livepde.streams.intake import Intake, IntakeOutcome, Ready
 from livepde.streams.sources import RowSource
 
-TOGETHER = 100  # messages that are sent before the first of them is acknowledged
+TOGETHER = 100  # messages sent before waiting for their acknowledgements
 
 
 def broken_rows(plan: Plan) -> Outcome:
-    """Feed broken rows to a live run, between right ones."""
+    """Feed malformed rows between valid ones to a live run, and check that each is counted."""
     rng = np.random.default_rng(plan.seed)
     tables, checks = [], []
     with TemporaryDirectory() as name:
@@ -56,18 +56,18 @@ def broken_rows(plan: Plan) -> Outcome:
         items = [*feeds.items()]
         for k in plan.watched(len(items), f"files of {each} broken rows"):
             title, (case, chosen, file) = items[k]
-            found = fed(case, chosen, folder / file, each, rng)
+            outcome = fed(case, chosen, folder / file, each, rng)
             (folder / file).unlink()
-            tables.append(found.table(title))
-            checks += found.checks(title)
-            sent += found.sent.total()
+            tables.append(outcome.table(title))
+            checks += outcome.checks(title)
+            sent += outcome.sent.total()
     return Outcome(
         tables=tables, checks=[Check("broken rows", sent, plan.malformed, ">="), *checks]
     )
 
 
 def broken_messages(plan: Plan) -> Outcome:
-    """Send broken messages to the real command, between right ones."""
+    """Send malformed messages between valid ones from a broker to `livepde run`."""
     rng = np.random.default_rng(plan.seed)
     rows, count = rod_rows(min(plan.samples, 600)), max(plan.malformed // 20, 1)
     expected, _ = undisturbed(len(rows))
@@ -76,8 +76,8 @@ def broken_messages(plan: Plan) -> Outcome:
         begun = time.monotonic()
         for k in plan.watched(len(rows), "right rows with broken messages between them"):
             topic.supply(k + 1)
-            for some in _parts(int(per_row[k]), TOGETHER):
-                lines = [broken_line(JSON | BYTES, rows[k], json_line, rng)[1] for _ in some]
+            for part in _parts(int(per_row[k]), TOGETHER):
+                lines = [broken_line(JSON | BYTES, rows[k], json_line, rng)[1] for _ in part]
                 for message in [topic.send(line) for line in lines]:
                     message.wait_for_publish(PATIENCE)
         run.end(len(rows))
@@ -96,12 +96,12 @@ def broken_messages(plan: Plan) -> Outcome:
 
 
 def _parts(count: int, most: int) -> Iterator[range]:
-    """Yield ranges of at most so many numbers."""
+    """Split range(count) into ranges of at most `most` numbers."""
     return (range(k, min(k + most, count)) for k in range(0, count, most))
 
 
 def _soil() -> tuple[Case, list[dict[str, Any]]] | None:
-    """Return the soil case and its real rows, if they are here."""
+    """Return the soil case and its measured rows, or None if they are not available."""
     try:
         path = next(path for path in find_cases() if path.stem == "soil_uniform")
         case = load(path, settings={"intake.leap": "10 d"})
@@ -113,7 +113,7 @@ def _soil() -> tuple[Case, list[dict[str, Any]]] | None:
 
 
 class _Audited(Gathered):
-    """Remembers what became of each row, by the place where its line begins."""
+    """Feed that records the remarks on each row, by the offset of its line in the file."""
 
     def __init__(self, source: RowSource, intake: Intake) -> None:
         super().__init__(source, intake)
@@ -128,7 +128,7 @@ class _Audited(Gathered):
 
 @dataclass(frozen=True)
 class Fed:
-    """What became of a file with broken rows between the right ones."""
+    """Outcome of a live run on a file with malformed rows between valid ones."""
 
     sent: Counter[str]
     reasons: Counter[str]
@@ -136,10 +136,10 @@ class Fed:
     right: int
     arrived: int
     different: int
-    rate: float  # rows a second, right and broken, with the steps
+    rate: float  # valid and malformed rows per second, including the steps
 
     def table(self, title: str) -> Table:
-        """Return what was sent and what was said of it."""
+        """Return a table of the rows sent, counted and used, by kind."""
         rows: list[tuple[str, str, float]] = []
         rows += [("sent", kind, number) for kind, number in sorted(self.sent.items())]
         rows += [("counted", kind, number) for kind, number in sorted(self.reasons.items())]
@@ -148,7 +148,7 @@ class Fed:
         return Table(f"Broken rows, {title}", ("", "kind", "number"), rows)
 
     def checks(self, title: str) -> list[Check]:
-        """Every broken row has a reason, every right one arrives, nothing else does."""
+        """Check that malformed rows have a reason, and that exactly the valid rows arrive."""
         return [
             Check(f"{title}: broken rows without a reason", self.silent, 0, "<="),
             Check(f"{title}: right rows that are missing", self.right - self.arrived, 0, "<="),
@@ -157,7 +157,7 @@ class Fed:
 
 
 def fed(case: Case, rows: Sequence[Row], path: Path, count: int, rng: np.random.Generator) -> Fed:
-    """Feed right rows with so many broken ones between them, and the right ones alone."""
+    """Run valid rows with `count` malformed rows between them, and compare with a clean run."""
     write = json_line if path.suffix == ".jsonl" else csv_line
     head = b"" if path.suffix == ".jsonl" else ",".join(rows[0]).encode() + b"\n"
     clean = path.with_stem("clean")
@@ -178,10 +178,10 @@ def fed(case: Case, rows: Sequence[Row], path: Path, count: int, rng: np.random.
     begun = time.monotonic()
     found, reasons = _taken(case, path)
     rate = (count + len(rows)) / (time.monotonic() - begun)
-    told = Counter(kind for place in broken for kind in sorted(reasons.get(place, ()))[:1])
+    counted = Counter(kind for place in broken for kind in sorted(reasons.get(place, ()))[:1])
     return Fed(
         sent,
-        told,
+        counted,
         sum(not reasons.get(place) for place in broken),
         len(expected),
         len(found),
@@ -191,7 +191,7 @@ def fed(case: Case, rows: Sequence[Row], path: Path, count: int, rng: np.random.
 
 
 def _taken(case: Case, path: Path) -> tuple[list[Record], dict[int, set[str]]]:
-    """Return what a live run of a file finds, and what it said of each line."""
+    """Run a file as a live run; return its records, and its remarks by offset of the line."""
     spec = case.spec.data
     intake = Intake(case.columns, case.clock, policy_of(case), missing=spec.missing)
     feed = _Audited(source_of(case, str(path), ""), intake)

@@ -1,7 +1,7 @@
-"""Clocks that leap or go back, and rows that come again, in live runs over every transport.
+"""Clocks that jump ahead or back, and repeated rows, in live runs over every transport.
 
-The real command runs the rod. Its rows come from a file, standard input, a broker and an OPC UA
-server. After the first wrong rows the plant waits for `/health`, and again at the end.
+`livepde run` runs the rod with rows from a file, standard input, a broker and an OPC UA server. The
+plant waits for `/health` after the first wrong rows, and again at the end.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from livepde.records import interval_95
 from livepde.runs import JOURNAL, Check, Journal, Outcome, Table
 from livepde.runs import open as open_run
 
-COUNT, AT = 500, 200  # rows, and the one with which most faults begin
-AFTER = 50  # right samples after a fault, after which the estimates are compared
-NEAR = 1.2  # half-widths of their 95 % interval by which they may differ
-SOON = 20.0  # seconds for health to change
+COUNT, AT = 500, 200  # number of rows, and the row at which most faults begin
+AFTER = 50  # correct samples between the end of a fault and the comparison of estimates
+NEAR = 1.2  # largest difference of estimates, in half-widths of the 95 % interval
+SOON = 20.0  # time limit for `/health` to change, in seconds
 DAY, HOUR = timedelta(days=1), timedelta(hours=1)
 CHANNELS = ("left", "T_3", "T_6")
 
@@ -52,20 +52,20 @@ Values: TypeAlias = Mapping[tuple[float, str], float]  # (time, channel) -> valu
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of clocks.
+    """A clock fault.
 
     Attributes
     ----------
     change
-        Turns the right rows into the rows that come.
+        Function that turns the correct rows into the rows that arrive.
     look
         Number of rows after which `/health` must be false; None if no row waits or is late.
     end
-        Row from which on all rows are right; None if the fault does not end.
+        First row from which all rows are correct; None if the fault does not end.
     moved
-        Whether rows have other times, instead of wrong rows between them.
+        If True, times of rows are changed; otherwise wrong rows are inserted.
     doubted
-        Whether the run has to end with "do not trust".
+        If True, the run must end with "do not trust".
     """
 
     change: Change
@@ -80,10 +80,10 @@ def _moved(rows: Sequence[Row], by: timedelta) -> list[Row]:
 
 
 def _inserted(by: timedelta, count: int = 1, names: Sequence[str] = CHANNELS) -> Change:
-    """Return a change that inserts rows with values of earlier ones, at times ahead."""
+    """Return a change that inserts rows with values of earlier rows at later times."""
 
     def change(rows: Sequence[Row]) -> list[Row]:
-        # A server does not send a value that stays the same, so these are not those of row AT.
+        # An OPC UA server does not send an unchanged value, so these are not values of row AT.
         wrong = _moved(rows[AT - count - 1 : AT - 1], by)
         few = [{name: row[name] for name in ("time", *names)} for row in wrong]
         return [*rows[:AT], *few, *rows[AT:]]
@@ -92,7 +92,7 @@ def _inserted(by: timedelta, count: int = 1, names: Sequence[str] = CHANNELS) ->
 
 
 def _set(by: timedelta, stop: int | None = None) -> Change:
-    """Return a change that moves all rows from AT on, up to another one."""
+    """Return a change that shifts the times of rows AT to `stop`."""
     return lambda rows: [
         *rows[:AT], *_moved(rows[AT:stop], by), *(rows[stop:] if stop is not None else ()),
     ]  # fmt: skip
@@ -101,7 +101,7 @@ def _set(by: timedelta, stop: int | None = None) -> Change:
 def _every_25th(rows: Sequence[Row]) -> list[Row]:
     wrong = [_moved(rows[k - 2 : k - 1], HOUR) if k % 25 == 24 else [] for k in range(450)]
     pairs = zip_longest(wrong, rows, fillvalue=())
-    return [one for ahead, row in pairs for one in (*ahead, row)]
+    return [item for ahead, row in pairs for item in (*ahead, row)]
 
 
 def _back_again(rows: Sequence[Row]) -> list[Row]:
@@ -111,7 +111,7 @@ def _back_again(rows: Sequence[Row]) -> list[Row]:
 
 FAULTS: Mapping[str, Fault] = {
     "none": Fault(list),
-    # There is no sample yet, so that the run waits.
+    # The run waits, because there is no sample yet.
     "the first row 10 years ahead": Fault(lambda rows: [*_moved(rows[2:3], 3650 * DAY), *rows]),
     "one row 29 days ahead": Fault(_inserted(29 * DAY), AT + 1),
     "one row 10 years ahead": Fault(_inserted(3650 * DAY), AT + 1),
@@ -119,7 +119,7 @@ FAULTS: Mapping[str, Fault] = {
     "two rows 10 years ahead": Fault(_inserted(3650 * DAY, 2), AT + 2),
     "eight rows 3 hours ahead": Fault(_inserted(3 * HOUR, 8), AT + 8),
     "every 25th row an hour ahead": Fault(_every_25th, 25, 450),
-    # Rows of the past that are counted, and change nothing.
+    # Rows of the past, which are counted and change nothing.
     "one row of 1970": Fault(_inserted(-20454 * DAY)),
     "100 rows again": Fault(lambda rows: [*rows[: AT + 100], *rows[AT:]], None, AT + 100),
     "set back by an hour": Fault(_set(-HOUR), AT + 5, AT + 60, True),
@@ -132,38 +132,38 @@ FAULTS: Mapping[str, Fault] = {
 
 
 def _seconds(rows: Sequence[Row]) -> list[float]:
-    """Return the times of rows since that of the first."""
+    """Return the times of rows in seconds after the first row."""
     times = [datetime.fromisoformat(row["time"]) for row in rows]
-    return [(one - times[0]).total_seconds() for one in times]
+    return [(time - times[0]).total_seconds() for time in times]
 
 
 def _right(fault: Fault, rows: Sequence[Row]) -> Values:
-    """Return the values of those rows that are later than all before them."""
-    came = fault.change(rows) if fault.moved else rows
-    found: dict[tuple[float, str], float] = {}
+    """Return the values that a run must use: of rows that are later than all rows before."""
+    arriving = fault.change(rows) if fault.moved else rows
+    values: dict[tuple[float, str], float] = {}
     newest = -1.0
-    for t, row in zip(_seconds(came), came, strict=True):
+    for t, row in zip(_seconds(arriving), arriving, strict=True):
         if t > newest:
-            found |= {(t, name): float(row[name]) for name in CHANNELS}
+            values |= {(t, name): float(row[name]) for name in CHANNELS}
             newest = t
-    return found
+    return values
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """What became of a run: its values, health while the fault lasts and after it, estimates."""
+    """Outcome of a run: used values, health during and after the fault, verdict, estimates."""
 
     values: Values
     counts: Mapping[str, int]
     during: Mapping[str, Any]
     after: Mapping[str, Any]
     verdict: str
-    estimates: Mapping[float, tuple[float, float]]  # time -> alpha, and half of its interval
+    estimates: Mapping[float, tuple[float, float]]  # time -> alpha, half-width of its interval
 
     def moved_from(self, other: _Seen, fault: Fault, rows: Sequence[Row]) -> tuple[float, float]:
-        """Compare alpha with that of a run without the fault.
+        """Compare alpha with a run without the fault, `AFTER` samples after the fault.
 
-        Return the difference in half-widths of its interval, and how much wider that is.
+        Return the difference in half-widths of the interval, and the ratio of the half-widths.
         """
         if fault.end is None:
             return np.nan, np.nan
@@ -175,12 +175,12 @@ class _Seen:
 
 
 def _health(run: Run) -> Mapping[str, Any]:
-    """Return the content of `/health`, empty before the run has a server."""
-    found = re.search(r"health and metrics at (\S+)", (run.folder / "log.txt").read_text())
-    if found is None:
+    """Return the content of `/health`; empty before the server of the run has started."""
+    server = re.search(r"health and metrics at (\S+)", (run.folder / "log.txt").read_text())
+    if server is None:
         return {}
     try:
-        with urllib.request.urlopen(f"{found[1]}/health", timeout=SOON) as answer:
+        with urllib.request.urlopen(f"{server[1]}/health", timeout=SOON) as answer:
             content = answer.read()
     except urllib.error.HTTPError as error:
         content = error.read()
@@ -189,11 +189,11 @@ def _health(run: Run) -> Mapping[str, Any]:
 
 
 def _awaited(run: Run, ok: bool) -> Mapping[str, Any]:
-    """Wait until the health is so, and return what it is in the end."""
+    """Wait up to `SOON` until `/health` has the given state, and return its last content."""
     until = time.monotonic() + SOON
-    while (found := _health(run))["ok"] != ok and time.monotonic() < until:
+    while (health := _health(run))["ok"] != ok and time.monotonic() < until:
         time.sleep(0.05)
-    return found
+    return health
 
 
 def _seen(folder: Path, plant: Plant, fault: Fault, rows: Sequence[Row]) -> _Seen:
@@ -201,7 +201,7 @@ def _seen(folder: Path, plant: Plant, fault: Fault, rows: Sequence[Row]) -> _See
     options = ["--listen", "0"]
     with closing(Run(folder, plant.source, plant.launch, options=options)) as run:
         text = case_text(plant.source, silence=600.0, leap="30 d")
-        if isinstance(plant, Nodes):  # the values of a row come one by one, in any order
+        if isinstance(plant, Nodes):  # the values of a row arrive one by one, in any order
             text = text.replace('"degC" }', '"degC", wait = "20 min" }')
         (folder / "case.toml").write_text(text)
         (folder / "log.txt").touch()
@@ -226,9 +226,9 @@ def _seen(folder: Path, plant: Plant, fault: Fault, rows: Sequence[Row]) -> _See
     pairs = zip(data["alpha"].values.tolist(), (0.5 * (high - low)).tolist(), strict=True)
     with Journal.open(run.out / JOURNAL) as journal:
         values = {
-            (one.t, name): value
-            for one in journal.taken()
-            for name, value in one.values.items()
+            (sample.t, name): value
+            for sample in journal.taken()
+            for name, value in sample.values.items()
             if not np.isnan(value)
         }
         counts: dict[str, int] = {}
@@ -243,7 +243,7 @@ TRANSPORTS = ("file", "standard input", "MQTT", "OPC UA")
 
 @contextmanager
 def _plants(name: str, folder: Path) -> Iterator[Callable[[Path, Sequence[Row]], Plant]]:
-    """Yield what makes a plant of a transport for a run in a folder."""
+    """Yield a function that creates a plant of the named transport for a run in a folder."""
     with ExitStack() as stack:
         if name == "MQTT":
             broker = stack.enter_context(closing(Mosquitto(folder)))
@@ -261,8 +261,8 @@ def _plants(name: str, folder: Path) -> Iterator[Callable[[Path, Sequence[Row]],
 
 
 def clock_faults(plan: Plan) -> Outcome:
-    """Let the clocks of the rod go wrong, and compare the samples with those that are right."""
-    rows, found, told = rod_rows(COUNT), [], _Told()
+    """Inject clock faults into runs of the rod, and compare their samples with the correct ones."""
+    rows, table, tally = rod_rows(COUNT), [], _Tally()
     cases = [(name, fault) for name in TRANSPORTS for fault in FAULTS]
     numbers = iter(plan.watched(len(cases), "clocks"))
     for name in TRANSPORTS:
@@ -272,16 +272,16 @@ def clock_faults(plan: Plan) -> Outcome:
                 here = Path(folder) / f"run-{k}"
                 here.mkdir()
                 seen = _seen(here, plants(here, fault.change(rows)), fault, rows)
-                found.append((name, about, *told.add(f"{about}, {name}", seen, fault, rows)))
+                table.append((name, about, *tally.add(f"{about}, {name}", seen, fault, rows)))
     head = (
         *("transport", "fault", "lost", "wrong", "half-widths", "wider by"),
         *("health during", "after", "verdict", "told"),
     )
-    return Outcome(tables=[Table(f"Clocks of {len(rows)} rows", head, found)], checks=told.checks())
+    return Outcome(tables=[Table(f"Clocks of {COUNT} rows", head, table)], checks=tally.checks())
 
 
-class _Told:
-    """What all runs lost, and where health was wrong."""
+class _Tally:
+    """Totals over all runs: lost and wrong values, and names of runs with wrong health."""
 
     def __init__(self) -> None:
         self.lost = self.wrong = 0
@@ -292,7 +292,7 @@ class _Told:
         self._plain: _Seen | None = None
 
     def add(self, about: str, seen: _Seen, fault: Fault, rows: Sequence[Row]) -> tuple[Any, ...]:
-        """Add a run, and return its row of the table."""
+        """Add a run, and return its table row."""
         right = _right(fault, rows)
         lost = len(right.keys() - seen.values.keys())
         wrong = sum(right.get(key) != value for key, value in seen.values.items())
@@ -312,7 +312,7 @@ class _Told:
         return lost, wrong, moved, wider, during, after, seen.verdict, counts or "–"
 
     def checks(self) -> list[Check]:
-        """Return the checks of all runs."""
+        """Return the checks of the totals."""
         return [
             Check("clock faults: right values lost", self.lost, 0, "<="),
             Check("clock faults: values at times that were never measured", self.wrong, 0, "<="),

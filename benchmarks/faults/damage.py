@@ -1,4 +1,4 @@
-"""What a run leaves behind, held against what one leaves that nobody disturbs."""
+"""Comparison of the results of disturbed runs with an undisturbed run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from livepde.runs import JOURNAL, Check, Journal
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What a run leaves behind."""
+    """Results of a run: records, number of accepted samples, checkpoint, events and counts."""
 
     records: Sequence[Record]
     samples: int
@@ -36,7 +36,7 @@ class Found:
 
 @dataclass
 class Damage:
-    """What has become of runs that were disturbed."""
+    """Counts of lost, duplicated and different samples over disturbed runs."""
 
     runs: int = 0
     lost: int = 0
@@ -44,21 +44,21 @@ class Damage:
     different: int = 0
 
     def compare(self, found: Found, expected: Found) -> None:
-        """Hold a run against the one that nobody disturbed."""
+        """Add the differences between a disturbed and an undisturbed run."""
         times = Counter(record.t for record in found.records)
         wanted = {record.t for record in expected.records}
         self.runs += 1
         self.lost += len(wanted - set(times)) + max(len(wanted) - found.samples, 0)
         self.doubled += sum(times.values()) - len(times) + max(found.samples - len(wanted), 0)
         pairs = [*zip(found.records, expected.records, strict=False)]
-        # The last estimate is another one if one of the runs reports that it had no time to fit it.
+        # The last estimates differ if only one of the runs had time for the final fit.
         if found.events["unfinished"] != expected.events["unfinished"]:
             pairs.pop()
-        self.different += sum(not same(mine, yours) for mine, yours in pairs)
+        self.different += sum(not same(record, other) for record, other in pairs)
         self.different += found.state != expected.state
 
     def checks(self, name: str) -> list[Check]:
-        """Nothing may be lost, doubled or different."""
+        """Check that nothing is lost, duplicated or different."""
         return [
             Check(f"{name}: samples lost", self.lost, 0, "<="),
             Check(f"{name}: samples doubled", self.doubled, 0, "<="),
@@ -73,11 +73,11 @@ def same(one: Record, other: Record) -> bool:
         return False
     if (one.t, one.status, one.steps) != (other.t, other.status, other.steps):
         return False
-    if json.dumps(dict(one.notes)) != json.dumps(dict(other.notes)):  # NaN is NaN here
+    if json.dumps(dict(one.notes)) != json.dumps(dict(other.notes)):  # as text, NaN equals NaN
         return False
-    mine, yours = one.snapshot, other.snapshot
-    if mine is None or yours is None:
-        return mine is yours
-    return mine.determined == yours.determined and all(
-        values.tobytes() == yours.profiles[name].tobytes() for name, values in mine.profiles.items()
+    left, right = one.snapshot, other.snapshot
+    if left is None or right is None:
+        return left is right
+    return left.determined == right.determined and all(
+        values.tobytes() == right.profiles[name].tobytes() for name, values in left.profiles.items()
     )

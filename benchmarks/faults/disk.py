@@ -1,4 +1,4 @@
-"""Disks that are full or fail while a run writes, and work again."""
+"""Disks that are full or fail for a while during a run."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from benchmarks.faults.run import Run, undisturbed
 from livepde.runs import JOURNAL, Check, Outcome, Table
 from livepde.runs.database import log_of
 
-FILLED = 4  # times that the disk is full
-SAID = "cannot be written"  # by /health
+FILLED = 4  # how often the disk is full
+SAID = "cannot be written"  # text that /health then contains
 BAD_INPUT = 2  # exit code
-SIZES = [2**k for k in (14, 16, 18)]  # bytes that a file may have at the end of a run
-LIMIT = 10  # processes that may end with an error in one trial
-CALLS = {  # what fails -> name of the failure point, error number, chance of each call
+SIZES = [2**k for k in (14, 16, 18)]  # limits of the file size while a run ends, in bytes
+LIMIT = 10  # largest number of processes in one trial
+CALLS = {  # failure -> name of the failure point, error number, probability per call
     "writes of the journal, disk full": ("posix/io/rw/pwrite", 28, 0.005),
     "writes of the journal, input/output error": ("posix/io/rw/pwrite", 5, 0.005),
 }
 
 
 def failing_disks(plan: Plan) -> Outcome:
-    """Fill the disk of a run and make room again; let its calls to the system fail at random."""
+    """Run with disks that are full for a while, and with system calls that fail at random."""
     rows = rod_rows(min(plan.samples, 300))
     trials: dict[str, Callable[[Path], tuple[int, int, int]]] = {}
     notes = []
@@ -60,27 +60,27 @@ def _tried(
     trials: dict[str, Callable[[Path], tuple[int, int, int]]], count: int, notes: list[str]
 ) -> Outcome:
     expected, _ = undisturbed(count)
-    found, whole, unclear = [], Damage(), 0
+    rows, total, unclear = [], Damage(), 0
     for what, trial in trials.items():
         damage = Damage()
         with TemporaryDirectory() as name:
-            waited, ended, riddles = trial(Path(name))
-            left = Found.of(Path(name) / "run")
-        for one in (damage, whole):
-            one.compare(left, expected)
-        unclear += riddles
-        found.append((what, waited, ended, damage.lost, damage.doubled, damage.different))
+            waited, ended, unexplained = trial(Path(name))
+            found = Found.of(Path(name) / "run")
+        damage.compare(found, expected)
+        total.compare(found, expected)
+        unclear += unexplained
+        rows.append((what, waited, ended, damage.lost, damage.doubled, damage.different))
     columns = ("what failed", "waited", "ended, and gone on", "lost", "doubled", "different")
     check = Check("disk: ends without one sentence, waits without a word", unclear, 0, "<=")
     return Outcome(
-        tables=[Table(f"Disks that fail: {count} samples", columns, found)],
-        checks=[check, *whole.checks("disk")],
+        tables=[Table(f"Disks that fail: {count} samples", columns, rows)],
+        checks=[check, *total.checks("disk")],
         notes=notes,
     )
 
 
 def _filled(folder: Path, rows: Sequence[Row], seed: int) -> tuple[int, int, int]:
-    """Let no file of a run grow for a while, again and again."""
+    """Repeatedly stop the files of a run from growing; return waits, failed ends, silent waits."""
     import resource
 
     plant, port, silent = GrowingFile(folder, rows, seed), _free_port(), 0
@@ -89,7 +89,7 @@ def _filled(folder: Path, rows: Sequence[Row], seed: int) -> tuple[int, int, int
         plant.supply(len(rows) // (FILLED + 2))
         run.start()
         for k in range(1, FILLED + 1):
-            run.wait_for(k * len(rows) // (FILLED + 2) - 1)  # of a line the end may be missing
+            run.wait_for(k * len(rows) // (FILLED + 2) - 1)  # the last line may be incomplete
             journal = run.out / JOURNAL
             size = max(file.stat().st_size for file in (journal, log_of(journal)))
             resource.prlimit(run.process.pid, resource.RLIMIT_FSIZE, (size, none))
@@ -104,10 +104,10 @@ def _filled(folder: Path, rows: Sequence[Row], seed: int) -> tuple[int, int, int
 
 
 def _full_at_the_end(folder: Path, rows: Sequence[Row], seed: int) -> tuple[int, int, int]:
-    """Let no file grow beyond a size while a run ends; then let it end."""
+    """Limit the file size while a run ends, for several sizes; then let the run end."""
     import resource
 
-    plant, ended, riddles = GrowingFile(folder, rows, seed), 0, 0
+    plant, ended, unexplained = GrowingFile(folder, rows, seed), 0, 0
     plant.supply(len(rows))
     with closing(Run(folder, plant.source, codes=(0, BAD_INPUT))) as run:
         for size in SIZES:
@@ -117,34 +117,34 @@ def _full_at_the_end(folder: Path, rows: Sequence[Row], seed: int) -> tuple[int,
             resource.prlimit(run.process.pid, resource.RLIMIT_FSIZE, limits)
             bad = _ended(run)
             ended += bad
-            riddles += bad and not _told(folder)
+            unexplained += bad and not _explained(folder)
         _start(run)
         run.end(len(rows))
-        return Found.of(run.out).events["disk"], ended, riddles
+        return Found.of(run.out).events["disk"], ended, unexplained
 
 
 def _failing(
     folder: Path, rows: Sequence[Row], seed: int, wrapper: Sequence[str]
 ) -> tuple[int, int, int]:
-    """Let calls of a run fail at random, as often as it is started; then end it undisturbed."""
-    plant, ended, riddles = GrowingFile(folder, rows, seed), 0, 0
+    """Start runs whose system calls fail at random until one survives; then end undisturbed."""
+    plant, ended, unexplained = GrowingFile(folder, rows, seed), 0, 0
     plant.supply(len(rows))
     with closing(Run(folder, plant.source, wrapper=wrapper, codes=(0, BAD_INPUT))) as run:
         for _ in range(LIMIT):
             _start(run)
             wait(lambda: not run.alive() or run.look() == len(rows), "a run does not go on")
-            if run.kill():  # before it draws: under fiu-run the import of Pillow aborts or hangs
+            if run.kill():  # before figures: under fiu-run the import of Pillow aborts or hangs
                 break
             ended += 1
-            riddles += not _told(folder)
+            unexplained += not _explained(folder)
     with closing(Run(folder, plant.source)) as run:
         _start(run)
         run.end(len(rows))
-        return Found.of(run.out).events["disk"], ended, riddles
+        return Found.of(run.out).events["disk"], ended, unexplained
 
 
 def _start(run: Run) -> None:
-    """Start a run, and wait until it hears signals or has ended."""
+    """Start a run, and wait until it handles signals or has ended."""
     log = run.folder / "log.txt"
     before = log.stat().st_size if log.exists() else 0
     run.start()
@@ -152,21 +152,21 @@ def _start(run: Run) -> None:
 
 
 def _ended(run: Run) -> bool:
-    """End a run, if it has not ended by itself; return whether with an error."""
+    """Stop a run that has not ended by itself; return whether it ended with an error."""
     run.signal(signal.SIGTERM)
     code = run.process.wait(PATIENCE)
-    run.alive()  # refuses other codes
+    run.alive()  # raises for other exit codes
     return code == BAD_INPUT
 
 
-def _told(folder: Path) -> bool:
-    """Return whether the log of a run ends with one sentence, and none of Python's own."""
+def _explained(folder: Path) -> bool:
+    """Return whether the log of a run ends with an error message and has no traceback."""
     log = (folder / "log.txt").read_text().splitlines()
     return log[-1].startswith("Error: ") and "Traceback" not in "".join(log)
 
 
 def _health(port: int) -> dict[str, Any]:
-    """Return what /health says, be it ok or not."""
+    """Return the content of /health, whether ok or not."""
     try:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=60.0) as answer:
             return dict(json.load(answer))

@@ -1,4 +1,4 @@
-"""Followed files that are rotated, copied, cut, written again, or end in NUL bytes."""
+"""Followed files that are rotated, copied, truncated, rewritten, or end in NUL bytes."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from livepde.cases.live_case import LiveCase
 from livepde.runs import Check, Outcome, Table
 from livepde.streams.sources import Follow
 
-COUNT, PART, WINDOW = 300, 60, 100  # rows of a file, rows written at a time, rows of a window
-PATIENCE = 60.0  # seconds after which a run that does not look at its file is given up
+COUNT, PART, WINDOW = 300, 60, 100  # rows of a file, of one write, and of a window
+PATIENCE = 60.0  # time limit for a run to read its file, in seconds
 
 Change: TypeAlias = Callable[[Path, str, Sequence[str]], Iterator[None]]
-"""(file, header, rows) -> writes all rows in several parts; yields after each."""
+"""Writes header and rows to a file in several parts, and yields after each part."""
 
 
 def _grows(path: Path, header: str, rows: Sequence[str]) -> Iterator[None]:
@@ -37,21 +37,21 @@ def _parts(rows: Sequence[str]) -> Iterator[str]:
 
 
 def _kept_back(path: Path, move: Callable[[Path, Path], object]) -> None:
-    """Rotate a file: rows.csv.1 becomes rows.csv.2, and the file rows.csv.1."""
+    """Rotate a file: rows.csv.1 becomes rows.csv.2, and rows.csv becomes rows.csv.1."""
     older = sorted(path.parent.glob(f"{path.name}.*"), reverse=True)
-    for one in older:
-        number = int(one.suffix[1:]) + 1
-        one.rename(path.with_name(f"{path.name}.{number}"))
+    for backup in older:
+        number = int(backup.suffix[1:]) + 1
+        backup.rename(path.with_name(f"{path.name}.{number}"))
     move(path, path.with_name(f"{path.name}.1"))
 
 
 def _rotated(times: int, move: Callable[[Path, Path], object]) -> Change:
-    """Return a change that rotates the file several times between two looks."""
+    """Return a change that rotates the file several times between two polls."""
 
     def change(path: Path, header: str, rows: Sequence[str]) -> Iterator[None]:
         first, *parts = _parts(rows)
         path.write_text(header + first)
-        yield  # the file that is there when a run begins is its first one
+        yield  # a run starts with the file that exists at its start
         for part in parts:
             lines = part.splitlines(keepends=True)
             size = -(-len(lines) // (times + 1))
@@ -67,7 +67,7 @@ def _rotated(times: int, move: Callable[[Path, Path], object]) -> Change:
 
 
 def _emptied(path: Path, header: str, rows: Sequence[str]) -> Iterator[None]:
-    """Each part is longer than what was read before."""
+    """Overwrite the file with parts that are each longer than the part before."""
     at, size = 0, PART // 2
     while at < len(rows):
         path.write_text(header + "".join(rows[at : at + size]))
@@ -76,7 +76,7 @@ def _emptied(path: Path, header: str, rows: Sequence[str]) -> Iterator[None]:
 
 
 def _window(path: Path, header: str, rows: Sequence[str]) -> Iterator[None]:
-    """A window of rows is written again in place, by halves."""
+    """Rewrite a moving window of rows in place, in two halves."""
     for stop in range(WINDOW, len(rows) + 1, 20):
         part = rows[stop - WINDOW : stop]
         with path.open("r+" if path.exists() else "w") as file:
@@ -88,7 +88,7 @@ def _window(path: Path, header: str, rows: Sequence[str]) -> Iterator[None]:
 
 
 def _nulls(path: Path, header: str, rows: Sequence[str]) -> Iterator[None]:
-    """The space of each part is there, as NUL bytes, before its rows."""
+    """Reserve the space of each part with NUL bytes before writing its rows."""
     written = header.encode()
     path.write_bytes(written)
     for part in _parts(rows):
@@ -103,7 +103,7 @@ def _nulls(path: Path, header: str, rows: Sequence[str]) -> Iterator[None]:
 
 
 def _exchanged(path: Path, header: str, rows: Sequence[str]) -> Iterator[None]:
-    """The header appears again with two columns exchanged, as do their values."""
+    """Repeat the header before each part; every second time, swap two columns and their values."""
     path.write_text(header)
     for number, part in enumerate(_parts(rows)):
         lines = [header, *part.splitlines(keepends=True)]
@@ -127,23 +127,23 @@ CHANGES: Mapping[str, Change] = {
     "the header again, two columns exchanged": _exchanged,
 }
 CHANNELS = ("left", "T_3", "T_6")
-KNOWN_LOSS = {"emptied and refilled beyond its length": "rewritten"}  # no row, but it is counted
+KNOWN_LOSS = {"emptied and refilled beyond its length": "rewritten"}  # lost rows, but counted
 
 
 def file_faults(plan: Plan) -> Outcome:
-    """Change files while runs follow them, and compare samples and values with those written."""
-    rows, found, lost, wrong, silent = rod_rows(COUNT), [], 0, 0, 0
+    """Change files while runs follow them, and compare samples and values with the written rows."""
+    rows, table, lost, wrong, silent = rod_rows(COUNT), [], 0, 0, 0
     faults = [*CHANGES.items()]
     for number in plan.watched(len(faults), "files"):
         fault, change = faults[number]
         missing, other, counts = _followed(change, rows)
         lost, wrong = lost + missing, wrong + other
         silent += fault in KNOWN_LOSS and KNOWN_LOSS[fault] not in counts
-        told = ", ".join(f"{kind} {number}" for kind, number in sorted(counts.items()))
-        found.append((fault, missing, other, told or "–"))
+        counted = ", ".join(f"{kind} {number}" for kind, number in sorted(counts.items()))
+        table.append((fault, missing, other, counted or "–"))
     head = ("fault", "right rows lost", "wrong values", "told")
     return Outcome(
-        tables=[Table(f"Followed files of {COUNT} rows", head, found)],
+        tables=[Table(f"Followed files of {COUNT} rows", head, table)],
         checks=[
             Check("files: right rows lost", lost, 0, "<="),
             Check("files: wrong values or times", wrong, 0, "<="),
@@ -153,23 +153,23 @@ def file_faults(plan: Plan) -> Outcome:
 
 
 class _Watched(Follow):
-    """A followed file that reports when a run waits for it."""
+    """Followed file that sets `idle` when a run waits for new rows."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, follow=True)
         self.idle = threading.Event()
 
     def poll(self, wait: float) -> Sequence[Any]:
-        """Return the rows that are there."""
+        """Return the available rows."""
         rows = super().poll(wait)
-        # A run waits once it has taken all that has come.
+        # A run waits once it has processed all rows.
         if not rows and wait > 0.0:
             self.idle.set()
         return rows
 
 
 def _followed(change: Change, rows: Sequence[Row]) -> tuple[int, int, Mapping[str, int]]:
-    """Return rows that are missing in a run, its values that were never written, and its counts."""
+    """Return the number of missing rows, the number of wrong samples, and the counts of a run."""
     header = ",".join(rows[0]) + "\n"
     lines = [",".join(map(str, row.values())) + "\n" for row in rows]
     with TemporaryDirectory() as name:
@@ -191,7 +191,7 @@ def _followed(change: Change, rows: Sequence[Row]) -> tuple[int, int, Mapping[st
             if live is None:
                 raise RuntimeError("the run did not begin")
             live.run()
-            taken = {round(one.t / STEP): dict(one.values) for one in live.journal.taken()}
+            taken = {round(each.t / STEP): dict(each.values) for each in live.journal.taken()}
             counts = {kind: number for (kind, _), number in live.journal.counts.items()}
         writer.join()
     right = {k: {name: row[name] for name in CHANNELS} for k, row in enumerate(rows)}

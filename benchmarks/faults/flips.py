@@ -1,4 +1,4 @@
-"""Journals that are damaged by a bit or cut off: an error, never other numbers."""
+"""Journals with a flipped bit or a missing end give an error, never different numbers."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from livepde.errors import RunError
 from livepde.records import Record
 from livepde.runs import Check, Journal, Outcome, Table
 
-CUT = 0.25  # share of the journals that are cut off; in the others one bit is changed
+CUT = 0.25  # share of truncated journals; one bit is flipped in the others
 
 
 def damaged_journals(plan: Plan) -> Outcome:
-    """Damage copies of a journal, and read them."""
+    """Read damaged copies of a journal, and count detected and silent damage."""
     rng = np.random.default_rng(plan.seed)
-    told = silent = 0
+    detected = silent = 0
     with TemporaryDirectory() as name:
         folder = Path(name)
         path = undisturbed_journal(folder, min(plan.samples, 1000))
@@ -34,13 +34,13 @@ def damaged_journals(plan: Plan) -> Outcome:
             shutil.rmtree(copy.parent, ignore_errors=True)
             copy.parent.mkdir()
             copy.write_bytes(_damaged(content, rng))
-            found = _read(copy, expected)
-            told += found is None
-            silent += found is False
+            intact = _read(copy, expected)
+            detected += intact is None
+            silent += intact is False
     table = Table(
         f"Damaged journals of {records.sizes['time']} estimates",
         ("damaged", "told", "read, nothing different", "different"),
-        [(plan.flips, told, plan.flips - told - silent, silent)],
+        [(plan.flips, detected, plan.flips - detected - silent, silent)],
     )
     return Outcome(
         tables=[table],
@@ -49,7 +49,7 @@ def damaged_journals(plan: Plan) -> Outcome:
 
 
 def _damaged(content: bytes, rng: np.random.Generator) -> bytes:
-    """Return a journal that is cut off, or one bit of which is another."""
+    """Truncate the content of a journal, or flip one of its bits."""
     place = int(rng.integers(len(content)))
     if rng.random() < CUT:
         return content[:place]
@@ -59,7 +59,7 @@ def _damaged(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _read(path: Path, expected: dict[int, Record]) -> bool | None:
-    """Return whether a journal is read as it was; None if it says that it is damaged."""
+    """Return whether a journal has the expected records; None if reading reports damage."""
     try:
         with Journal.open(path) as kept:
             found = dict(kept.after(0))

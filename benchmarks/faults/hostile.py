@@ -1,4 +1,4 @@
-"""Cases that ask for too much: each is answered by one sentence, soon and with little memory."""
+"""Excessive cases: each is refused with one sentence, in short time and with little memory."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from benchmarks.faults.plan import Plan
 from benchmarks.faults.rod import case_text
 from livepde.runs import Check, Outcome, Table
 
-SOONEST = 2.0  # seconds of the processor: other programs do not count
-MEMORY = 500e6  # bytes
-PATIENCE = 60.0  # seconds after which a command is ended
+SOONEST = 2.0  # limit of processor seconds, which exclude other programs
+MEMORY = 500e6  # limit in bytes
+PATIENCE = 60.0  # seconds after which a command is killed
 
 _DATA = 'file = "rows.csv"'
 _PRIOR = 'prior = "3e-5 m^2/s"'
@@ -27,7 +27,7 @@ def _nested(count: int) -> tuple[str, str]:
     return "[output]", "a" + ".a" * count + " = 1\n[output]"
 
 
-# Name -> what stands in the case of the rod, and what stands there instead.
+# Name -> text in the case of the rod, and its replacement.
 HOSTILE: Mapping[str, tuple[str, str]] = {
     "unit, powers of powers": (_PRIOR, 'prior = "3e-5 m^9^9^9^9"'),
     "unit, number of powers": (_PRIOR, 'prior = "9**9**9**9 m^2/s"'),
@@ -87,14 +87,14 @@ HOSTILE: Mapping[str, tuple[str, str]] = {
 
 
 def hostile_case(folder: Path, name: str) -> Path:
-    """Write the case of the rod with something hostile in it; '' for the right one."""
+    """Write the case of the rod with a hostile replacement; '' writes the valid case."""
     text = case_text(_DATA)
     if name:
         old, new = HOSTILE[name]
         if old not in text:
             raise LookupError(f"{name}: the case has no {old!r}")
         if new.endswith("[output]") and "." not in old:
-            # What stands before a table belongs to the one above: at the top of the file.
+            # Keys before `[output]` would be part of the table above, so they go to the top.
             text = new.removesuffix("[output]") + text
         else:
             text = text.replace(old, new, 1)
@@ -104,7 +104,7 @@ def hostile_case(folder: Path, name: str) -> Path:
 
 
 def hostile_cases(plan: Plan) -> Outcome:
-    """Check hostile cases by the real command, one process for each."""
+    """Run `livepde check` on each hostile case, one process per case."""
     rows, worst = [], {"time": 0.0, "memory": 0.0}
     wrong = []
     with TemporaryDirectory() as name:

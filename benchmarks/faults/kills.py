@@ -1,4 +1,4 @@
-"""Kills of runs at any moment, that take rows from a file, from standard input or from a broker."""
+"""Kills at random moments of runs that read a file, standard input or a broker."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from benchmarks.faults.rod import Row, rod_rows
 from benchmarks.faults.run import Run, undisturbed
 from livepde.runs import Check, Outcome, Table
 
-STRIDE = 0.25  # seconds after a sign of life within which a kill falls
-LEAD = (20, 400)  # rows that are there before they are asked for
+STRIDE = 0.25  # largest delay of a kill after the run makes progress, in seconds
+LEAD = (20, 400)  # range of the number of rows supplied in advance
 MOMENTS = {"start": 0.25, "step": 0.4, "write": 0.25, "end": 0.1}  # share of the kills
-PROGRESS = 0.7  # share of the kills that have to fall after new samples
+PROGRESS = 0.7  # smallest share of kills after new samples
 
 Plants = Callable[[Path, Sequence[Row], int], Plant]
 
 
 def kills_of_files(plan: Plan) -> Outcome:
-    """Kill runs of a file that grows."""
+    """Kill runs that follow a growing file."""
     with TemporaryDirectory() as folder:
         return _killed(plan, Path(folder), "file", GrowingFile)
 
 
 def kills_of_input(plan: Plan) -> Outcome:
-    """Kill runs that read standard input, and send again what was not acknowledged."""
+    """Kill runs that read standard input; rows without an estimate are sent again."""
     with TemporaryDirectory() as name, ExitStack() as stack:
 
         def plant(here: Path, rows: Sequence[Row], seed: int) -> Feeder:
@@ -49,7 +49,7 @@ def kills_of_input(plan: Plan) -> Outcome:
 
 
 def kills_of_topics(plan: Plan) -> Outcome:
-    """Kill runs that listen to a broker."""
+    """Kill runs that subscribe to a broker."""
     with TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name)
         broker = Mosquitto(folder)
@@ -66,16 +66,16 @@ KILLED = {"file": kills_of_files, "stdin": kills_of_input, "mqtt": kills_of_topi
 
 @dataclass
 class _Hunt:
-    """Kills of runs in several threads, until there are enough of them.
+    """Kills runs in several threads until the planned number of kills is reached.
 
     Attributes
     ----------
     fallen
-        Moment -> kills.
+        Moment -> number of kills.
     progress
-        Kills after new samples.
+        Number of kills after new samples.
     uncounted
-        Rows that were sent again, had been taken, and were not counted as that; or were late.
+        Number of repeated rows that were not counted as repeated, or were counted as late.
     """
 
     plan: Plan
@@ -93,12 +93,12 @@ class _Hunt:
 
     @property
     def open(self) -> bool:
-        """Return whether kills are missing."""
+        """Whether more kills are needed."""
         few = self.fallen.total() < self.plan.kills
         return not self._over and (few or self.progress < PROGRESS * self.plan.kills)
 
     def hunt(self) -> None:
-        """Kill one run after the other; nobody goes on after an error."""
+        """Kill one run after another; an error in one thread stops all threads."""
         try:
             while self.open:
                 with self._lock:
@@ -128,9 +128,9 @@ class _Hunt:
         found = Found.of(here / "run")
         with self._lock:
             self.damage.compare(found, expected)
-            if isinstance(plant, Feeder):  # it knows what it has sent again
-                again = before - plant.first
-                self.uncounted += abs(found.counts["repeated"] - repeated - again)
+            if isinstance(plant, Feeder):  # it knows which rows it sent again
+                resent = before - plant.first
+                self.uncounted += abs(found.counts["repeated"] - repeated - resent)
                 self.uncounted += found.counts["late"]
         shutil.rmtree(here)
 
@@ -141,7 +141,7 @@ class _Hunt:
             next(self.bar, None)
 
     def outcome(self) -> Outcome:
-        """Return what was done, and what was lost."""
+        """Return the table of kills and damage, and the checks."""
         name, damage = self.name, self.damage
         head = ("runs", *(f"at {moment}" for moment in MOMENTS), "lost", "doubled", "different")
         moments = (self.fallen[moment] for moment in MOMENTS)
@@ -155,13 +155,13 @@ class _Hunt:
             *damage.checks(name),
         ]
         if name == "stdin":
-            told = "rows sent again that are not counted as repeated"
-            checks.append(Check(f"{name}: {told}", self.uncounted, 0, "<="))
+            text = "rows sent again that are not counted as repeated"
+            checks.append(Check(f"{name}: {text}", self.uncounted, 0, "<="))
         return Outcome(tables=[table], checks=checks)
 
 
 def _killed(plan: Plan, folder: Path, name: str, plants: Plants) -> Outcome:
-    undisturbed(plan.samples)  # once, before threads ask for it
+    undisturbed(plan.samples)  # compute once, before the threads start
     bar = plan.watched(plan.kills, f"kills, {name}")
     next(bar, None)
     hunt = _Hunt(plan, folder, name, plants, bar)
@@ -174,17 +174,17 @@ def _killed(plan: Plan, folder: Path, name: str, plants: Plants) -> Outcome:
 def _kill(
     run: Run, plant: Plant, rows: int, moment: str, start: float, rng: np.random.Generator
 ) -> bool:
-    """Start a run and kill it at such a moment; return whether it was still there."""
+    """Start a run and kill it at a kind of moment; return whether it was still running."""
     seen = run.look()
     plant.supply(min(seen + int(rng.integers(*LEAD)), rows))
     run.start()
-    if moment == "start":  # also while it resumes
+    if moment == "start":  # includes the resume
         time.sleep(float(rng.uniform(0.0, 1.2 * start)))
         return run.kill()
     wait(lambda: not run.alive() or run.look() > seen, "a run does not go on")
     plant.supply(min(run.look() + int(rng.integers(*LEAD)), rows))
     until = time.monotonic() + float(rng.uniform(0.0, STRIDE))
-    if moment == "write":  # while its log grows, if it does
+    if moment == "write":  # when its log grows, or after the delay
         size = run.log_size
         while run.log_size == size and time.monotonic() < until:
             pass

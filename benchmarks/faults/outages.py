@@ -1,4 +1,4 @@
-"""Sources that go away, and come back."""
+"""Data sources that are temporarily unavailable."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from benchmarks.faults.rod import Row, rod_rows
 from benchmarks.faults.run import Run, hearing, undisturbed
 from livepde.runs import Check, Outcome, Table
 
-RESTARTS = 2  # of the broker
+RESTARTS = 2  # number of broker restarts
 
 
 def outages(plan: Plan) -> Outcome:
-    """Stop a broker and start it again, fall silent, and take a file away."""
+    """Restart a broker, send nothing for a while, and move a followed file away and back."""
     rows = rod_rows(min(plan.samples, 600))
     expected, _ = undisturbed(len(rows))
-    heard, damage = [_broker_away(rows), _file_away(rows, plan.seed)], Damage()
-    for found in heard:
+    runs, damage = [_broker_away(rows), _file_away(rows, plan.seed)], Damage()
+    for found in runs:
         damage.compare(found, expected)
-    noticed = sum(min(found.events["silent"], found.events["heard"]) for found in heard)
+    noticed = sum(min(found.events["silent"], found.events["heard"]) for found in runs)
     table = Table(
         f"Sources that go away: {len(rows)} samples",
         ("broker restarts", "outages noticed", "lost", "doubled", "different"),
         [(RESTARTS, noticed, damage.lost, damage.doubled, damage.different)],
     )
-    check = Check("outages: noticed, and their end", noticed, len(heard), ">=")
+    check = Check("outages: noticed, and their end", noticed, len(runs), ">=")
     return Outcome(tables=[table], checks=[check, *damage.checks("outages")])
 
 
@@ -40,7 +40,7 @@ def _broker_away(rows: Sequence[Row]) -> Found:
     with hearing(rows, saved=True) as (broker, topic, run):
         for part in np.linspace(0, len(rows) // 3, RESTARTS + 1, dtype=int).tolist()[1:]:
             topic.supply(part)
-            run.wait_for(part // 2)  # the others are on their way
+            run.wait_for(part // 2)  # the other rows are still in transit
             broker.stop()
             wait(lambda: not topic.connected(), "a broker that was stopped answers")
             broker.start()

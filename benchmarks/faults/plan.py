@@ -1,4 +1,4 @@
-"""How much harm is done, and whether that is shown."""
+"""Options of the fault benchmark."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from benchmarks.progress import shown
 
 @dataclass(frozen=True)
 class Plan:
-    """What `python -m benchmarks faults` was asked for."""
+    """Amount of each fault, and options of `python -m benchmarks faults`."""
 
     kills: int
     samples: int
@@ -21,6 +21,6 @@ class Plan:
     workers: int = 1
 
     def watched(self, count: int, what: str) -> Iterator[int]:
-        """Yield so many numbers, and show how far that is."""
+        """Iterate over range(count), with a progress bar if requested."""
         numbers = range(count)
         return shown(numbers, count, what) if self.progress else iter(numbers)

@@ -1,4 +1,4 @@
-"""What brings rows to a run: a growing file, standard input, topics of a broker, a server."""
+"""Plants that supply rows to a run by a growing file, standard input, MQTT or OPC UA."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ import numpy as np
 from benchmarks.faults.rod import STEP, Row
 from livepde.errors import RunError
 
-PATIENCE = 120.0  # seconds after which a run that does not go on is given up
+PATIENCE = 120.0  # time limit for a run to make progress, in seconds
 BROKER = "/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin:/opt/homebrew/sbin"
 
 
 class Plant(Protocol):
-    """Brings rows to a run."""
+    """Supplies rows to a run."""
 
     source: str
 
     def supply(self, count: int) -> None:
-        """Have the first so many rows there."""
+        """Make the first `count` rows available."""
 
     def launch(self, command: Sequence[str], folder: Path) -> subprocess.Popen[bytes]:
         """Start a run in its folder."""
@@ -46,13 +46,13 @@ def launched(
     stdin: int | None = None,
     stdout: int = subprocess.DEVNULL,
 ) -> subprocess.Popen[bytes]:
-    """Start a command in a folder, with its log there."""
+    """Start a command in a folder, with its error output in log.txt."""
     with (folder / "log.txt").open("ab") as log:
         return subprocess.Popen(command, cwd=folder, stdin=stdin, stdout=stdout, stderr=log)
 
 
 class GrowingFile(Plant):
-    """A file that grows; unless `whole`, not always by whole lines."""
+    """Growing file; unless `whole`, its last line may be incomplete."""
 
     source = 'file = "rows.csv"\nfollow = true'
 
@@ -79,19 +79,19 @@ class GrowingFile(Plant):
 
 
 class Feeder(Plant):
-    """A program that writes rows to the standard input of a run, and reads its estimates.
+    """Program that writes rows to the standard input of a run, and reads its estimates.
 
-    Rows up to the last estimate that was printed have been taken for good. A run that is started
-    again is sent all that follows, and often rows before, too.
+    Rows up to the last printed estimate are stored by the run. A restarted run gets all rows that
+    follow, and often some rows before.
 
     Attributes
     ----------
     first
-        Number of the row with which the run that was started last was begun.
+        Index of the first row that was sent to the last started run.
     """
 
     source = ""
-    OVERLAP = (0, 0, 1, 40, 400)  # rows that are sent again without need
+    OVERLAP = (0, 0, 1, 40, 400)  # numbers of rows that are sent again unnecessarily
 
     def __init__(self, folder: Path, rows: Sequence[Row], seed: int) -> None:
         self.first = 0
@@ -114,13 +114,13 @@ class Feeder(Plant):
         return process
 
     def supply(self, count: int) -> None:
-        """Have the first so many rows sent as fast as they are read."""
+        """Send the first `count` rows as fast as they are read."""
         with self._changed:
             self._count = max(count, self._count)
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Send nothing more."""
+        """Stop sending rows."""
         self._feed(None)
 
     def _feed(self, process: subprocess.Popen[bytes] | None) -> None:
@@ -129,14 +129,14 @@ class Feeder(Plant):
             self._changed.notify_all()
 
     def _printed(self) -> int:
-        """Return the number of rows up to the last estimate of which a whole line was printed."""
+        """Return the number of rows up to the last estimate that was printed as a whole line."""
         if not self._estimates.exists():
             return 0
         *lines, _ = self._estimates.read_bytes().split(b"\n")
         return round(json.loads(lines[-1])["t"] / STEP) + 1 if lines else 0
 
     def _pump(self, process: subprocess.Popen[bytes], k: int) -> None:
-        """Write rows from the k-th on, until another process is to be fed or nobody reads."""
+        """Write rows from index k, until another process is fed or the pipe is closed."""
         pipe = process.stdin
         if pipe is None:
             raise RunError("benchmark faults: a run has no standard input.")
@@ -147,14 +147,14 @@ class Feeder(Plant):
                 k = end
 
     def _asked_for(self, process: subprocess.Popen[bytes], k: int) -> int:
-        """Wait for more than k rows to be asked for; return how many, 0 if others are fed now."""
+        """Wait for more than k supplied rows; return their number, 0 if another process is fed."""
         with self._changed:
             self._changed.wait_for(lambda: self._fed is not process or self._count > k)
             return self._count if self._fed is process else 0
 
 
 class Topic(Plant):
-    """Messages of a broker that keeps them for who is away."""
+    """MQTT topic of a broker that queues messages for disconnected clients."""
 
     def __init__(self, broker: Mosquitto, rows: Sequence[Row], name: str) -> None:
         from livepde.streams.mqtt import Broker, MqttSource
@@ -166,7 +166,7 @@ class Topic(Plant):
             f'rows = ["{self._topic}"]'
         )
         place = ("127.0.0.1", broker.port)
-        MqttSource(Broker(*place, name), {self._topic: None}, "time").close()  # a session
+        MqttSource(Broker(*place, name), {self._topic: None}, "time").close()  # create a session
         self._client = Broker(*place, f"{name}-plant").client()
         Broker(*place, f"{name}-plant").connect(self._client)
 
@@ -178,7 +178,7 @@ class Topic(Plant):
         self._count = max(count, self._count)
 
     def connected(self) -> bool:
-        """Return whether it reaches the broker."""
+        """Return whether the plant is connected to the broker."""
         return bool(self._client.is_connected())
 
     def send(self, message: str | bytes) -> Any:
@@ -190,16 +190,16 @@ class Topic(Plant):
 
 
 class Nodes(Plant):
-    """Variables of an OPC UA server, one for each channel, with the times of the rows.
+    """OPC UA server with one variable per channel and the times of the rows.
 
     Parameters
     ----------
     rows
-        The first one names all channels.
+        Rows to supply; the first row has all channels.
     """
 
-    PERIOD = 0.05  # seconds between two messages of the server
-    AT_ONCE = 5  # rows that are written between two messages, fewer than the server queues
+    PERIOD = 0.05  # publishing interval of the server, in seconds
+    AT_ONCE = 5  # rows written between two messages, fewer than the server's queue size
 
     def __init__(self, rows: Sequence[Row]) -> None:
         logging.getLogger("asyncua").setLevel(logging.CRITICAL)
@@ -259,14 +259,14 @@ class Nodes(Plant):
     async def _sent(self) -> None:
         """Wait until the server has sent all values."""
         subscriptions = self._server.iserver.subscription_service.subscriptions
-        while any(one._triggered_datachanges for one in subscriptions.values()):
+        while any(item._triggered_datachanges for item in subscriptions.values()):
             await asyncio.sleep(0.2 * self.PERIOD)
 
 
 class Mosquitto:
-    """A broker of its own, in a folder of its own; sessions survive its restart if they are saved.
+    """MQTT broker in its own folder; with `saved`, sessions survive its restart.
 
-    It saves all of them with each message then, which costs more than all else.
+    With `saved` it writes all sessions at each message, which dominates the cost.
     """
 
     def __init__(self, parent: Path, saved: bool = False) -> None:
@@ -276,7 +276,7 @@ class Mosquitto:
                 "there is no MQTT broker: install mosquitto (Debian's package of that name), or "
                 "leave it out with --only file --only malformed."
             )
-        self._kept = socket.socket()  # keeps the port for the broker, also while it is away
+        self._kept = socket.socket()  # reserves the port, also while the broker is stopped
         self._kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self._kept.bind(("127.0.0.1", 0))
         self.port = int(self._kept.getsockname()[1])
@@ -292,7 +292,7 @@ class Mosquitto:
         self.start()
 
     def start(self) -> None:
-        """Start it and wait until it listens."""
+        """Start the broker, and wait until it listens."""
         self._process = subprocess.Popen(
             self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
@@ -304,18 +304,18 @@ class Mosquitto:
         wait(listens, "mosquitto does not listen")
 
     def stop(self) -> None:
-        """Stop it; what it keeps is on disk."""
+        """Stop the broker; saved sessions stay on disk."""
         self._process.terminate()
         self._process.wait()
 
     def close(self) -> None:
-        """Stop it for good."""
+        """Stop the broker, and release its port."""
         self.stop()
         self._kept.close()
 
 
 def wait(what: Callable[[], bool], why: str, patience: float = PATIENCE) -> None:
-    """Wait until something is so; raises `RunError` that says why it is not."""
+    """Wait until `what()` is true; after `patience` seconds, raise `RunError` with text `why`."""
     end = time.monotonic() + patience
     while not what():
         if time.monotonic() > end:

@@ -1,4 +1,4 @@
-"""Runs that are killed every few seconds, with short and with long steps."""
+"""Runs with short and long steps that are killed every few seconds."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from benchmarks.faults.run import Run
 from livepde.runs import Check, Outcome, Table
 
 LIFE = 8.0  # seconds after which a run is killed
-# Name -> substeps of a step, and samples of a run.
+# Duration of a step -> number of substeps, and samples of a run.
 STEPS = {"50 ms": (40, 400), "2 s": (1600, 16)}
-MOST = 40  # lives of a run
-STOPS = 100  # signals at random moments of long steps
-LATE = 2.5  # seconds from SIGTERM to the exit: a second of grace, and the report
+MOST = 40  # largest number of processes of a run
+STOPS = 100  # largest number of signals at random moments of long steps
+LATE = 2.5  # seconds from SIGTERM to the exit, for a grace period of 1 s and the report
 
 
 def frequent_kills(plan: Plan) -> Outcome:
-    """Kill runs every eight seconds until they have taken all samples; stop others by SIGTERM."""
+    """Kill runs, or stop them by SIGTERM, every eight seconds until all samples are processed."""
     rows, damage, idle, slowest = [], Damage(), 0, 0.0
     for name, (substeps, samples) in STEPS.items():
         text = f'refit = false\n[steps]\ndt_max = "{STEP / substeps} s"\n'
@@ -38,7 +38,7 @@ def frequent_kills(plan: Plan) -> Outcome:
                 found, gains, exits = _lives(Path(folder), samples, text, lambda: LIFE, how)
             slow = max(exits, default=0.0)
             damage.compare(found, expected)
-            # The first life may end before its first step has.
+            # The first process may end before its first step is complete.
             idle += sum(gain == 0 for gain in gains[1:])
             slowest = max(slowest, slow if how == signal.SIGTERM else 0.0)
             rows.append((name, how.name, len(gains), min(gains[1:], default=0), slow))
@@ -54,7 +54,7 @@ def frequent_kills(plan: Plan) -> Outcome:
 
 
 def prompt_stops(plan: Plan) -> Outcome:
-    """Stop a run with steps of two seconds by SIGTERM, at moments drawn at random."""
+    """Stop a run with steps of two seconds by SIGTERM at random moments."""
     rng, count = np.random.default_rng(plan.seed), min(plan.kills, STOPS)
     numbers = iter(plan.watched(count, "SIGTERM"))
 
@@ -64,7 +64,7 @@ def prompt_stops(plan: Plan) -> Outcome:
         log = Path(folder) / "log.txt"
 
         def life() -> float:
-            """Wait until the run has begun, and return a number of seconds."""
+            """Wait until the run has begun, and return its random lifetime in seconds."""
             next(numbers)
             size = log.stat().st_size
             wait(lambda: log.stat().st_size > size, "a run does not begin")
@@ -72,7 +72,7 @@ def prompt_stops(plan: Plan) -> Outcome:
 
         rows = 20 * count + 10
         _, gains, exits = _lives(Path(folder), rows, text, life, signal.SIGTERM, count)
-    soon = sum(one <= LATE for one in exits)
+    soon = sum(seconds <= LATE for seconds in exits)
     row = (len(exits), soon, float(np.median(exits)), max(exits), sum(gains))
     head = ("SIGTERM", f"within {LATE:g} s", "median seconds", "most", "samples")
     check = Check(f"SIGTERM: exits later than {LATE:g} s", len(exits) - soon, 0, "<=")
@@ -87,9 +87,9 @@ def _lives(
     how: signal.Signals,
     most: int = MOST,
 ) -> tuple[Found, list[int], list[float]]:
-    """Return what a run leaves behind, its new samples in each life, and the seconds of exits."""
+    """Restart a run until it is complete; return its results, new samples and exit times."""
     plant, gains, exits = GrowingFile(folder, rod_rows(samples + 1), 0), list[int](), list[float]()
-    plant.supply(samples)  # the last row may be without its end
+    plant.supply(samples)  # the last row may be incomplete
     with closing(Run(folder, plant.source)) as run:
         case = folder / "case.toml"
         case.write_text(case.read_text().replace("[output]", text + "[output]"))
@@ -109,7 +109,7 @@ def _lives(
             exits.append(time.monotonic() - begun)
         if len(gains) == most and run.estimated() < samples - 1:
             return Found.of(folder / "run"), gains, exits
-        # The last sample shows that the last life hears signals.
+        # The last sample shows that the last process handles signals.
         plant.supply(samples + 1)
         run.end(samples + 1)
     return Found.of(folder / "run"), gains, exits

@@ -1,4 +1,4 @@
-"""The process of these runs: a rod whose end is warmed and cooled, its case and its rows."""
+"""Case and rows of the test process, a rod with one end heated and cooled periodically."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-STEP = 60.0  # seconds from one row to the next
-ALPHA = 2e-5  # m^2/s, of the rod
-SILENCE = 1.0  # seconds after which a source is said to be silent
+STEP = 60.0  # seconds between two rows
+ALPHA = 2e-5  # diffusivity of the rod, m^2/s
+SILENCE = 1.0  # seconds after which a source is reported as silent
 
 Row: TypeAlias = Mapping[str, Any]
 
@@ -55,20 +55,20 @@ fields_every = 20
 
 
 def case_text(source: str = "", silence: float = SILENCE, leap: str = "1 d") -> str:
-    """Return the case of the rod, with the lines that name a source."""
+    """Return the case file of the rod, with lines that configure a data source."""
     return _CASE.format(source=source, silence=silence, leap=leap)
 
 
 def rod_rows(count: int) -> list[dict[str, Any]]:
-    """Return rows of a rod whose end is warmed and cooled, with noise."""
+    """Return noisy rows of a rod with one end heated and cooled periodically."""
     rng, start = np.random.default_rng(0), datetime(2026, 1, 1)
-    x, rate = np.array([0.0, 0.3, 0.6]), 0.04  # places, and the phase that passes in a minute
-    decay = x / math.sqrt(2.0 * ALPHA / (rate / STEP))  # of a wave that goes into the rod
-    found = []
+    x, rate = np.array([0.0, 0.3, 0.6]), 0.04  # positions, and phase per row
+    decay = x / math.sqrt(2.0 * ALPHA / (rate / STEP))  # decay and phase lag of the thermal wave
+    rows = []
     for k in range(count):
         wave = np.exp(-decay) * np.cos(rate * k - decay)
         T = 20.0 + 5.0 * (1.0 - x - wave) + [0.0, *0.2 * rng.standard_normal(2)]
         names = ("left", "T_3", "T_6")
         values = dict(zip(names, T.tolist(), strict=True))
-        found.append({"time": str(start + timedelta(seconds=STEP * k)), **values})
-    return found
+        rows.append({"time": str(start + timedelta(seconds=STEP * k)), **values})
+    return rows

@@ -1,4 +1,4 @@
-"""`livepde run` as a process that can be killed."""
+"""Processes of `livepde run` that can be killed, and undisturbed runs to compare with."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class Run:
     Parameters
     ----------
     folder, source
-        Where it runs, and the lines of its case that name the source.
+        Folder of the run, and lines of its case that configure the data source.
     launch
-        Starts the command.
+        Function that starts the command.
     options, wrapper
-        What comes after its command, and before it.
+        Arguments after the command, and before it.
     codes
-        With which it may end by itself.
+        Exit codes that are no error.
     """
 
     def __init__(
@@ -65,57 +65,57 @@ class Run:
         self._process = self._launch([*self._wrapper, *command, *self._options], self.folder)
 
     def look(self) -> int:
-        """Return how many samples are accepted; a reader is open all the time."""
+        """Return the number of accepted samples; the journal stays open for reading."""
         if self._journal is None and (self.out / JOURNAL).exists():
             self._journal = Journal.open(self.out / JOURNAL)
         return 0 if self._journal is None else self._journal.accepted
 
     def estimated(self) -> int:
-        """Return how many samples have been estimated."""
+        """Return the number of samples with an estimate."""
         self.look()
         return 0 if self._journal is None else len(self._journal)
 
     def counted(self, kind: str) -> int:
-        """Return how many remarks of a kind the journal has."""
+        """Return the number of remarks of a kind in the journal."""
         self.look()
         counts = {} if self._journal is None else self._journal.counts
         return sum(number for (what, _), number in counts.items() if what == kind)
 
     @property
     def log_size(self) -> int:
-        """Bytes of the journal's write-ahead log."""
+        """Size of the journal's write-ahead log in bytes."""
         log = log_of(self.out / JOURNAL)
         return log.stat().st_size if log.exists() else 0
 
     @property
     def process(self) -> subprocess.Popen[bytes]:
-        """The process that was started last."""
+        """The most recently started process."""
         if self._process is None:
             raise RunError("benchmark faults: nothing was started.")
         return self._process
 
     def alive(self) -> bool:
-        """Return whether it runs; one that has ended by itself is an error."""
+        """Return whether the process is running; raise `RunError` for an unexpected exit code."""
         code = self.process.poll()
         if code is not None and code not in self._codes:
-            told = (self.folder / "log.txt").read_text()[-2000:]
-            raise RunError(f"benchmark faults: a run ended with code {code}:\n{told}")
+            log = (self.folder / "log.txt").read_text()[-2000:]
+            raise RunError(f"benchmark faults: a run ended with code {code}:\n{log}")
         return code is None
 
     def signal(self, number: int) -> bool:
-        """Send a signal; return whether there was still somebody to hear it."""
+        """Send a signal; return whether the process was still running."""
         if not self.alive():
             return False
         self.process.send_signal(number)
         return True
 
     def kill(self) -> bool:
-        """Kill it; return whether it was still there."""
-        there = self.signal(signal.SIGKILL)
-        return self.process.wait() == -signal.SIGKILL and there
+        """Kill the process; return whether it was still running."""
+        running = self.signal(signal.SIGKILL)
+        return self.process.wait() == -signal.SIGKILL and running
 
     def wait_for(self, samples: int) -> None:
-        """Wait until so many samples have been estimated."""
+        """Wait until `samples` samples have an estimate."""
 
         def enough() -> bool:
             self.alive()
@@ -124,7 +124,7 @@ class Run:
         wait(enough, f"a run did not take {samples} samples")
 
     def wait_for_event(self, kind: str, number: int) -> None:
-        """Wait until something has happened so often."""
+        """Wait until the journal has `number` events of a kind."""
 
         def happened() -> bool:
             self.alive()
@@ -135,14 +135,14 @@ class Run:
         wait(happened, f"a run did not say {kind!r}")
 
     def end(self, samples: int) -> None:
-        """Let it take all samples, and end it as a service is ended."""
+        """Wait until all samples have an estimate, and stop the process by SIGTERM."""
         self.wait_for(samples)
         self.signal(signal.SIGTERM)
         self.process.wait(PATIENCE)
         self.alive()
 
     def close(self) -> None:
-        """Leave nothing behind."""
+        """Kill the process, and close the journal."""
         if self._process is not None and self._process.poll() is None:
             self._process.kill()
             self._process.wait()
@@ -152,7 +152,7 @@ class Run:
 
 @contextmanager
 def hearing(rows: Sequence[Row], saved: bool = False) -> Iterator[tuple[Mosquitto, Topic, Run]]:
-    """Yield a broker, a topic that has rows, and a run that hears it."""
+    """Yield a broker, a topic with rows, and a run that subscribes to it."""
     with TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name) / "mqtt"
         folder.mkdir()
@@ -165,20 +165,20 @@ def hearing(rows: Sequence[Row], saved: bool = False) -> Iterator[tuple[Mosquitt
 
 
 def undisturbed_journal(folder: Path, count: int) -> Path:
-    """Return the journal of a run in a folder that nobody disturbs."""
+    """Run undisturbed in a folder, and return the path of the journal."""
     plant = GrowingFile(folder, rod_rows(count), 0)
     plant.supply(count)
     with closing(Run(folder, plant.source)) as run:
         run.start()
         run.end(count)
     path = folder / "run" / JOURNAL
-    Journal.open(path, write=True).close()  # all in one file: nothing is left in the log
+    Journal.open(path, write=True).close()  # moves the write-ahead log into the file
     return path
 
 
 @cache
 def undisturbed(count: int) -> tuple[Found, float]:
-    """Return what a run finds that nobody disturbs, and the seconds until its first sample."""
+    """Run undisturbed; return the results, and the seconds until the first sample."""
     with TemporaryDirectory() as name:
         folder = Path(name)
         plant = GrowingFile(folder, rod_rows(count), 0)
