@@ -1,4 +1,4 @@
-"""Readings of rods by their own finite differences, and what broken sensors make of them."""
+"""Readings of a rod by independent finite differences, and case and table files made of them."""
 
 from functools import cache
 
@@ -14,14 +14,14 @@ def left(t):
 
 @cache
 def exact(rows: int, change: float = 1.0, after: int = 10**9) -> np.ndarray:
-    """Temperatures at the sensors by Crank-Nicolson on 160 cells, 8 steps a row, (rows, 3).
+    """Return sensor temperatures by Crank-Nicolson, 160 cells, 8 steps per row, shape (rows, 3).
 
-    The diffusivity is `change` times as large from row `after` on.
+    After row `after`, the diffusivity is multiplied by `change`.
     """
     cells, parts = 160, 8
     x = np.linspace(0.0, LENGTH, cells + 1)
     u, h = np.full(cells + 1, 20.0), STEP / parts
-    found = [u[[40, 80, 120]]]
+    temperatures = [u[[40, 80, 120]]]
     for k in range(1, rows):
         r = 0.5 * ALPHA * (change if k > after else 1.0) * h / (x[1] - x[0]) ** 2
         bands = np.zeros((3, cells + 1))
@@ -32,8 +32,8 @@ def exact(rows: int, change: float = 1.0, after: int = 10**9) -> np.ndarray:
             rhs[1:-1] += r * (u[2:] - 2 * u[1:-1] + u[:-2])
             rhs[0], rhs[-1] = left((k - 1) * STEP + (j + 1) * h), 20.0
             u = scipy.linalg.solve_banded((1, 1), bands, rhs)
-        found.append(u[[40, 80, 120]])
-    return np.array(found)
+        temperatures.append(u[[40, 80, 120]])
+    return np.array(temperatures)
 
 
 def readings(rows: int, seed: int = 0, **process) -> np.ndarray:
@@ -42,7 +42,7 @@ def readings(rows: int, seed: int = 0, **process) -> np.ndarray:
 
 
 def case_text() -> str:
-    """Return a case for `table`, whose initial state is made of the first row."""
+    """Return a case file for `table`, with the initial state interpolated from the first row."""
     sensors = "\n".join(
         f'T_{k + 1} = {{ role = "sensor", column = "T_{k + 1}", at = {x}, noise = {NOISE} }}'
         for k, x in enumerate(AT)
@@ -63,7 +63,7 @@ T_right = {{ role = "boundary", column = "T_right", at = "right" }}
 
 
 def table(z: np.ndarray, left_cells: dict[int, float] | None = None) -> str:
-    """Return readings with the values of the ends as a CSV file; some of the left end differ."""
+    """Return a CSV file of readings and end values; `left_cells` replaces values at the left."""
     lines = ["t,T_left,T_1,T_2,T_3,T_right"]
     for k, row in enumerate(z.tolist()):
         end = (left_cells or {}).get(k, left(k * STEP))

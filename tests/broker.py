@@ -1,4 +1,4 @@
-"""A message broker of one's own."""
+"""A private MQTT broker for tests."""
 
 import contextlib
 import shutil
@@ -12,7 +12,7 @@ from ports import kept_port
 
 MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
 
-AGAIN = 2.0  # s until a signal is sent again
+AGAIN = 2.0  # seconds until a signal is sent again
 
 
 class Server:
@@ -42,7 +42,7 @@ class Server:
         raise RuntimeError("mosquitto does not listen")
 
     def stop(self) -> None:
-        """End the broker; it forgets a signal that comes before its loop has begun."""
+        """Stop the broker; it ignores signals that arrive before its loop has begun."""
         end = time.monotonic() + PATIENCE
         while self.process.poll() is None:
             if time.monotonic() > end:

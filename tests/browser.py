@@ -1,4 +1,4 @@
-"""A real browser, and what a page shows in it."""
+"""Chromium in tests, and functions that read a page in it."""
 
 import json
 import shutil
@@ -11,7 +11,7 @@ from patience import PATIENCE
 
 @contextmanager
 def chromium(width: int = 1280):
-    """Start a browser, and see at the end that it had nothing to complain of and asked only us."""
+    """Start a browser; at the end, check that it logged no error and contacted only our server."""
     browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if browser is None or driver is None:
         pytest.skip("no Chromium: apt-get install chromium chromium-driver")
@@ -41,7 +41,7 @@ def chromium(width: int = 1280):
 
 
 def requested(page) -> list[str]:
-    """Return the addresses that a page has asked for."""
+    """Return the addresses that a page has requested."""
     messages = [json.loads(line["message"])["message"] for line in page.get_log("performance")]
     urls = [
         message["params"]["request"]["url"]
@@ -53,7 +53,7 @@ def requested(page) -> list[str]:
 
 
 def wait(page, condition):
-    """Return what a condition on the page gives, as soon as it is true."""
+    """Wait until a condition on the page is true, and return its value."""
     from selenium.common.exceptions import StaleElementReferenceException as Stale
     from selenium.webdriver.support.ui import WebDriverWait
 

@@ -1,4 +1,4 @@
-"""Certificates that sign themselves."""
+"""Self-signed certificates for tests."""
 
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -7,7 +7,7 @@ import pytest
 
 
 def certificate(folder: Path, name: str, uri: str = "") -> tuple[Path, Path]:
-    """Write a certificate that signs itself, of this machine or of an application, and its key."""
+    """Write a self-signed certificate for localhost, or for the application `uri`, and its key."""
     x509 = pytest.importorskip("cryptography.x509")
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import rsa
@@ -16,7 +16,7 @@ def certificate(folder: Path, name: str, uri: str = "") -> tuple[Path, Path]:
     who = x509.Name([x509.NameAttribute(x509.oid.NameOID.COMMON_NAME, name)])
     names = [x509.UniformResourceIdentifier(uri) if uri else x509.DNSName("localhost")]
     now = datetime.now(UTC)
-    made = (
+    signed = (
         x509.CertificateBuilder()
         .subject_name(who)
         .issuer_name(who)
@@ -29,7 +29,7 @@ def certificate(folder: Path, name: str, uri: str = "") -> tuple[Path, Path]:
         .sign(key, hashes.SHA256())
     )
     cert, secret = folder / f"{name}.pem", folder / f"{name}-key.pem"
-    cert.write_bytes(made.public_bytes(serialization.Encoding.PEM))
+    cert.write_bytes(signed.public_bytes(serialization.Encoding.PEM))
     secret.write_bytes(
         key.private_bytes(
             serialization.Encoding.PEM,

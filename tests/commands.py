@@ -1,4 +1,4 @@
-"""Commands as users give them: in this process, in one of their own, or as a service."""
+"""Functions that run commands in this process, in a separate process, or as a service."""
 
 import logging
 import shutil
@@ -24,24 +24,24 @@ from livepde.runs import JOURNAL, Journal
 
 @contextmanager
 def unchanged_logging() -> Iterator[None]:
-    """Leave logging as it was."""
+    """Restore the configuration of logging at the end of a context."""
     root = logging.getLogger()
-    before, level = list(root.handlers), root.level
-    own = {name: logging.getLogger(name).level for name in ("livepde", "asyncua")}
+    handlers, root_level = list(root.handlers), root.level
+    levels = {name: logging.getLogger(name).level for name in ("livepde", "asyncua")}
     try:
         yield
     finally:
-        root.handlers[:] = before
-        root.setLevel(level)
-        for name, was in own.items():
-            logging.getLogger(name).setLevel(was)
+        root.handlers[:] = handlers
+        root.setLevel(root_level)
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)
 
 
 def call(
     *arguments: str | Path, stdin: str | None = None, program: typer.Typer = cli.app
 ) -> tuple[int, str]:
-    """Return exit code and output of a command that ends as it should."""
-    with unchanged_logging():  # a live run configures it, with a stream that is closed here
+    """Run a command in this process; return its exit code and output, or raise its exception."""
+    with unchanged_logging():  # a live run logs to a stream that is closed afterwards
         result = CliRunner().invoke(program, list(map(str, arguments)), input=stdin)
     if result.exception and not isinstance(result.exception, SystemExit):
         raise result.exception
@@ -49,26 +49,26 @@ def call(
 
 
 def bench(*arguments: str) -> tuple[int, str]:
-    """Return exit code and output of a benchmark."""
+    """Run a benchmark; return its exit code and output."""
     return call(*arguments, program=benchmarks)
 
 
 def bad(*arguments: str) -> str:
-    """Return the one sentence of a command that ends with bad input."""
+    """Run a command that must fail with a `LivepdeError`, and return the message."""
     with pytest.raises(LivepdeError) as error:
         call(*arguments)
     return str(error.value)
 
 
 def shell(*arguments: str, **options) -> subprocess.CompletedProcess[str]:
-    """Run the command in a process of its own."""
+    """Run the command in a separate process."""
     code = "import sys; from livepde.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", code, *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, **options)
 
 
 def cut(whole: str, target: str, samples: int) -> None:
-    """Copy a run as if it had been killed within its sample of this number."""
+    """Copy a run as if it had been killed while processing sample number `samples`."""
     shutil.copytree(whole, target)
     with closing(sqlite3.connect(f"{target}/{JOURNAL}")) as journal, journal:
         journal.execute("DELETE FROM checkpoints")
@@ -92,14 +92,14 @@ def until(what, process: subprocess.Popen[str]) -> None:
 
 
 def estimates(folder: str | Path) -> int:
-    """Return how many samples a run has estimated."""
+    """Return the number of samples that a run has estimated."""
     path = Path(folder) / JOURNAL
     if not path.exists():
         return 0
     try:
         with Journal.open(path) as journal:
             return len(journal)
-    except RunError:  # it is being made
+    except RunError:  # the journal is being created
         return 0
 
 

@@ -11,13 +11,13 @@ from commands import unchanged_logging
 
 PROJECT = Path(__file__).resolve().parents[1]
 
-# A program of test_petsc.py, which imports DOLFINx: no module with doctests.
+# A program started by test_petsc.py. It imports DOLFINx, so doctests must not collect it.
 collect_ignore = ["petsc_ranks.py"]
 
 if find_spec("hypothesis"):
     from hypothesis import HealthCheck, settings
 
-    # The same examples each time, on a slow machine too; --hypothesis-profile default: others.
+    # Each run has the same examples; `--hypothesis-profile default` draws other examples.
     slow = [HealthCheck.too_slow]
     settings.register_profile("same", derandomize=True, deadline=None, suppress_health_check=slow)
     settings.load_profile("same")
@@ -25,7 +25,7 @@ if find_spec("hypothesis"):
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """The folder of real measurements: $LIVEPDE_DATA, or shared/data beside the project."""
+    """Return the folder of measured data: $LIVEPDE_DATA, or shared/data next to the project."""
     named = os.environ.get("LIVEPDE_DATA")
     folder = Path(named) if named else PROJECT.parent / "shared" / "data"
     if not folder.is_dir():
@@ -35,7 +35,7 @@ def data_dir() -> Path:
 
 @pytest.fixture
 def server(tmp_path):
-    """A message broker."""
+    """Provide a running MQTT broker."""
     if MOSQUITTO is None:
         pytest.skip("needs the broker mosquitto")
     folder = tmp_path / "broker"
@@ -47,21 +47,21 @@ def server(tmp_path):
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """Work in an empty folder."""
+    """Change to an empty folder."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
 @pytest.fixture(autouse=True)
 def logs():
-    """Leave logging as it was: a live run configures it for its process."""
+    """Restore logging after each test, because a live run configures it for its process."""
     with unchanged_logging():
         yield
 
 
 @pytest.fixture
 def ctrl_c():
-    """Let children hear Ctrl-C, also where tests run in the background of a shell."""
+    """Let child processes receive Ctrl-C, even if the tests run in the background of a shell."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)

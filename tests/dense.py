@@ -1,7 +1,7 @@
-"""The coupled stage on a line by NumPy alone: P1 elements, A(u) q = q u, B(u) = -u''.
+"""The coupled stage on a line in NumPy, with P1 elements, A(u) q = q u, B(u) = -u''.
 
-Of livepde its damping rules are used, and nothing of its forms, spaces or stages: the matrices are
-assembled by loops over elements, with the integrals over omega apart from those over the rest.
+Only the damping rules are from livepde, not its forms, spaces or stages. Loops over elements
+assemble the matrices, with separate integrals over omega and over the rest.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ import numpy as np
 import livepde as lp
 
 POINTS, WEIGHTS = np.polynomial.legendre.leggauss(4)
-SHAPES = np.array([(1.0 - POINTS) / 2.0, (1.0 + POINTS) / 2.0])  # at the points of an element
+SHAPES = np.array([(1.0 - POINTS) / 2.0, (1.0 + POINTS) / 2.0])  # at the quadrature points
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,9 +25,9 @@ class DenseStage:
     x
         Nodes.
     inside
-        Which elements lie in omega.
+        Mask of the elements in omega.
     gain, rule, nu, sigma
-        Of the law, with M and N of (MN1), (MN2): u v + u' v'.
+        Parameters of the law, whose M and N of (MN1), (MN2) are u v + u' v'.
     """
 
     x: np.ndarray
@@ -38,7 +38,7 @@ class DenseStage:
     sigma: float = 0.0
 
     def assembled(self, elements: np.ndarray, w: np.ndarray | None = None) -> tuple[Any, Any, Any]:
-        """Return mass, stiffness and A(w) over some elements."""
+        """Return the matrices of mass, stiffness and A(w) over a subset of elements."""
         n = len(self.x)
         mass, stiff, A = np.zeros((3, n, n))
         for k in np.flatnonzero(elements):
@@ -61,14 +61,14 @@ class DenseStage:
 
     @cached_property
     def observed(self) -> np.ndarray:
-        """R as a diagonal: the nodes of the elements in omega, ends of omega included."""
+        """Diagonal of R, which is 1 at the nodes of elements in omega, including its ends."""
         seen = np.zeros(len(self.x))
         seen[:-1][self.inside] = seen[1:][self.inside] = 1.0
         seen[[0, -1]] = 0.0
         return seen
 
     def dual(self, f: np.ndarray, gram: np.ndarray, among: np.ndarray) -> float:
-        """Return the dual norm of a functional over some coefficients."""
+        """Return the dual norm of a functional restricted to a subset of coefficients."""
         if not len(among):
             return 0.0
         part = f[among]
@@ -77,7 +77,7 @@ class DenseStage:
     def lines(
         self, y: np.ndarray, c: np.ndarray, h: float, u_alpha: np.ndarray, F: np.ndarray
     ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return the terms of both lines; each line sums to its residual."""
+        """Return the terms of the equations of u and of q, whose sums are the residuals."""
         n, R, outside = len(self.x), self.observed, ~self.inside
         u, q = y[:n], y[n:]
         r, w = R * u - u_alpha, u_alpha + (1.0 - R) * u
@@ -112,13 +112,13 @@ class DenseStage:
         return state, learned
 
     def relative(self, *args: Any) -> float:
-        """Return the dual norm of the residual of each line over its largest term; the larger."""
+        """Return the larger residual of both equations over its largest term, in the dual norm."""
         mass, stiff, _ = self.assembled(self.everywhere)
         n = len(self.x)
-        found = []
+        residuals = []
         for line, gram, among in zip(
             self.lines(*args), (mass, mass + stiff), (self.free, np.arange(n)), strict=True
         ):
             sizes = [self.dual(term, gram, among) for term in line]
-            found.append(self.dual(sum(line), gram, among) / max(max(sizes), 1e-300))
-        return max(found)
+            residuals.append(self.dual(sum(line), gram, among) / max(max(sizes), 1e-300))
+        return max(residuals)

@@ -1,4 +1,4 @@
-"""Meshes, models and measurements that several test files use."""
+"""Meshes, models and measurements shared by several test files."""
 
 import random
 from collections.abc import Callable, Iterable, Sequence
@@ -31,15 +31,15 @@ from livepde.stepping import ForwardStage, advance
 
 
 def few(count: int, *axes: Iterable[Any]) -> list[tuple[Any, ...]]:
-    """Return some combinations, always the same ones, in which each value is about as frequent."""
+    """Return a reproducible selection of combinations with balanced frequencies of the values."""
     rng, listed = random.Random(0), [list(axis) for axis in axes]
     picks = [rng.sample([k % len(axis) for k in range(count)], count) for axis in listed]
-    found = dict.fromkeys(zip(*picks, strict=True))
-    return [tuple(axis[k] for axis, k in zip(listed, one, strict=True)) for one in found]
+    unique = dict.fromkeys(zip(*picks, strict=True))
+    return [tuple(axis[k] for axis, k in zip(listed, pick, strict=True)) for pick in unique]
 
 
 def usual(values: Iterable[Any], *, often: int = 1) -> list[Any]:
-    """Return values of a parameter, all but the first few of which are long tests."""
+    """Return values of a test parameter, with all but the first `often` marked as long tests."""
     return [
         value if k < often else pytest.param(value, marks=pytest.mark.long)
         for k, value in enumerate(values)
@@ -47,7 +47,7 @@ def usual(values: Iterable[Any], *, often: int = 1) -> list[Any]:
 
 
 def turns(first: Iterable[Any], second: Iterable[Any], third: Sequence[Any]) -> list[Any]:
-    """Return all pairs of two axes, each with one value of a third, which take turns."""
+    """Return all pairs of two axes, each with one value of a third axis in turn."""
     second = list(second)
     return [
         (a, b, third[(j + k) % len(third)])
@@ -61,13 +61,13 @@ def line(cells: int = 12) -> Any:
 
 
 def square(cells: int) -> MeshTri:
-    """Return the unit square of twice `cells` squared triangles, its sides named."""
+    """Return the unit square with 2 `cells`^2 triangles and named sides."""
     return lp.rectangle((0.0, 1.0), (0.0, 1.0), (cells, cells)).to_meshtri()
 
 
 @dataclass(frozen=True)
 class Case:
-    """A mesh with an element for the state and another one for the parameter."""
+    """A mesh, with one element for the state and one for the parameter."""
 
     mesh: Callable[[], Any]
     state: Any
@@ -111,9 +111,9 @@ def conduction(q: Any, u: Any, v: Any, x: Any) -> Any:
 def driven_rod(
     unknowns: Any, left: Callable[[float], float], mesh: Any, A: Any = conduction, **options: Any
 ) -> lp.Model:
-    """Return a rod whose left end is driven in time and whose right end is zero, P1.
+    """Return a rod of P1 elements with a time-dependent left end and zero at the right end.
 
-    Without `A`, the conductivity is the unknown `a`: u_t - (a u_x)_x = 0.
+    By default, the conductivity is the unknown `a`: u_t - (a u_x)_x = 0.
     """
     ends = {"left": lambda x, t: left(t) + 0.0 * x[0], "right": 0.0}
     state = lp.Field(mesh, ElementLineP1(), dirichlet=ends)
@@ -130,7 +130,7 @@ def reaction(
     q_dirichlet: Any = None,
     **options: Any,
 ) -> lp.Model:
-    """Return u_t - div(grad u) + q(x) u = f, u = 0 on the boundary unless told otherwise."""
+    """Return u_t - div(grad u) + q(x) u = f; by default u = 0 on the boundary."""
     zero = {"boundary": 0.0}
     return lp.Model(
         state=lp.Field(mesh, state, dirichlet=zero if dirichlet is None else dirichlet),
@@ -144,7 +144,7 @@ def reaction(
 def excited(
     cells: int = 20, element: Any = None, f: Any = None, mesh: Any = None, **options: Any
 ) -> lp.Model:
-    """Return the excited twin of DESIGN.md, fact 5: its u* is `excited_u`, its q* `excited_q`."""
+    """Return the excited twin of DESIGN.md, fact 5, with u* = `excited_u` and q* = `excited_q`."""
     element = element or ElementLineHermite()
 
     def source(x: Any, t: float) -> Any:
@@ -173,18 +173,18 @@ def truth(
     scheme: lp.stepping.Scheme | None = None,
     inputs: Any = None,
 ) -> list[np.ndarray]:
-    """Return the states of the forward model at all times."""
+    """Simulate the forward model, and return its states at all times."""
     control = lp.Advance(scheme or lp.ImplicitEuler())
     return [u for _, u in lp.simulate(model, q, u0, list(times), control, inputs)]
 
 
 def broad(value: float) -> lp.Normal:
-    """Return a prior around a value that hardly says anything."""
+    """Return a weakly informative prior around a value."""
     return lp.Normal(value, max(abs(value), 1.0))
 
 
 def last_state(model: lp.Model, u0: Any, times: Any, inputs: Any = None) -> np.ndarray:
-    """Return the state at the vertices at the last time, with the unknowns of the prior."""
+    """Simulate with the prior means, and return the last state at the vertices."""
     control = lp.Advance(lp.Alexander2())
     *_, (_, u) = lp.simulate(model, model.initial_parameter(), u0, times, control, inputs)
     return model.state_block.at_vertices @ u
@@ -198,7 +198,7 @@ def advanced(
     t1: float,
     scheme: lp.stepping.Scheme = lp.SensitivityLaw.scheme,
 ) -> np.ndarray:
-    """Return the state of the forward model at t1; q are coefficients, or a function of time."""
+    """Advance a state from t0 to t1; q contains coefficients, or is a function of time."""
 
     def stage(c: np.ndarray, t: float, h: float) -> np.ndarray:
         return forward.solve(c, q(t) if callable(q) else q, h, lp.fem.Moment(t))
@@ -209,7 +209,7 @@ def advanced(
 
 
 def filter_alone(**options: Any) -> lp.SensitivityLaw:
-    """Return a sensitivity law without its iterated start, shadows and verdict, for speed."""
+    """Return a sensitivity law without refits, shadows and verdict, which is faster."""
     return lp.SensitivityLaw(**{"refit": None, "shadows": None, "verdict": False, **options})
 
 
@@ -218,7 +218,7 @@ def observe(model: lp.Model, observation: lp.observation.Observation) -> Any:
 
 
 def rates(errors: Any) -> np.ndarray:
-    """Return the orders of convergence between errors whose step is halved each time."""
+    """Return the orders of convergence of successive errors, each with half the step before."""
     errors = np.asarray(errors)
     return np.log2(errors[:-1] / errors[1:])
 
@@ -232,13 +232,13 @@ def readings(
     seed: int = 0,
     scheme: lp.stepping.Scheme = lp.SensitivityLaw.scheme,
 ) -> list[tuple[float, np.ndarray]]:
-    """Return noisy samples of a process that starts at zero, with one unknown q(t)."""
+    """Simulate a process from zero with one unknown q(t), and return its noisy samples."""
     rng, observed = np.random.default_rng(seed), observe(model, sensors)
-    forward, u, found = ForwardStage(model), model.initial(0.0), []
+    forward, u, samples = ForwardStage(model), model.initial(0.0), []
     for t0, t1 in pairwise(float(t) for t in times):
         u = advanced(forward, u, lambda t: np.array([q(t)]), t0, t1, scheme)
-        found.append((t1, observed.G @ u + noise * rng.standard_normal(observed.size)))
-    return found
+        samples.append((t1, observed.G @ u + noise * rng.standard_normal(observed.size)))
+    return samples
 
 
 def short_rod(folder: Path, samples: int = 61) -> Path:
@@ -249,7 +249,7 @@ def short_rod(folder: Path, samples: int = 61) -> Path:
     return case
 
 
-# A rod in a case file, ready for its [channels].
+# Case file of a rod, to which a test appends [channels].
 ROD_CASE = """
 equation = "heat"
 initial = "20 degC"
@@ -283,4 +283,4 @@ BODIES = {
     "tetra": lambda: lp.fem.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (3, 2, 2)),
     "hexahedron": lambda: sided(MeshHex().refined(1)),
 }
-"""Kind of cell -> a body of size one in each direction, with a boundary on its left."""
+"""Kind of cell -> mesh of a unit body with a boundary "left"."""

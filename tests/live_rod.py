@@ -1,4 +1,4 @@
-"""A rod whose rows come from a file that grows, and its run."""
+"""Live runs of a rod whose rows come from a growing file."""
 
 import math
 from functools import cache
@@ -18,7 +18,7 @@ from livepde.streams.table import Column
 
 COLUMNS = {name: Column((name,)) for name in ("a", "b", "left")}
 CLOCK = Clock("t")
-OPENED: list = []  # sources, closed after each test of the module that opened them
+OPENED: list = []  # sources; the test module that uses them closes them after each test
 
 
 def identifier(*, verdict: bool = True) -> lp.Identifier:
@@ -29,14 +29,14 @@ def identifier(*, verdict: bool = True) -> lp.Identifier:
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
     )
     sensors = lp.Points({"a": 0.3, "b": 0.6}, noise=0.01)
-    refit = lp.laws.Refit(start=4) if verdict else None  # of half of the time of a run
+    refit = lp.laws.Refit(start=4) if verdict else None  # refits take half of the time of a run
     law = lp.SensitivityLaw(refit=refit, shadows=None, verdict=verdict)
     return lp.Identifier(model, sensors, law)
 
 
 @cache
 def readings(count: int) -> np.ndarray:
-    """Return noisy readings of the rod of `identifier`: runs with other ones search for causes."""
+    """Return noisy readings that match `identifier`: for other data, runs search for causes."""
     who = identifier()
     times = [0.1 * k for k in range(count)]
     q = who.model.initial_parameter({"k": 0.06})

@@ -1,3 +1,3 @@
-"""How long tests wait for what has to come."""
+"""Time limit of tests that wait for an event."""
 
-PATIENCE = 600.0  # seconds: more than any machine needs, it only ends what hangs
+PATIENCE = 600.0  # seconds, more than any machine needs; it only ends tests that hang

@@ -1,4 +1,4 @@
-"""The problems of tests/test_petsc.py, and their solution by livepde's own laws on one process."""
+"""Problems of tests/test_petsc.py, and their solutions by the serial laws of livepde."""
 
 from functools import cache
 from typing import ClassVar
@@ -17,15 +17,15 @@ EULER = lp.Advance(lp.ImplicitEuler())
 
 
 class Filter(lp.SensitivityLaw):
-    """The filter as it is written, from the first step on."""
+    """Sensitivity law without a graded start."""
 
     graded_start: ClassVar[bool] = False
 
 
 def plain(**options):
-    """The filter without all that stands around it."""
-    around = {"refit": None, "guards": None, "shadows": None, "verdict": False}
-    return Filter(noise=NOISE, gate=np.inf, **around, **options)
+    """Return the filter without refits, guards, shadows, verdict and gate."""
+    disabled = {"refit": None, "guards": None, "shadows": None, "verdict": False}
+    return Filter(noise=NOISE, gate=np.inf, **disabled, **options)
 
 
 @cache
@@ -78,7 +78,7 @@ def field_readings():
 
 @cache
 def data(count=6):
-    """Times and states of the process with a q that is to be found."""
+    """Return times and states of the process with the true q."""
     model = reaction()
     q = model.initial_parameter(lambda x: 1.0 + x[0] * x[1])
     times = STEP * np.arange(count + 1)
@@ -86,7 +86,7 @@ def data(count=6):
 
 
 def rest(count=9):
-    """A transient, then nothing but noise about zero."""
+    """Return rows of a transient, followed by noise about zero."""
     rng, (_, first) = np.random.default_rng(2), data()[0]
     rows = [(STEP * (k + 1), u) for k, (_, u) in enumerate(data()[:3])]
     for k in range(4, count + 1):
@@ -100,7 +100,7 @@ def filtered(model, law, rows):
     for t, z in rows:
         estimate = identifier.step(t, z)
         assert estimate.status.ok
-    # That of the filter: the one that is reported is wider where innovations are correlated.
+    # The filter's own factor, because reported intervals are wider if innovations are correlated.
     (root,) = identifier._state.now.C
     return estimate, np.sqrt((root**2).sum(axis=0))
 
@@ -115,12 +115,12 @@ def observed(observation, law):
 
 
 def solved():
-    """All estimates by livepde's own laws."""
+    """Return all estimates by the serial laws of livepde."""
     first, shares = filtered(numbers(), plain(), readings())
     field, _ = filtered(reaction(), plain(modes=MODES), field_readings())
     strict = {"gain": 100.0, "gate": None, "newton": Newton(tolerance=1e-11, share=0.0)}
     part = lp.Subdomain(omega)
-    found = {
+    estimates = {
         "full": observed(lp.Full(), lp.GradientLaw(**strict)),
         "part": observed(part, lp.GradientLaw(nu=0.01, sigma=0.1, **strict)),
         "constant": observed(part, lp.GradientLaw(damping=ConstantDamping(mu=0.5), **strict)),
@@ -131,6 +131,6 @@ def solved():
         "numbers.u": first.u,
         "modes.q": field.q,
         "modes.u": field.u,
-        **{f"{name}.q": one.q for name, one in found.items()},
-        **{f"{name}.u": one.u for name, one in found.items()},
+        **{f"{name}.q": estimate.q for name, estimate in estimates.items()},
+        **{f"{name}.u": estimate.u for name, estimate in estimates.items()},
     }

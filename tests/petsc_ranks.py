@@ -1,7 +1,7 @@
-"""What tests/test_petsc.py runs on several ranks: mpirun -n 2 python -m mpi4py petsc_ranks.py.
+"""Program that tests/test_petsc.py runs: mpirun -n 2 python -m mpi4py petsc_ranks.py.
 
-petsc_ranks.py FOUND.npz [FOLDER]: all cases to a file; with FOLDER checkpoints are written there
-half way, or taken up where there are some.
+petsc_ranks.py FOUND.npz [FOLDER] writes the results of all cases to a file. With FOLDER, it resumes
+from the checkpoints there, or writes checkpoints halfway if there are none.
 """
 
 import json
@@ -25,7 +25,7 @@ COMM = MPI.COMM_WORLD
 
 
 def mesh():
-    """The mesh of `problems.mesh`, shared out by DOLFINx."""
+    """Return the mesh of `problems.mesh`, distributed by DOLFINx."""
     given = problems.mesh()
     points, cells = (given.p.T, given.t.T) if COMM.rank == 0 else (given.p.T[:0], given.t.T[:0])
     element = ufl.Mesh(ufl.VectorElement("Lagrange", ufl.triangle, 1))
@@ -72,24 +72,24 @@ def reaction(domain, omega=None, edge=2.0):
 
 
 def given(vector, order, values):
-    """Set a vector from values in the order of the mesh as given."""
+    """Set a vector from values in the original order of the mesh."""
     vector.getArray()[:] = np.asarray(values)[order]
     return vector
 
 
 def ordered(vector, order):
-    """All values in the order of the mesh as given, on rank 0."""
+    """Return all values in the original order of the mesh on rank 0, None on other ranks."""
     parts = COMM.gather((order, vector.getArray().copy()))
     if COMM.rank:
         return None
-    found = np.zeros(sum(len(part) for part, _ in parts))
+    result = np.zeros(sum(len(part) for part, _ in parts))
     for part, values in parts:
-        found[part] = values
-    return found
+        result[part] = values
+    return result
 
 
 class Checkpoints:
-    """Writes and takes up checkpoints half way through a case, in a folder."""
+    """Writes checkpoints halfway through a case to a folder, or resumes from them."""
 
     def __init__(self, folder):
         self.folder = None if folder is None else Path(folder)
@@ -166,7 +166,7 @@ def observers(domain, checkpoints):
 
 
 def shares(domain):
-    """Owned rows, nonzeros and cells with ghosts of each rank, beside those of all."""
+    """Return for each rank the owned rows, the nonzeros, and the cells including ghosts."""
     model = reaction(domain)
     info = model.mass.getInfo(PETSc.Mat.InfoType.LOCAL)
     cells = domain.topology.index_map(2)
@@ -198,7 +198,7 @@ def checked(domain):
 
 
 def refusals(domain, folder):
-    """What is said of mistakes."""
+    """Return the error messages of invalid arguments."""
     model, V = reaction(domain), space(domain)
     few, u = numbers(domain), model.create_u()
     modes, prior = petsc.number_modes(few.create_q(), problems.STD), few.create_q()
@@ -229,17 +229,17 @@ def refusals(domain, folder):
         "no checkpoint": lambda: petsc.load_state(folder / "none.json", few),
         "another model": lambda: petsc.load_state(folder / "small.json", model),
     }
-    found = {}
+    messages = {}
     for name, attempt in attempts.items():
         try:
             attempt()
         except LivepdeError as error:
-            found[name] = f"{type(error).__name__}: {error}"
-    return found
+            messages[name] = f"{type(error).__name__}: {error}"
+    return messages
 
 
 def opened(domain):
-    """Residual of the state's equation after a step without damping, with a Robin boundary."""
+    """Return the state residual after a step without damping, with a nonlinear Robin boundary."""
     V = space(domain)
     model = petsc.DolfinxModel(
         V,
@@ -258,7 +258,7 @@ def opened(domain):
 
 
 def failures(domain):
-    """Status of steps that have no solution; nothing moves meanwhile."""
+    """Return the status of a step without a solution, which must not change the state."""
     V = space(domain)
     model = petsc.DolfinxModel(
         V, [1.0], lambda u, q, v, x, t: q[0] * ufl.sqrt(u - 10.0) * v, sensors=problems.POINTS
@@ -271,7 +271,7 @@ def failures(domain):
 
 
 def robust(domain):
-    """Gate and bounds of the filter: an outlier is refused, and an estimate stays within."""
+    """Run the filter with outliers and bounds; return used readings and estimates in bounds."""
     model = numbers(domain)
     modes = petsc.number_modes(model.create_q(), problems.STD)
     prior, start = model.parameter(problems.PRIOR), model.interpolate(lambda x: 2.0)

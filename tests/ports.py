@@ -1,12 +1,12 @@
-"""Ports of one's own."""
+"""Reserved ports for test servers."""
 
 import socket
 
 
 def kept_port() -> tuple[socket.socket, int]:
-    """Return a port that no other program is given, and the socket that keeps it.
+    """Return a socket that reserves a free port against other programs, and the port.
 
-    Who asks for this port may listen there, and again after a restart: the socket itself does not.
+    The socket does not listen, so a server can listen on this port, also after a restart.
     """
     kept = socket.socket()
     kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
