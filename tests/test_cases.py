@@ -1,4 +1,4 @@
-"""Case files: what they may say, what is refused, and the shipped ones on real measurements."""
+"""Case files: valid contents, refused contents, and the shipped cases on measured data."""
 
 import dataclasses
 import re
@@ -28,7 +28,7 @@ SHIPPED = Path(__file__).resolve().parents[1] / "cases"
 
 @pytest.fixture
 def rod(tmp_path):
-    """Return (edit the template's text) -> path of a case."""
+    """Return a function that edits the template and returns the path of the case."""
     case = short_rod(tmp_path / "rod", 91)
 
     def edited(*changes: tuple[str, str]) -> Path:
@@ -70,18 +70,18 @@ def result_of(path, **options):
     ],
 )
 @pytest.mark.slow
-def test_quantities(value, unit, expected):
+def test_quantities_are_parsed_with_their_units(value, unit, expected):
     assert convert(value, unit, "key") == pytest.approx(expected, rel=1e-9)
 
 
-def test_decibels_are_no_unit_of_a_case():
+def test_decibels_are_refused_as_a_unit():
     with pytest.raises(
         lp.errors.CaseError, match="here: 'dB' has no linear scale; expected no unit"
     ):
         convert("3 dB", "", "here")
 
 
-def test_deviations_of_temperatures_are_differences():
+def test_standard_deviations_of_temperatures_are_differences():
     assert convert("0.1 K", "degC", "key", difference=True) == pytest.approx(0.1)
     assert convert("0.9 degF", "degC", "key", difference=True) == pytest.approx(0.5)
     assert convert("0.1 degC", "degC", "key", difference=True) == 0.1
@@ -106,7 +106,7 @@ def test_pint_is_loaded_only_for_a_case():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-# --- what a case may say ---------------------------------------------------------------------
+# --- valid cases -----------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -128,7 +128,7 @@ def test_template_runs_and_finds_the_truth(tmp_path):
 
 
 @pytest.mark.slow
-def test_sensors_that_one_cell_does_not_tell_apart_are_named(rod):
+def test_sensors_within_one_cell_are_named(rod):
     def noted(cells: int, places: tuple[str, str, str]) -> bool:
         at = {f"channels.T_{k}.at": x for k, x in zip((10, 20, 30), places, strict=True)}
         notes = cases.load(rod(), settings={**at, "mesh.cells": cells}).notes
@@ -140,7 +140,7 @@ def test_sensors_that_one_cell_does_not_tell_apart_are_named(rod):
     assert not noted(40, ("10 cm", "10.5 cm", "11.5 cm"))
 
 
-def test_template_is_not_written_over(tmp_path):
+def test_the_template_does_not_overwrite_a_case(tmp_path):
     write_template(tmp_path)
     (tmp_path / "case.toml").unlink()
     with pytest.raises(lp.errors.RunError, match="Nothing was written"):
@@ -153,7 +153,7 @@ def test_template_is_not_written_over(tmp_path):
 
 @pytest.mark.long
 def test_units_of_columns(rod, tmp_path):
-    """The same data in Fahrenheit, minutes and with other numbers give the same estimate."""
+    """The data in Fahrenheit, minutes and scaled numbers give the estimate of the original data."""
     import pandas as pd
 
     path = rod()
@@ -175,11 +175,11 @@ def test_units_of_columns(rod, tmp_path):
 LAYERS = ("bounds = [", 'regions = { a = [0, "20 cm"], b = ["20 cm", "40 cm"] }\nbounds = [')
 FIELD = ('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', 'field = true\nlength = "20 cm"')
 GRADIENT = ('kind = "sensitivity" ', 'kind = "gradient"\ngain = 1e-12\n#')
-DRIFT = '# drift = "0.1 1/h"'  # a comment of the template, to be replaced by an option of the law
+DRIFT = '# drift = "0.1 1/h"'  # template comment to replace by an option of the law
 
 
 @pytest.mark.slow
-def test_layers_with_priors_of_their_own(rod):
+def test_layers_may_have_separate_priors(rod):
     own = """{ over = ["20 cm", "40 cm"], prior = 0.8, std = "3e-5 m^2/s",
         evolution = { kind = "mean-reverting", time = "1 h" } }"""
     layers = (LAYERS[0], LAYERS[1].replace('["20 cm", "40 cm"]', " ".join(own.split())))
@@ -209,7 +209,7 @@ def test_nodes_move_to_the_ends_of_layers_and_sources(rod, spacing):
     assert int((np.abs(nodes - plain) > 1e-12).sum()) == 3
 
 
-def test_layers_that_end_inside_of_a_cell_get_one_note(rod):
+def test_layers_that_end_inside_a_cell_get_one_note(rod):
     path = rod(LAYERS, (MESH, "nodes = [0, 0.1, 0.19, 0.3, 0.4]\n#"))
     notes = [note for note in cases.load(path).notes if "inside a cell" in note]
     assert notes == [
@@ -242,7 +242,7 @@ T = { role = "sensor", column = "T", at = ["60 cm", "20 cm"], noise = "0.1 K" }
 
 
 def test_a_source_in_a_box_of_a_rectangle_has_its_power(tmp_path):
-    """The power is that of the box, wherever the cells of the mesh end."""
+    """The total power does not depend on where the cells of the mesh end."""
     (tmp_path / "plate.csv").write_text("time,P,T\n0,1,20\n60,1,20\n")
     (path := tmp_path / "case.toml").write_text(HEATED_PLATE)
     case = cases.load(path)
@@ -262,7 +262,7 @@ def test_a_source_in_a_box_of_a_rectangle_has_its_power(tmp_path):
 
 
 @pytest.mark.slow
-def test_field(rod):
+def test_a_case_estimates_a_field(rod):
     prepared, data = result_of(rod(FIELD))
     assert data.attrs["fields"] == "alpha"
     best, worst = preview(prepared, prepared.stream).unknowns
@@ -283,8 +283,8 @@ def test_gradient_law_on_averages(rod):
     assert (data.status == 0).all()
 
 
-def test_gradient_law_that_tunes_itself_refuses_a_diffusivity_from_means():
-    """A rod of 1 m, warmed and cooled at its left end, seen as means over its tenths."""
+def test_the_self_tuning_gradient_law_refuses_a_diffusivity_from_means():
+    """A rod of 1 m, heated and cooled at its left end, is observed as means over its tenths."""
     ends = {"left": lp.Channel("left")}
     rod = lp.models.heat(lp.interval(0, 1, 40), lp.Normal(0.05, std=0.05), ends)
     means = lp.Averages(
@@ -332,7 +332,7 @@ def test_gradient_law_on_points_gets_a_note(rod):
     )
 
 
-def test_gradient_law_has_no_intervals_and_says_which_settings_have(rod):
+def test_gradient_law_has_no_intervals_and_names_settings_that_have(rod):
     path = rod(GRADIENT)
     prepared = cases.load(path).prepare()
     settings = prepared.case.with_intervals
@@ -359,7 +359,7 @@ def test_sensitivity_options(rod):
 
 
 @pytest.mark.slow
-def test_the_level_of_the_noise_is_found(rod):
+def test_the_noise_level_is_estimated(rod):
     path = rod(
         (DRIFT, 'noise = "auto"'), ('kind = "sensitivity"', 'kind = "sensitivity"\ngate = 9')
     )
@@ -493,7 +493,7 @@ def test_a_unit_where_a_function_has_none(rod):
         cases.load(path, allow_code=True)
 
 
-# --- what is refused -------------------------------------------------------------------------
+# --- refused cases ---------------------------------------------------------------------------
 
 MESH = 'from = 0\nto = "40 cm"\ncells = 40'
 REFERENCE = '[reference]\nalpha = "0.97 cm^2/s"\nsource = "made up"\n[expect]'
@@ -506,7 +506,7 @@ expect = { rmse = "<= 1", alpha.error = "<= 0.1" }
 
 [expect]"""
 
-# The mistakes that newcomers make most are in test_input_errors.py.
+# test_input_errors.py has the most common mistakes of new users.
 REFUSED = [
     ("cells = 40", "cels = 40", "no key 'mesh.cels'; did you mean 'cells'?"),
     ("cells = 40", 'cells = "many"', "mesh.cells: got 'many'; expected a whole number"),
@@ -612,7 +612,7 @@ REFUSED = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("old", "new", "named"), REFUSED)
-def test_what_is_refused_gets_one_sentence(rod, old, new, named):
+def test_an_invalid_case_is_refused_with_one_sentence(rod, old, new, named):
     path = rod((old, new))
     with pytest.raises(lp.errors.CaseError) as error:
         cases.load(path)
@@ -634,7 +634,7 @@ REFUSED_WITH_DATA = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("old", "new", "named"), REFUSED_WITH_DATA)
-def test_what_is_refused_with_data(rod, old, new, named):
+def test_invalid_data_are_refused_with_one_sentence(rod, old, new, named):
     case = cases.load(rod((old, new)))
     with pytest.raises(lp.LivepdeError) as error:
         case.prepare()
@@ -723,7 +723,7 @@ def test_borehole_needs_its_options_and_input(tmp_path):
         assert named in str(error.value)
 
 
-# --- meshes, regions, and unknowns that move or stay positive ---------------------------------
+# --- meshes, regions, and time-varying or positive unknowns -----------------------------------
 
 
 def test_nodes(rod):
@@ -775,7 +775,7 @@ def test_regions_of_a_rectangle(tmp_path, regions, named):
         ('kind = "periodic", period = "1 day", harmonics = 2', lp.fem.Periodic(86400.0, 2)),
     ],
 )
-def test_unknowns_that_move(rod, evolution, expected):
+def test_unknowns_may_vary_in_time(rod, evolution, expected):
     path = rod(("bounds = [", f"evolution = {{ {evolution} }} #"))
     unknown = cases.load(path).model.parameter_space.unknowns["alpha"]
     assert type(unknown.evolution) is type(expected)
@@ -784,7 +784,7 @@ def test_unknowns_that_move(rod, evolution, expected):
     assert 0 < preview(prepared, prepared.stream).unknowns[0].left < 1
 
 
-def test_numbers_are_in_the_unit_that_an_unknown_states(rod):
+def test_plain_numbers_have_the_unit_of_the_unknown(rod):
     numbers = {"unit": "cm^2/s", "prior": 0.5, "std": 0.3, "bounds": [0.01, 10.0]}
     numbers["evolution"] = {"kind": "random-walk", "rate": 0.01}
     case = cases.load(rod(), settings={"unknowns.alpha": numbers, "reference.alpha": 0.97})
@@ -805,7 +805,7 @@ def test_positive_unknowns(rod):
     assert case.model.parameter_space.unknowns["alpha"].prior == lp.LogNormal(5e-5, 3e-5)
 
 
-def test_the_initial_state_is_said_once(rod):
+def test_the_initial_state_is_specified_once(rod):
     with pytest.raises(lp.errors.CaseError, match="initial is missing"):
         cases.load(rod(('initial = "interpolate"', ""))).prepare()
 
@@ -826,7 +826,7 @@ def test_families(rod):
 
 
 @pytest.mark.slow
-def test_very_many_sensors_are_one_row(rod):
+def test_very_many_sensors_share_one_table_row(rod):
     old = 'T_20 = { role = "validation", column = "T_20", at = "20 cm" }'
     new = 'W = { role = "validation", column = "T_20{}", each = [0, 0.4, 50] }'
     path = rod(
@@ -913,7 +913,7 @@ def test_means_along_a_line(rod):
 
 
 @pytest.mark.slow
-def test_a_sensor_that_moves(rod):
+def test_a_sensor_may_move(rod):
     import pandas as pd
 
     place = 'where = { role = "position", column = "x_cm", unit = "cm" }\n'
@@ -934,7 +934,7 @@ def test_a_sensor_that_moves(rod):
         cases.load(rod(('follows = "where"', 'follows = "wehre"')))
 
 
-# --- data that a function reads --------------------------------------------------------------
+# --- data from a reader function -------------------------------------------------------------
 
 READER = """
 import numpy as np
@@ -956,7 +956,7 @@ def with_reader(rod, body: str, *changes: tuple[str, str]) -> Path:
 
 
 @pytest.mark.long
-def test_reader_gives_what_the_file_gives(rod, monkeypatch):
+def test_a_reader_function_gives_the_estimates_of_the_file(rod, monkeypatch):
     _, first = result_of(rod())
     path = with_reader(rod, READER)
     monkeypatch.setenv("LIVEPDE_DATA", str(path.parent))
@@ -980,7 +980,7 @@ def test_reader_gives_what_the_file_gives(rod, monkeypatch):
         ("frame[key] + noise * rng", "['a'] * 91 or rng", "must contain numbers only"),
     ],
 )
-def test_readers_that_fail(rod, monkeypatch, old, new, named):
+def test_readers_that_fail_are_refused_with_one_sentence(rod, monkeypatch, old, new, named):
     assert old in READER
     path = with_reader(rod, READER.replace(old, new))
     monkeypatch.setenv("LIVEPDE_DATA", str(path.parent))
@@ -1031,7 +1031,7 @@ def test_text_for_a_bare_function(rod):
     cases.load(path, allow_code=True)
 
 
-# --- values set from outside -----------------------------------------------------------------
+# --- settings that override a case -----------------------------------------------------------
 
 
 def test_settings(rod):
@@ -1056,7 +1056,7 @@ def test_tables_are_set_key_by_key(rod):
     assert case.law.refit == lp.Refit(start=16)
 
 
-def test_keys_are_taken_away(rod):
+def test_settings_without_a_value_remove_keys(rod):
     path = rod()
     assert cases.load(path).expected
     taken = cases.load(path, settings=parse(["expect=", "channels.T_20=", "steps.dt_max="]))
@@ -1152,7 +1152,7 @@ def test_soil_by_layer(tmp_path):
     found = measures(data)
     assert found["rmse"] <= 0.25
     assert found["rmse.validation"] <= 0.25
-    # Layers as batch fits of amplitude and phase have them, within the deviations reported.
+    # Layers agree with batch fits of amplitude and phase within the reported standard deviations.
     for layer, fit in (("05-10", 4.1e-7), ("10-20", 5.4e-7), ("20-30", 8.1e-7), ("30-40", 7.7e-7)):
         name = f"alpha[{layer}]"
         assert abs(found[name] - fit) <= 4 * found[f"{name}.std"]
@@ -1172,7 +1172,7 @@ def test_thermal_response_does_not_depend_on_the_prior(tmp_path):
         assert abs(found["k"] - 2.88) <= 2 * found["k.std"]  # measured independently
         assert 0.05 < found["k.std"] < 0.3
         early = data.innovation.values[data.time.values < prepared.assimilate_from]
-        assert np.sqrt(np.nanmean(early**2)) > 5 * found["rmse"]  # the model is wrong there
+        assert np.sqrt(np.nanmean(early**2)) > 5 * found["rmse"]  # early, the model is wrong
     assert max(ends) - min(ends) <= 0.05
 
 
@@ -1182,7 +1182,7 @@ def test_a_misspelt_expectation(rod):
 
 
 def test_units_of_many_cases_are_those_of_pint():
-    """The table that spares its registry says what it would say."""
+    """The table that avoids loading Pint's registry agrees with the registry."""
     from livepde import units
 
     registry = units.pint_registry()
@@ -1215,7 +1215,7 @@ def test_the_column_of_times_is_time_unless_another_is_named(rod):
 
 
 def test_sensors_are_named_in_the_order_of_an_innovation(tmp_path):
-    """Else metrics and the table of predictions give the numbers of one sensor to another."""
+    """Otherwise metrics and the table of predictions would mix up the sensors."""
     mean = "channels.mean={ role='sensor', column='T_20', over=[0.1, 0.2], noise='0.05 K' }"
     last = "channels.T_21={ role='sensor', column='T_20', at='20 cm', noise='0.05 K' }"
     settings = parse(["channels.T_20=", mean, last])

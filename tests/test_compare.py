@@ -1,4 +1,4 @@
-"""`livepde compare`: variants of a case side by side, and the one that is recommended."""
+"""`livepde compare` runs variants of a case, ranks them and recommends one."""
 
 import json
 import math
@@ -34,7 +34,7 @@ FREED = "offset: channels.T_10.offset='1 K'"
 
 @pytest.fixture
 def biased(tmp_path, monkeypatch):
-    """Return the case of `livepde init` whose sensor T_10 reads too much."""
+    """Provide the case of `livepde init` with an offset of sensor T_10."""
     monkeypatch.chdir(tmp_path)
     path = short_rod(tmp_path / "rod", 41)
     table = pd.read_csv(path.parent / "rod.csv")
@@ -47,8 +47,8 @@ def biased(tmp_path, monkeypatch):
 
 
 @pytest.mark.long
-def test_the_variant_that_frees_the_fault_is_recommended_and_written(biased):
-    # The second is no case, the third leaves readings out, the fourth is refuted.
+def test_the_variant_that_estimates_the_fault_is_recommended_and_written(biased):
+    # The second is not a valid case, the third omits readings, the fourth is refuted.
     given = [FREED, "far: channels.T_10.at='9 m'", "channels.T_10.role=ignored"]
     options = [part for text in given for part in ("--variant", text)]
     written = biased.parent / "better.toml"
@@ -68,7 +68,7 @@ def test_the_variant_that_frees_the_fault_is_recommended_and_written(biased):
     assert found["far"]["level"] == "failed"
     assert "lies outside" in found["far"]["error"]
     rows = {row[0]: row for row in content["tables"][0]["rows"]}
-    assert rows["channels.T_10.role=ignored"][2] == "–"  # other readings count
+    assert rows["channels.T_10.role=ignored"][2] == "–"  # its evidence is from other readings
     assert any("counts other readings" in note for note in content["notes"])
     # The better case is the case with this key, comments included, and it runs as the variant did.
     lines = set(biased.read_text().splitlines())
@@ -82,7 +82,7 @@ def test_the_variant_that_frees_the_fault_is_recommended_and_written(biased):
 def test_the_program_finds_the_fault_from_a_case_and_from_a_run(biased):
     code, output = call("run", biased, "--out", "run")
     assert code == 0, output
-    assert "Add --data FILE" in bad("compare", "run")  # the copy in its directory knows no table
+    assert "Add --data FILE" in bad("compare", "run")  # the copied case has no table
     data = ["--data", biased.parent / "rod.csv"]
     for what in ([biased], ["run", *data]):
         code, output = call("compare", *what, "--json", "--most", "4")
@@ -115,7 +115,7 @@ def test_variants_in_processes_are_those_of_this_process(biased):
 
 
 @pytest.mark.slow
-def test_a_case_that_is_recommended_itself_is_not_written_again(tmp_path):
+def test_a_recommended_original_case_is_not_written_again(tmp_path):
     path = short_rod(tmp_path, 31)
     written = tmp_path / "better.toml"
     options = ["--variant", "offset: channels.T_10.offset='1 K'", "--jobs", "1"]
@@ -125,7 +125,7 @@ def test_a_case_that_is_recommended_itself_is_not_written_again(tmp_path):
     assert not written.exists()
 
 
-def test_what_cannot_be_compared_or_written_is_refused_before_a_run(biased, tmp_path):
+def test_invalid_comparisons_and_outputs_are_refused_before_a_run(biased, tmp_path):
     assert "expected 'name: key=value" in bad("compare", biased, "--variant", "offset:")
     assert "is the case itself" in bad("compare", biased, "--write", biased, "--force")
     assert "--force" in bad("compare", biased, "--write", biased)
@@ -186,7 +186,7 @@ def test_the_best_evidence_counts_unless_validation_sensors_are_predicted_worse(
     assert "evidence of 'other' is missing or counts other readings" in notes
 
 
-def test_a_variant_whose_fit_fails_is_not_recommended_beside_one_that_fits():
+def test_a_variant_whose_fit_fails_is_not_recommended():
     errors = ModelErrors(9.0, 0.5, {"a": 9.0}, ())
     failed = Verdict.of(()).with_errors(errors).to_dict()
     base, good = ended("as stated", 0.0, math.nan), ended("good", 20.0, math.nan)
@@ -245,9 +245,9 @@ def test_an_unknown_that_depends_on_the_variant_is_named():
     assert "All variants agree" in " ".join(
         conclusions(base, [replace(other, estimates={"c": near})])
     )
-    # Without a common unknown there is nothing that agrees.
+    # Without a common unknown there is nothing to agree on.
     assert "agree" not in " ".join(conclusions(base, [replace(other, estimates={})]))
-    # The case itself is one of the variants that may disagree.
+    # The case itself is also a variant that may disagree.
     best = replace(other, log_evidence=50.0)
     assert "its interval in 'as stated' does not" in " ".join(conclusions(base, [best]))
 
@@ -267,7 +267,7 @@ def test_a_case_without_evidence_recommends_nothing_and_names_failures():
     assert "failed: 'typo'" in notes
 
 
-def test_an_interval_that_is_not_known_refutes_nothing():
+def test_an_unknown_interval_refutes_nothing():
     unknown = LastEstimate(1.0, math.nan, math.nan, math.nan)
     assert unknown.overlaps(unknown)
     content = ended("gradient", math.nan, 1.0, estimates={"k": unknown}).to_dict()
@@ -335,7 +335,7 @@ def test_a_setting_of_a_sensor_writes_its_family_as_single_channels(tmp_path):
     cause = Cause("offset", "10", "", size=0.5)
     verdict = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=(cause,))])
     (found,) = with_settings(cases.load(path).prepare(), verdict).findings[0].causes
-    assert found.remedy == estimating("offset", "T", '"1 K"')  # the table that the case has
+    assert found.remedy == estimating("offset", "T", '"1 K"')  # the existing table of the case
     settings = parse([found.setting, "channels.30.column=T_20"])
     case = cases.load(path, settings=settings)
     assert list(case.roles("sensor")) == ["10", "30"]
@@ -376,7 +376,7 @@ def test_the_size_of_a_source_does_not_depend_on_the_unit_of_the_prior(tmp_path)
     assert len(found) == 1
 
 
-def test_a_cause_that_no_setting_frees_says_so(tmp_path):
+def test_a_cause_without_a_setting_says_so(tmp_path):
     prepared = cases.load(short_rod(tmp_path)).prepare()
     lag = Cause("lag", "T_10", "it is late", remedy="Check the clock.")
     there = Cause("flux", "right", "a flux is missing", size=1.0)  # the boundary has a value
@@ -408,8 +408,8 @@ def test_a_column_is_not_read_in_the_unit_of_another_quantity(tmp_path, unit, th
     assert freed(prepared, Cause("unit", "T_10", "", setting=setting)) == (setting,) * there
 
 
-def test_exchanged_columns_are_exchanged_by_settings(tmp_path):
-    """The law names channels; their columns have other names."""
+def test_settings_swap_exchanged_columns(tmp_path):
+    """The law reports names of channels, which differ from the names of their columns."""
     path = short_rod(tmp_path)
     named = path.read_text().replace("T_10 = {", "first = {", 1)
     path.write_text(named)
@@ -497,7 +497,7 @@ def test_every_proposed_variant_is_a_case(tmp_path, equation):
 def heated(
     h: float = 1e-12, upper: float = 2e-5, switched: float = 0.0, step: float = 10.0
 ) -> pd.DataFrame:
-    """Return readings of a rod with side loss: finite volumes and the trapezoidal rule.
+    """Return readings of a rod with side loss, by finite volumes and the trapezoidal rule.
 
     The left end is driven, the surroundings are at `ambient`. `h`: heat transfer at the right end.
     `upper`: diffusivity beyond 10 cm. `switched`: source from 1200 s on.
@@ -550,7 +550,7 @@ T_25 = { column = "T_25", role = "sensor", at = "25 cm", noise = "0.05 K" }
 
 
 @pytest.mark.slow
-def test_an_exchange_that_the_case_lacks_is_named_and_found(tmp_path):
+def test_a_missing_heat_exchange_is_named_and_estimated(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(HEATED)
     heated(h=2e-5, step=20.0).to_csv(tmp_path / "rod.csv", index=False)
@@ -583,7 +583,7 @@ def test_an_exchange_that_the_case_lacks_is_named_and_found(tmp_path):
     ],
 )
 def test_a_layer_for_each_sensor_and_a_source_that_jumps_are_tried(tmp_path, name, error, truth):
-    """Halfway between the sensors lies the border of the layers, and not in the middle of all."""
+    """The layers meet halfway between the sensors, not in the middle of the domain."""
     path = tmp_path / "case.toml"
     path.write_text(HEATED)
     heated(**error).to_csv(tmp_path / "rod.csv", index=False)
@@ -678,7 +678,7 @@ def test_estimates_of_a_recommended_variant_that_is_not_trusted_are_not_to_be_us
     assert "Do not use" not in " ".join(conclusions(base, [unjudged]))
 
 
-def test_a_variant_without_an_unknown_lacks_what_is_read_for_it_alone(tmp_path):
+def test_a_variant_without_an_unknown_omits_its_inputs(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text(HEATED)
     heated().iloc[:5].to_csv(tmp_path / "rod.csv", index=False)
@@ -691,8 +691,8 @@ def test_a_variant_without_an_unknown_lacks_what_is_read_for_it_alone(tmp_path):
     assert not run_variant(path, (), variants["no loss"]).error
 
 
-def test_a_variant_has_no_reference_for_numbers_that_it_lacks(tmp_path):
-    """With a published value of alpha, or of loss, those without such a number failed."""
+def test_a_variant_has_no_reference_for_unknowns_that_it_lacks(tmp_path):
+    """Variants without such a number failed if the case had a published value of it."""
     path = tmp_path / "case.toml"
     path.write_text(f'{HEATED}\n[reference]\nalpha = "1e-5 m^2/s"\nloss = "1e-4 1/s"\n')
     heated().iloc[:5].to_csv(tmp_path / "rod.csv", index=False)
@@ -702,8 +702,8 @@ def test_a_variant_has_no_reference_for_numbers_that_it_lacks(tmp_path):
         assert not run_variant(path, (), variants[name]).error
 
 
-def test_no_variant_lacks_what_the_equation_needs(tmp_path):
-    """Water flows in a stream bed by `v` or by `K`: the only one of them cannot go."""
+def test_no_variant_removes_an_unknown_that_the_equation_needs(tmp_path):
+    """The flow in a stream bed needs `v` or `K`, so no variant removes the only one."""
     path = tmp_path / "case.toml"
     flow = 'v = { prior = "0 m/s", std = "1e-6 m/s" }'
     lines = [one for one in HEATED.splitlines() if not one.startswith(("loss", "ambient"))]
@@ -731,7 +731,7 @@ def test_a_key_that_is_new_among_dotted_keys_has_its_own_line():
         assert once.count("# told\n") == 1
 
 
-# --- what an equation leaves out while a process begins ------------------------------------------
+# --- effects that an equation neglects at the start of a process ---------------------------------
 
 RESPONSE = """
 equation = "borehole"
@@ -795,7 +795,7 @@ def test_a_quantity_is_no_reading_of_the_start(tmp_path):
     prepared = cases.load(tmp_path / "case.toml").prepare()
     assert first_miss(prepared) == 0.0
     assert start_missed(prepared, Verdict("caution", ())) == []
-    # Nor has it a position that could be wrong: `at_std` requires `at`.
+    # It has no position that could be wrong, because `at_std` requires `at`.
     assert stated_positions(prepared.identifier.observed) is None
 
 
@@ -817,7 +817,7 @@ def test_each_variant_has_a_line_in_a_terminal(monkeypatch, capsys):
                     pass
         return capsys.readouterr()
 
-    assert two() == ("", "as stated: 0 s\noffset of [T_10]: 0 s\n")  # no terminal
+    assert two() == ("", "as stated: 0 s\noffset of [T_10]: 0 s\n")  # without a terminal
     monkeypatch.setenv("FORCE_COLOR", "1")
     output, shown = two()
     assert output == ""

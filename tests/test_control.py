@@ -1,4 +1,4 @@
-"""A reduced model is the full one in few coordinates; what a loop does with it, and when it may."""
+"""Reduced models agree with full models; filters, controllers and control loops that use them."""
 
 from dataclasses import replace
 from datetime import datetime, timedelta
@@ -22,7 +22,7 @@ needs_mpc = pytest.mark.skipif(find_spec("do_mpc") is None, reason="do-mpc is no
 
 
 def rod(cells: int = 20, **options: Any) -> lp.Model:
-    """Return a rod that is heated at the left by a flux and cooled at the right by its boundary."""
+    """Return a rod with a heat flux at the left and a cooled boundary at the right."""
     mesh = lp.interval(0.0, 0.15, cells)
     given = {
         "A": lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
@@ -60,7 +60,7 @@ def identifier(**options: Any) -> lp.Identifier:
 
 
 class Plant:
-    """The same rod with another conductivity."""
+    """Simulated rod with a different conductivity."""
 
     def __init__(self, k: float = 26.0) -> None:
         self.model, self.q = rod(), np.log([k])
@@ -94,7 +94,7 @@ def drive(loop: ct.Loop, plant: Plant, count: int) -> list[ct.Action]:
 
 @pytest.mark.parametrize("k", [8.0, 20.0, 50.0])
 def test_one_reduced_model_serves_all_conductivities(k):
-    """Seven coordinates for 21 nodes; the conductivity stays a parameter."""
+    """Seven coordinates replace 21 nodes; the conductivity remains a parameter."""
     model = reduced(modes=2)
     assert model.size <= 8
     assert max(model.error({"k": k}, h=PERIOD).values()) < 0.01
@@ -117,7 +117,7 @@ def test_steady_states_at_the_prior_are_exact():
 
 
 def test_a_boundary_value_may_be_a_control_that_jumps():
-    """Boundary values enter without their derivative."""
+    """Boundary values enter without their time derivative."""
     mesh = lp.interval(0.0, 1.0, 16)
     model = lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"left": lp.Channel("hot"), "right": 1.0}),
@@ -157,7 +157,7 @@ def test_a_boundary_value_may_be_a_control_that_jumps():
         ),
     ],
 )
-def test_what_has_no_reduced_model_is_told(options, says):
+def test_models_without_a_reduced_model_are_refused(options, says):
     with pytest.raises(lp.errors.ModelError, match=says):
         ct.reduce(rod(**options), OUTPUTS, ["heater"])
 
@@ -178,19 +178,19 @@ def test_what_has_no_reduced_model_is_told(options, says):
         ),
     ],
 )
-def test_an_output_that_would_stay_at_the_prior_or_at_zero_is_told(outputs, says):
+def test_an_output_that_would_stay_at_the_prior_or_at_zero_is_refused(outputs, says):
     with pytest.raises(lp.errors.ModelError, match=says):
         ct.reduce(rod(), outputs, ["heater"], sensors=SENSORS)
 
 
-def test_an_output_that_is_not_linear_is_linearised_where_it_is_said():
+def test_a_nonlinear_output_is_linearised_at_the_stated_state():
     radiation = lp.observation.Transformed(lp.Points({"P": 0.1}), function=lambda T: T**4)
     small = ct.reduce(rod(), radiation, ["heater"], sensors=SENSORS, u=300.0)
     y = small.outputs(small.project(np.full(21, 301.0)), np.zeros(2))
     assert y[0] == pytest.approx(300.0**4 + 4 * 300.0**3, rel=1e-6)
 
 
-def test_a_nonlinear_model_is_linearised_where_it_is_said():
+def test_a_nonlinear_model_is_linearised_at_the_stated_state():
     model = rod(B=lambda u, v, x: 1e-5 * u**4 * v)
     small = ct.reduce(model, OUTPUTS, ["heater"], u=100.0)
     moved = small.about(u=model.initial(60.0))
@@ -202,7 +202,7 @@ def test_a_nonlinear_model_is_linearised_where_it_is_said():
 
 
 def warm_conductor() -> lp.Model:
-    """u_t = (D0 (1 + b u) u_x)_x, hot at the left, 0 at the right."""
+    """Return u_t = (D0 (1 + b u) u_x)_x with u = hot at the left and 0 at the right."""
     mesh = lp.interval(0.0, 1.0, 16)
     return lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"left": lp.Channel("hot"), "right": 0.0}),
@@ -212,7 +212,7 @@ def warm_conductor() -> lp.Model:
     )
 
 
-def test_a_nonlinear_model_is_not_linearised_where_nobody_said():
+def test_a_nonlinear_model_requires_a_state_to_linearise_at():
     seen = lp.Points({"middle": 0.5})
     with pytest.raises(lp.errors.ConfigurationError, match="name that with u="):
         ct.reduce(warm_conductor(), seen, ["hot"])
@@ -220,8 +220,8 @@ def test_a_nonlinear_model_is_not_linearised_where_nobody_said():
         ct.reduce(warm_conductor(), seen, ["hot"], u=0.0)
 
 
-def test_a_nonlinear_model_responds_as_its_exact_steady_state():
-    """u + b u^2/2 is linear in x in a steady state, so that its derivatives are known."""
+def test_a_linearised_model_has_the_response_of_the_exact_steady_state():
+    """In a steady state u + b u^2/2 is linear in x, which gives exact derivatives."""
     b, hot = 0.5, 1.0
 
     def steady(x: Any) -> Any:
@@ -244,7 +244,7 @@ def test_a_nonlinear_model_responds_as_its_exact_steady_state():
 
 
 def test_the_error_is_relative_to_the_largest_response_to_any_control():
-    """In five seconds a weak heater does not reach the tip; the room does."""
+    """Within five seconds a weak heater does not affect the tip, but the room temperature does."""
     sources = [
         lambda x, _: 2000.0 * x.inputs["room"],
         lp.On("left", lambda x, _: 0.06 * x.inputs["heater"]),
@@ -315,7 +315,7 @@ def reduction(**options: Any) -> ct.ReducedModel:
         ),
     ],
 )
-def test_what_makes_no_sense_is_told(build, says):
+def test_invalid_arguments_are_refused(build, says):
     with pytest.raises(lp.errors.ConfigurationError, match=says):
         build()
 
@@ -330,7 +330,7 @@ def test_what_makes_no_sense_is_told(build, says):
         ({"period": 0.0}, "period must be a positive number"),
     ],
 )
-def test_settings_of_mpc_that_make_no_sense_are_told(options, says):
+def test_invalid_settings_of_mpc_are_refused(options, says):
     with pytest.raises(lp.errors.ConfigurationError, match=says):
         ct.MPC(reduced(modes=2), GOAL, **{"period": PERIOD, **options})
 
@@ -338,8 +338,8 @@ def test_settings_of_mpc_that_make_no_sense_are_told(options, says):
 # --- filter --------------------------------------------------------------------------------------
 
 
-def test_the_filter_is_kalmans():
-    """Against the recursion of the textbooks, with the gain from the information form."""
+def test_the_filter_equals_the_kalman_filter():
+    """Compare with the textbook recursion, with the gain from the information form."""
     model = reduced(modes=1)
     q, rng = np.array([20.0]), np.random.default_rng(0)
     found = ct.Kalman(model, PERIOD, drive={"heater": 0.1})
@@ -358,7 +358,7 @@ def test_the_filter_is_kalmans():
         np.testing.assert_allclose(known.x, x, rtol=1e-5, atol=1e-4 * np.abs(x).max())
 
 
-def test_a_late_sample_is_stepped_to_as_long_as_it_took():
+def test_a_late_sample_is_predicted_over_its_whole_interval():
     model, inputs = reduced(modes=1), {"heater": 0.3, "room": ROOM}
     nothing, ends = np.full(2, np.nan), []
     for times in ([0.0, 60.0, 120.0, 180.0], [0.0, 180.0]):
@@ -370,7 +370,7 @@ def test_a_late_sample_is_stepped_to_as_long_as_it_took():
 
 
 def test_readings_with_their_noise_have_the_same_effect_in_each_form():
-    """By names, the identifier took such a sample, and the filter beside it refused it."""
+    """The identifier once accepted such samples by name, while the filter refused them."""
     inputs, (one, two) = {"heater": 0.3, "room": ROOM}, SENSORS.names(2)
     forms = [
         lambda a, b: [[a, 0.5], [b, np.nan]],
@@ -425,10 +425,10 @@ def z_of(model: ct.ReducedModel, x: Any) -> float:
 def optimum(
     model: ct.ReducedModel, goal: ct.Goal, x: Any, q: Any, before: float, count: int
 ) -> float:
-    """Return the first of the moves that cost least, without bounds, by one least-squares fit."""
+    """Return the first of the optimal moves without bounds, by one least-squares fit."""
     step, rows, targets = model.matrices(q, PERIOD), [], []
     C, weight = model.outputs.C[1], np.sqrt(goal.move["heater"])
-    changes = np.tri(count)  # of the changes to the values
+    changes = np.tri(count)  # maps changes to values
 
     def tip(values: Any) -> Any:
         seen, at = [], x
@@ -467,7 +467,7 @@ def test_the_linear_quadratic_controller_is_optimal():
     assert abs(expected - 0.2) > 0.02
 
 
-def test_a_state_that_is_lost_holds_the_inputs():
+def test_a_state_that_is_not_finite_holds_the_inputs():
     model = reduced()
     controller = ct.LQ(model, GOAL, PERIOD)
     lost = replace(known(model), x=np.full(model.size, np.nan))
@@ -487,8 +487,8 @@ def test_the_target_meets_the_reference_or_stays_within_the_range():
         assert tip == pytest.approx(reference) if reference < 100.0 else v[0] == 1.0
 
 
-def test_a_control_does_the_work_of_another_that_is_at_its_end():
-    """The best steady state within the ranges, found by trying all of them."""
+def test_a_control_replaces_another_control_at_its_bound():
+    """Compare with the best steady state within the ranges, from an exhaustive search."""
     sources = [
         lambda x, _: 2000.0 * x.inputs["room"],
         lp.On("left", lambda x, _: 60e3 * x.inputs["heater"]),
@@ -518,7 +518,7 @@ def test_a_control_does_the_work_of_another_that_is_at_its_end():
 
 @pytest.mark.slow
 @needs_mpc
-def test_the_predictive_controller_is_optimal_where_nothing_binds():
+def test_the_predictive_controller_is_optimal_without_active_bounds():
     model = reduced(modes=2)
     controller = ct.MPC(
         model, replace(GOAL, inputs={"heater": (-9.0, 9.0)}), PERIOD, horizon=25, kappa=0.0
@@ -531,8 +531,8 @@ def test_the_predictive_controller_is_optimal_where_nothing_binds():
 
 @pytest.mark.slow
 @needs_mpc
-def test_limits_are_kept_for_all_that_the_conductivity_may_be():
-    """The less is known, the more cautious; where nothing is possible it does its best."""
+def test_limits_are_kept_for_all_likely_conductivities():
+    """A larger uncertainty makes the controller more cautious; infeasible limits are relaxed."""
     model = reduced(modes=2)
     limited = replace(GOAL, limits={"face": (-np.inf, 75.0)}, move={"heater": 1.0})
     controller = ct.MPC(model, limited, PERIOD, horizon=10)
@@ -555,8 +555,8 @@ def test_limits_are_kept_for_all_that_the_conductivity_may_be():
 
 @pytest.mark.slow
 @needs_mpc
-def test_scenarios_stay_where_the_model_makes_sense():
-    """Two deviations of 30 below a conductivity of 20 are none."""
+def test_scenarios_have_positive_conductivities():
+    """Two standard deviations of 30 below 20 would be a negative conductivity."""
     model = reduced(modes=2)
     controller = ct.MPC(model, GOAL, PERIOD, horizon=5)
     found = controller.decide(known(model, 30.0), plan(5), np.array([0.2]), controller.start())
@@ -568,8 +568,8 @@ def test_scenarios_stay_where_the_model_makes_sense():
 
 @pytest.mark.slow
 @needs_mpc
-def test_scenarios_are_deviations_of_what_is_gaussian():
-    """Of the logarithm: 12 in 20 are a factor of exp(0.6)."""
+def test_scenarios_are_deviations_of_the_gaussian_coordinate():
+    """For the logarithm, a standard deviation of 12 at 20 is a factor of exp(0.6)."""
     model = reduced(modes=2)
     controller = ct.MPC(model, GOAL, PERIOD, horizon=5)
     controller.decide(known(model, 12.0), plan(5), np.array([0.2]), controller.start())
@@ -581,7 +581,7 @@ def test_scenarios_are_deviations_of_what_is_gaussian():
 
 @pytest.mark.slow
 @needs_mpc
-def test_a_search_that_fails_holds_the_inputs_and_says_so():
+def test_a_failed_optimisation_holds_the_inputs_and_reports_it():
     model = reduced(modes=2)
     controller = ct.MPC(model, GOAL, PERIOD, horizon=5)
     lost = replace(known(model), x=np.full(model.size, np.nan))
@@ -593,7 +593,7 @@ def test_a_search_that_fails_holds_the_inputs_and_says_so():
     assert again.status == "ok"
 
 
-def test_do_mpc_that_is_missing_is_told(monkeypatch):
+def test_a_missing_do_mpc_is_reported(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "do_mpc", None)
     with pytest.raises(lp.errors.ConfigurationError, match=r"pip install 'livepde\[control\]'"):
         ct.MPC(reduced(), GOAL, PERIOD)
@@ -602,8 +602,8 @@ def test_do_mpc_that_is_missing_is_told(monkeypatch):
 # --- trust ---------------------------------------------------------------------------------------
 
 
-def told(**changes: Any) -> Any:
-    """Return an estimate as trust looks at it."""
+def estimate_for_trust(**changes: Any) -> Any:
+    """Return an estimate with the attributes that `Trust` reads."""
     given = {
         "status": lp.laws.Status(),
         "diagnostics": lp.laws.Diagnostics(innovation_ratio=1.2),
@@ -629,7 +629,7 @@ def told(**changes: Any) -> Any:
         ({"q_std": None}, "no covariance"),
         ({"q": np.array([0.0]), "q_std": np.array([0.0])}, "lies at its bound"),
         ({"verdict": Verdict.of([Finding("flat", "caution", "f")])}, ""),
-        ({"verdict": Verdict.unjudged()}, ""),  # of few samples the innovations are a test
+        ({"verdict": Verdict.unjudged()}, ""),  # with few samples, the innovations are the test
         (
             {"verdict": Verdict.unjudged(), "diagnostics": lp.laws.Diagnostics()},
             "Not judged: the model was not tested",
@@ -637,13 +637,13 @@ def told(**changes: Any) -> Any:
     ],
 )
 def test_an_estimate_is_trusted_only_where_all_tests_pass(changes, says):
-    doubt = ct.Trust().doubt(told(**changes), reduced())
+    doubt = ct.Trust().doubt(estimate_for_trust(**changes), reduced())
     assert says in doubt
     assert bool(doubt) == bool(says)
 
 
-def test_what_may_be_negative_is_measured_by_its_prior():
-    """A source of 0.01, known to 0.1, is known, where it might have been 1."""
+def test_the_uncertainty_of_a_signed_unknown_is_relative_to_its_prior():
+    """A source of 0.01 ± 0.1 is well determined if its prior standard deviation is 1."""
     mesh = lp.interval(0.0, 1.0, 8)
     model = lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"left": lp.Channel("hot")}),
@@ -653,7 +653,7 @@ def test_what_may_be_negative_is_measured_by_its_prior():
     )
     small = ct.reduce(model, lp.Points({"middle": 0.5}), ["hot"])
     for std, doubt in ((0.1, ""), (0.4, "s = 0.01 is known to 0.4 only")):
-        estimate = told(q=np.array([0.01]), q_std=np.array([std]))
+        estimate = estimate_for_trust(q=np.array([0.01]), q_std=np.array([std]))
         assert ct.Trust().doubt(estimate, small) == doubt
 
 
@@ -670,7 +670,7 @@ def test_without_trust_the_loop_acts_as_the_nominal_model_would():
 
 
 @pytest.mark.slow
-def test_what_is_learned_is_used_after_some_good_samples():
+def test_estimates_are_used_after_some_good_samples():
     loop = ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD), ct.Trust(patience=4))
     found = drive(loop, Plant(), 60)
     first = [a.source for a in found].index("estimate")
@@ -686,7 +686,7 @@ def test_what_is_learned_is_used_after_some_good_samples():
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["LQ", pytest.param("MPC", marks=needs_mpc)])
-def test_a_loop_goes_on_where_it_was_saved(kind, tmp_path):
+def test_a_loop_resumes_from_its_saved_state(kind, tmp_path):
     def loop() -> ct.Loop:
         model = reduced(modes=2)
         controller = (
@@ -710,7 +710,7 @@ def test_a_loop_goes_on_where_it_was_saved(kind, tmp_path):
         smaller.load(tmp_path / "loop")
 
 
-def test_what_was_really_applied_counts():
+def test_the_loop_uses_the_inputs_that_were_really_applied():
     model = reduced()
     loop = ct.Loop(ct.Kalman(model, PERIOD, drive={"heater": 1e-6}), ct.LQ(model, GOAL, PERIOD))
     first = loop.step(0.0, [ROOM, ROOM], {"room": ROOM}, reference={"tip": 45.0})
@@ -720,8 +720,8 @@ def test_what_was_really_applied_counts():
 
 
 @pytest.mark.slow
-def test_what_is_not_a_number_is_missing():
-    """A disturbance holds its last value, a control what was asked for."""
+def test_an_input_that_is_not_a_number_is_missing():
+    """A missing disturbance keeps its last value, a missing control its requested value."""
     ends = []
     for later in ({}, {"room": np.nan, "heater": np.nan}):
         loop = ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD))
@@ -735,8 +735,8 @@ def test_what_is_not_a_number_is_missing():
 
 
 @pytest.mark.slow
-def test_inputs_may_stand_among_the_measurements():
-    """As for an identifier; those that are given apart go first."""
+def test_inputs_may_be_among_the_measurements():
+    """As for an identifier; inputs passed separately take precedence."""
     ends = []
     for z, given in (
         ([21.0, 20.0], {"room": 5.0}),
@@ -752,7 +752,7 @@ def test_inputs_may_stand_among_the_measurements():
 
 
 class Own:
-    """A controller of a user's own: it returns, or raises, what it is told."""
+    """Custom controller that returns or raises a given object."""
 
     model, goal, period, horizon = reduced(modes=1), GOAL, PERIOD, 1
 
@@ -777,7 +777,7 @@ class Own:
         ([7.0], 0.3, 1.0, "beyond its range"),
     ],
 )
-def test_a_loop_lets_through_what_actuators_can_do(answer, applied, set_to, says):
+def test_a_loop_applies_only_actions_that_actuators_allow(answer, applied, set_to, says):
     loop = ct.Loop(identifier(), Own(answer))
     given = {"room": ROOM, "heater": applied}
     action = loop.step(0.0, [ROOM] * 2, given, reference={"tip": 45.0})
@@ -785,7 +785,7 @@ def test_a_loop_lets_through_what_actuators_can_do(answer, applied, set_to, says
     assert says in action.status
 
 
-def test_a_memory_that_is_not_finite_is_not_kept():
+def test_a_controller_state_that_is_not_finite_is_discarded():
     seen = []
 
     class Remembers(Own):
@@ -804,7 +804,7 @@ def test_a_memory_that_is_not_finite_is_not_kept():
 
 
 @pytest.mark.slow
-def test_a_row_of_a_pandas_table_counts_by_name_for_all_of_a_loop():
+def test_a_row_of_a_pandas_table_is_read_by_name():
     import pandas as pd
 
     loops = [ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD)) for _ in range(2)]
@@ -819,7 +819,7 @@ def test_a_row_of_a_pandas_table_counts_by_name_for_all_of_a_loop():
 
 
 def test_times_of_a_loop_may_be_dates():
-    """As those of its identifier; a filter alone has no unit for them."""
+    """Dates work as for the identifier; a filter without an identifier has no unit for them."""
     begin, known = datetime(2025, 3, 1, 12), []
     for dated in (False, True):
         loop = ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD))
@@ -834,7 +834,7 @@ def test_times_of_a_loop_may_be_dates():
         alone.step(begin, [21.0, 20.0], {"room": ROOM}, reference={"tip": 45.0})
 
 
-def test_a_controller_that_raises_leaves_a_loop_that_goes_on():
+def test_a_loop_continues_after_a_controller_raises():
     loop = ct.Loop(identifier(), Own(ZeroDivisionError("bang")))
     with pytest.raises(ZeroDivisionError, match="bang"):
         loop.step(0.0, [ROOM] * 2, {"room": ROOM, "heater": 0.3}, reference={"tip": 45.0})
@@ -863,7 +863,7 @@ def test_a_sample_that_is_refused_changes_nothing():
     assert mine.estimate.u.tolist() == theirs.estimate.u.tolist()
 
 
-def test_a_reduced_model_of_another_process_is_told():
+def test_a_reduced_model_of_another_process_is_refused():
     swapped = lp.Points({"T_10": 0.10, "T_5": 0.05}, noise=0.2)
     other = ct.reduce(rod(), OUTPUTS, ["heater"], sensors=swapped, u=ROOM)
     with pytest.raises(lp.errors.ConfigurationError, match="the identifier has the sensors"):
@@ -881,7 +881,7 @@ def test_a_loop_of_another_estimator_is_not_loaded(tmp_path):
 
 
 def test_a_limit_that_the_goal_does_not_have_is_not_dropped():
-    """The controller is built with the goal's: it would not know it."""
+    """The controller is built with the limits of the goal, so it could not use another limit."""
     limited = replace(GOAL, limits={"face": (-np.inf, 75.0)})
     loop = ct.Loop(identifier(), ct.LQ(reduced(), limited, PERIOD))
     step = {"z": [ROOM] * 2, "inputs": {"room": ROOM}, "reference": {"tip": 45.0}}
@@ -926,8 +926,8 @@ def test_references_and_forecasts_are_checked():
 
 
 @pytest.mark.slow
-def test_inputs_that_are_held_do_not_ramp():
-    """Several substeps see what the sample brings, as many samples with the same input would."""
+def test_held_inputs_do_not_ramp():
+    """Several substeps use the input of the sample, as samples with a constant input would."""
     nothing, ends = np.full(2, np.nan), []
     for between, parts in (("next", 1), ("line", 1), ("next", 4)):
         one = identifier(

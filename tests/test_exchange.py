@@ -1,4 +1,4 @@
-"""Units for other programs (FMI), and online learners: the numbers are those of the identifier."""
+"""FMI units for other programs and online learners give the numbers of the identifier."""
 
 import copy
 import json
@@ -57,7 +57,7 @@ def other():
 
 @pytest.fixture(scope="module")
 def rod(tmp_path_factory):
-    """The case of `livepde init`: a rod with two sensors, 61 samples."""
+    """Provide the case of `livepde init`, a rod with two sensors and 61 samples."""
     return short_rod(tmp_path_factory.mktemp("rod"))
 
 
@@ -100,14 +100,14 @@ def test_the_unit_gives_the_numbers_of_the_identifier(rod, unit):
 
 
 @pytest.mark.long
-def test_a_unit_of_another_case_is_found_out(rod, tmp_path):
+def test_a_unit_of_another_case_is_detected(rod, tmp_path):
     other = load(rod, settings={"unknowns.alpha.prior": "6e-5 m^2/s"})
     found = compare_fmu(export_fmu(other, tmp_path / "other.fmu"), load(rod))
     assert found.differences["alpha"] > 1e-3
     assert not found.largest <= 1e-10
 
 
-def test_the_description_says_names_units_and_times(unit):
+def test_the_description_has_names_units_and_times(unit):
     assert validation.validate_fmu(str(unit)) == []
     description = fmpy.read_model_description(str(unit))
     by_name = {item.name: item for item in description.modelVariables}
@@ -132,7 +132,7 @@ def test_the_description_says_names_units_and_times(unit):
 
 @pytest.mark.long
 def test_a_simulation_runs_the_unit_as_users_do(rod, unit):
-    """FMPy sets the inputs of each communication point, and reads a step later."""
+    """FMPy sets the inputs at each communication point, and reads outputs one step later."""
     prepared = load(rod).prepare()
     samples = list(prepared.stream)
     kinds = [("time", float), *((name, float) for name in INPUTS)]
@@ -173,7 +173,7 @@ def test_the_state_is_kept_serialised_and_restored(unit):
 
 
 @pytest.mark.slow
-def test_a_unit_begins_anew_after_a_reset(unit):
+def test_a_reset_unit_starts_from_the_beginning(unit):
     with running(unit, 0.0) as instance:
         before = [taken(instance, t, z) for t, z in history(4)]
         instance.fmu.reset()
@@ -186,8 +186,8 @@ def test_a_unit_begins_anew_after_a_reset(unit):
 
 
 @pytest.mark.long
-def test_with_a_period_short_steps_are_not_taken_for_measurements(unit):
-    """A master with steps of 6 s, say, while there is a sample every 20 s."""
+def test_with_a_period_short_steps_are_not_measurements(unit):
+    """For example, the master has steps of 6 s and a sample arrives every 20 s."""
     with running(unit, 0.0) as instance:
         assert instance.get(["sample_period"]) == [0.0]
         instance.set(["sample_period"], [20.0])
@@ -214,7 +214,7 @@ def test_with_a_period_short_steps_are_not_taken_for_measurements(unit):
 
 
 @pytest.mark.slow
-def test_a_step_that_takes_no_sample_does_not_use_up_its_period(unit):
+def test_a_step_without_a_sample_does_not_consume_its_period(unit):
     with running(unit, 0.0) as instance:
         instance.set(["sample_period"], [20.0])
         found = []
@@ -222,11 +222,11 @@ def test_a_step_that_takes_no_sample_does_not_use_up_its_period(unit):
             instance.set(INPUTS, [20.0 if k % 2 else math.nan] * 4)
             instance.step(10.0 * k, 10.0)
             found += instance.get(["estimate_time"])
-    assert found[1:] == [10.0, 20.0, 20.0, 40.0, 40.0, 60.0, 60.0]  # at 0 it could not begin
+    assert found[1:] == [10.0, 20.0, 20.0, 40.0, 40.0, 60.0, 60.0]  # the unit could not begin at 0
 
 
 @pytest.mark.slow
-def test_a_function_of_ones_own_waits_for_a_first_sample_too(tmp_path):
+def test_a_custom_function_also_waits_for_a_first_sample(tmp_path):
     (tmp_path / "own.py").write_text(
         "import livepde as lp\n"
         "from livepde.models import heat\n"
@@ -247,7 +247,7 @@ def test_a_function_of_ones_own_waits_for_a_first_sample_too(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_cannot_be_used_is_a_status_and_a_message(unit):
+def test_unusable_inputs_give_a_status_and_a_message(unit):
     (_, z), *others = history(6)
     with running(unit, 0.0) as instance:
         first = taken(instance, 0.0, [math.nan, *z[1:]])
@@ -267,7 +267,7 @@ def test_what_cannot_be_used_is_a_status_and_a_message(unit):
 
 
 @pytest.mark.slow
-def test_a_step_that_fails_is_a_status_and_a_message(tmp_path):
+def test_a_failed_step_gives_a_status_and_a_message(tmp_path):
     (tmp_path / "own.py").write_text(
         "import numpy as np\n"
         "import livepde as lp\n"
@@ -292,7 +292,7 @@ def test_a_step_that_fails_is_a_status_and_a_message(tmp_path):
 
 
 @pytest.mark.slow
-def test_missing_values_are_those_of_the_case(rod, tmp_path):
+def test_missing_values_follow_the_rules_of_the_case(rod, tmp_path):
     shutil.copy(rod.with_name("rod.csv"), tmp_path)
     text = rod.read_text().replace('time_unit = "s"', 'time_unit = "s"\nmissing = [-9999]')
     text = text.replace('column = "T_10", ', 'column = "T_10", valid = ["0 degC", "90 degC"], ')
@@ -304,11 +304,11 @@ def test_missing_values_are_those_of_the_case(rod, tmp_path):
     for k, (t, (left, one, other, right)) in enumerate(history(8)):
         given = [left, one, other + 273.15, right]
         if k == 3:
-            one, given[1] = math.nan, 95.0  # not valid
+            one, given[1] = math.nan, 95.0  # invalid
         if k == 4:
             left, given[0] = math.nan, -9999.0
         if k == 5:
-            given[2] = math.nan  # the whole sample is left out
+            given[2] = math.nan  # the whole sample is missing
         component.inputs = given
         assert component.take(t) == ""
         z = dict(zip(INPUTS, [left, one, other, right], strict=True))
@@ -331,14 +331,14 @@ def test_a_channel_with_a_factor_has_no_stated_unit(rod):
 
 
 @pytest.mark.parametrize("key", ["late", "noise_column"])
-def test_what_a_unit_would_not_do_is_refused(rod, key):
+def test_features_that_a_unit_lacks_are_refused(rod, key):
     value = {"late": "10 s", "noise_column": "T_20"}[key]
     with pytest.raises(lp.errors.CaseError, match=f"channels.T_10.{key}"):
         recipe_of(load(rod, settings={f"channels.T_10.{key}": value}))
 
 
 @pytest.mark.slow
-def test_time_goes_in_seconds_whatever_the_model_counts(tmp_path):
+def test_time_is_in_seconds_for_any_time_unit_of_the_model(tmp_path):
     model = lp.Model(
         lp.Field(lp.interval(0.0, 1.0, 10), ElementLineP1()),
         {"k": lp.Scalar(lp.Normal(0.1, std=0.05), unit="1/h")},
@@ -363,7 +363,7 @@ def test_time_goes_in_seconds_whatever_the_model_counts(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_field_goes_out_at_the_vertices(tmp_path):
+def test_a_field_is_an_output_at_the_vertices(tmp_path):
     def build(cells):
         mesh = lp.interval(0.0, 1.0, cells)
         model = lp.Model(
@@ -392,7 +392,7 @@ def test_a_field_goes_out_at_the_vertices(tmp_path):
 
 
 @pytest.mark.long
-def test_a_case_with_code_asks_for_leave_and_takes_its_files_along(rod, tmp_path):
+def test_a_case_with_code_requires_permission_and_includes_its_files(rod, tmp_path):
     (tmp_path / "inside").mkdir()
     shutil.copy(rod.with_name("rod.csv"), tmp_path)
     (tmp_path / "inside" / "pde.py").write_text(
@@ -416,7 +416,7 @@ def test_a_case_with_code_asks_for_leave_and_takes_its_files_along(rod, tmp_path
 
 
 @pytest.mark.slow
-def test_a_case_takes_its_mesh_along(rod, tmp_path):
+def test_a_unit_includes_the_mesh_of_its_case(rod, tmp_path):
     pytest.importorskip("meshio")
     (tmp_path / "meshes").mkdir()
     MeshTri().refined(2).scaled(0.4).save(tmp_path / "meshes" / "plate.msh")
@@ -441,7 +441,7 @@ def test_a_case_takes_its_mesh_along(rod, tmp_path):
         assert instance.get(["status", "T_10_model"]) == pytest.approx([0.0, 20.0])
 
 
-def test_files_of_one_name_do_not_fit_into_a_unit(rod, tmp_path):
+def test_two_files_of_one_name_are_refused(rod, tmp_path):
     shutil.copy(rod.with_name("rod.csv"), tmp_path)
     for folder, code in (("a", "mine = EQUATIONS['heat']"), ("b", "def read(folder): ...")):
         (tmp_path / folder).mkdir()
@@ -461,7 +461,7 @@ def test_a_case_without_data_becomes_a_unit(rod, tmp_path):
     case.write_text(re.sub(r"^file = .*\n", "", rod.read_text(), flags=re.MULTILINE))
     unit = export_fmu(case, tmp_path / "rod.fmu")
     assert fmpy.read_model_description(str(unit)).defaultExperiment is None
-    with running(unit, 400.0) as instance:  # it begins when the other program does
+    with running(unit, 400.0) as instance:  # it begins with the other program
         found = [taken(instance, 400.0 + t, z) for t, z in history(3)]
     assert [row[-1] for row in found] == [0.0, 0.0, 0.0]
     with pytest.raises(lp.errors.CaseError, match=r"data\.file is missing"):
@@ -469,7 +469,7 @@ def test_a_case_without_data_becomes_a_unit(rod, tmp_path):
 
 
 @pytest.mark.long
-def test_dates_of_the_case_hold_in_the_unit(rod, tmp_path):
+def test_the_unit_uses_the_dates_of_the_case(rod, tmp_path):
     header, *rows = rod.with_name("rod.csv").read_text().splitlines()
     begin = datetime(2025, 4, 1)
     dated = [header]
@@ -527,7 +527,7 @@ def test_bad_input_is_one_sentence(rod, tmp_path, monkeypatch):
     assert not list(Path().glob("*.fmu.*"))
 
 
-def test_variables_need_names_of_their_own(rod, tmp_path):
+def test_variables_need_unique_names(rod, tmp_path):
     shutil.copy(rod.with_name("rod.csv"), tmp_path)
     case = tmp_path / "case.toml"
     case.write_text(rod.read_text().replace("T_left = {", "alpha_std = {"))
@@ -536,7 +536,7 @@ def test_variables_need_names_of_their_own(rod, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_unit_that_does_not_run_says_why(rod, tmp_path, monkeypatch):
+def test_a_unit_that_cannot_run_reports_why(rod, tmp_path, monkeypatch):
     unit, broken = export_fmu(rod, tmp_path / "rod.fmu"), tmp_path / "broken.fmu"
     with zipfile.ZipFile(unit) as old, zipfile.ZipFile(broken, "w") as new:
         for item in old.infolist():
@@ -555,7 +555,7 @@ def test_a_unit_that_does_not_run_says_why(rod, tmp_path, monkeypatch):
 
 @pytest.mark.process
 def test_many_units_run_in_one_process(rod, tmp_path):
-    """Each in a library of its own; one that gives back too much would crash the next."""
+    """Each unit has its own library; one that frees too much memory would crash the next."""
     paths = []
     for k, prior in enumerate(("5e-5 m^2/s", "6e-5 m^2/s")):
         case = load(rod, settings={"unknowns.alpha.prior": prior})
@@ -578,7 +578,7 @@ def test_many_units_run_in_one_process(rod, tmp_path):
 
 
 @pytest.mark.process
-def test_the_unit_runs_in_a_program_that_is_no_python(rod, tmp_path):
+def test_the_unit_runs_in_a_program_without_python(rod, tmp_path):
     compiler = shutil.which("cc")
     folder, name = sysconfig.get_config_vars("LIBDIR", "INSTSONAME")
     library = Path(folder) / name
@@ -612,7 +612,7 @@ def test_the_unit_runs_in_a_program_that_is_no_python(rod, tmp_path):
 
 
 @pytest.mark.long
-def test_the_command_writes_compares_and_tells(rod, tmp_path, monkeypatch):
+def test_the_command_writes_and_compares_a_unit_and_reports(rod, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = CliRunner()
     done = run.invoke(app, ["fmu", str(rod), "--out", "rod.fmu", "--json"])
@@ -632,13 +632,13 @@ def test_the_command_writes_compares_and_tells(rod, tmp_path, monkeypatch):
     assert "--set requires a case file" in str(done.exception)
 
 
-def test_units_of_the_si():
+def test_units_are_converted_to_si():
     assert in_si("cm/h").exponents == {"m": 1, "s": -1}
     assert in_si("cm/h").factor == pytest.approx(0.01 / 3600)
     assert in_si("percent").exponents == {}
     assert in_si("m/s**0.5") is None
     assert in_si("apples") is None
-    assert in_si("dB") is None  # no linear scale
+    assert in_si("dB") is None  # not a linear scale
 
 
 @pytest.mark.parametrize(("unit", "step"), [("degC", "K"), ("degF", "degR"), ("m", "m")])
@@ -668,7 +668,7 @@ def slab(sensors):
 
 
 def measured(count=40):
-    """Features and targets as a slab of k = 0.3 shows them."""
+    """Return features and targets of a slab with k = 0.3."""
     model, points = slab({"a": 0.3}).model, lp.Points({"a": 0.3, "b": 0.6})
     scheme = lp.SensitivityLaw.scheme
     truth = lp.Identifier(model, points, lp.GradientLaw(), q0={"k": 0.3}, scheme=scheme)
@@ -720,7 +720,7 @@ def test_a_target_that_is_missing_is_not_learned_from(sensors):
 
 
 @pytest.mark.long
-def test_rivers_own_evaluation_runs_it():
+def test_the_evaluation_of_river_runs_it():
     evaluate = pytest.importorskip("river.evaluate")
     metrics = pytest.importorskip("river.metrics")
     model = river_regressor(slab({"a": 0.3, "b": 0.6}))
@@ -740,8 +740,8 @@ def test_rivers_own_evaluation_runs_it():
 
 
 @pytest.mark.long
-def test_rivers_checks_that_fit():
-    """Not those that leave out features (there is no time then), or pickle models of lambdas."""
+def test_the_applicable_checks_of_river_pass():
+    """Except checks that omit features, such as the time, or pickle models with lambdas."""
     common = pytest.importorskip("river.checks.common")
     model = river_regressor(slab({"a": 0.3}))
     for x, y in measured(10):

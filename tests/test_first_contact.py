@@ -1,4 +1,4 @@
-"""What a user of pandas and xarray types first, without our documentation."""
+"""First lines of a new user of pandas and xarray, written without our documentation."""
 
 import pickle
 from functools import cache
@@ -13,7 +13,7 @@ import livepde as lp
 from livepde.models import borehole, fluid, heat
 
 TRUE = 0.07  # diffusivity of the rod
-NOISE = 0.05  # of its sensors, K
+NOISE = 0.05  # standard deviation of its sensors, K
 START = "2025-03-01 12:00"
 
 
@@ -32,8 +32,8 @@ def identifier(**options) -> lp.Identifier:
 
 @cache
 def measured() -> pd.DataFrame:
-    """Return what a logger has written: seconds, and a column that is not a channel."""
-    t = 0.125 * np.arange(24)  # exact in dates, too
+    """Return a table as from a logger, with seconds and a column that is not a channel."""
+    t = 0.125 * np.arange(24)  # also exact as dates
 
     def ends(when: float) -> dict[str, float]:
         return {"T_left": 20.0 * np.sin(when)}
@@ -48,20 +48,20 @@ def measured() -> pd.DataFrame:
 
 
 def dated(**index) -> pd.DataFrame:
-    """Return the same table with dates as its index."""
+    """Return the table of `measured` with dates as its index."""
     dates = pd.date_range(START, periods=len(measured()), freq="125ms", **index)
     return measured().set_axis(dates)
 
 
 @cache
 def known() -> lp.Result:
-    """Return the run of the samples as tuples, which no reader has touched."""
+    """Return the run of the samples as tuples, without a table reader."""
     rows = measured()[["T_left", "T_30", "T_60"]].to_dict("index")
     return identifier().run(rows.items())
 
 
 def same(result: lp.Result, rtol: float = 1e-12, to: lp.Result | None = None) -> bool:
-    """Return whether a run has found what the run of tuples, or another run, has found."""
+    """Return whether a run has the results of the run of tuples, or of another run."""
     found, expected = (one.last.parameters["alpha"] for one in (result, to or known()))
     return len(result) == len(known()) and np.allclose(found, expected, rtol=rtol)
 
@@ -93,7 +93,7 @@ ax.figure.savefig("alpha.png")
 
 
 @pytest.mark.slow
-def test_the_lines_that_a_user_of_pandas_types(here, capsys):
+def test_the_first_lines_of_a_pandas_user_work(here, capsys):
     pytest.importorskip("matplotlib")
     dated().rename_axis("time").to_csv("rod.csv")
     names = {"lp": lp, "pd": pd, "pickle": pickle, "model": rod()}
@@ -161,7 +161,7 @@ def test_units_of_columns():
 
 
 def test_units_of_a_dataset_are_those_of_all_its_temperatures():
-    """Those of a boundary value were ignored: it was off by 273 where its sensors were right."""
+    """The unit of a boundary value was once ignored: it was wrong by 273 K, sensors were right."""
     kelvin = measured()[["T_30", "T_60", "T_left"]] + 273.15
     data = kelvin.assign(**{"noise of T_30": NOISE}).to_xarray()
     for name in kelvin:
@@ -173,7 +173,7 @@ def test_units_of_a_dataset_are_those_of_all_its_temperatures():
 
 
 def test_units_of_inputs_are_converted_like_those_of_sensors():
-    """The power of a dataset in kW was taken as in W."""
+    """The power of a dataset in kW was once read as W."""
     wall, hours = 0.07, np.linspace(0.0, 10.0, 11)
     mesh = lp.interval(wall, 5.0, 12, geometric=True)
     k, resistance = lp.LogNormal(2.0, std=0.5), lp.LogNormal(0.1, std=0.03)
@@ -214,10 +214,10 @@ def test_a_table_that_cannot_be_used_is_one_sentence(wrong, message):
     who = identifier()
     with pytest.raises(lp.errors.DataError, match=message):
         who.run(wrong(measured()))
-    assert same(who.run(measured()))  # nothing was changed
+    assert same(who.run(measured()))  # the refused tables changed nothing
 
 
-def test_options_of_a_table_that_do_not_fit():
+def test_invalid_options_of_a_table_are_refused():
     with pytest.raises(lp.errors.ConfigurationError, match="columns: there is no channel 'T_3'"):
         identifier().run(measured(), columns={"T_3": "T_30"})
     with pytest.raises(lp.errors.ConfigurationError, match="strict describes a table or a file"):
@@ -264,7 +264,7 @@ def test_an_xarray_dataset_with_units():
 
 
 @pytest.mark.slow
-def test_files(tmp_path):
+def test_files_are_read_like_their_tables(tmp_path):
     measured().to_csv(tmp_path / "numbers.csv")
     dated().to_csv(tmp_path / "dates.csv")
     measured().to_csv(tmp_path / "german.csv", sep=";", decimal=",")
@@ -353,7 +353,7 @@ def test_a_smoothed_table_has_its_dates():
 
 @cache
 def found() -> lp.Result:
-    """Return the run of a table of dates."""
+    """Provide the run of a table with dates."""
     again = lp.Points({"T_60 again": 0.6})
     table = dated().assign(**{"T_60 again": dated()["T_60"]})
     return identifier(law=lp.SensitivityLaw(), validation=again).run(table)
@@ -361,7 +361,7 @@ def found() -> lp.Result:
 
 @cache
 def two() -> lp.Result:
-    """Return a run with a number under a transform, one without, and a field."""
+    """Provide a run with a transformed number, a plain number and a field."""
     mesh = lp.interval(0.0, 1.0, 20)
     state = lp.Field(mesh, lp.linear(mesh), dirichlet={"left": lp.Channel("T_left"), "right": 0.0})
     source = lp.Field(mesh, lp.linear(mesh), inner="H1", prior=lp.Normal(0.0, std=1.0))
@@ -399,7 +399,7 @@ def test_the_summary_is_what_a_run_prints():
 
 
 @pytest.mark.slow
-def test_numbers_over_time_as_a_table():
+def test_numbers_over_time_are_a_table():
     table = found().to_dataframe()
     assert table.index.equals(dated().index.rename("time").as_unit(table.index.unit))
     assert table["alpha"].iloc[-1] == found().last["alpha"].median
@@ -434,7 +434,7 @@ def test_the_dataset_is_written_and_read_again(engine, tmp_path):
         assert (read["date"].values == data["date"].values).all()
 
 
-def test_covariance_by_name():
+def test_covariances_are_selected_by_name():
     covariance, correlation = two().covariance(), two().correlation()
     for label in ("k", "r"):
         assert np.sqrt(covariance.loc[label, label]) == pytest.approx(two().last[label].deviation)
@@ -603,7 +603,7 @@ def test_unknowns_that_move_have_no_likelihood_of_a_draw():
     assert "log_likelihood" not in who.run(measured().iloc[9:]).to_inference_data(3)
 
 
-# --- objects that show themselves ----------------------------------------------------------------
+# --- representations of objects ------------------------------------------------------------------
 
 
 def test_a_ready_made_equation_shows_its_formula():
@@ -623,7 +623,7 @@ def test_a_ready_made_equation_shows_its_formula():
 
 
 def conduction(q, u, v, x):
-    """Return the form of conduction, in one expression."""
+    """Weak form of conduction as a single expression."""
     return q.k * lp.dot(lp.grad(u), lp.grad(v))
 
 
@@ -772,7 +772,7 @@ def test_forms_that_are_not_linear_in_v_are_refused():
     assert not roots.affine
 
 
-def test_a_diffusion_of_the_wrong_sign_is_said():
+def test_a_diffusion_of_the_wrong_sign_is_reported():
     mesh = lp.interval(0.0, 1.0, 8)
     state = lp.Field(mesh, lp.linear(mesh))
 
@@ -794,7 +794,7 @@ def test_a_diffusion_of_the_wrong_sign_is_said():
     lp.Model(state, {"k": lp.Normal(0.0, std=0.1)}, A=growing)
 
 
-def test_the_sign_of_diffusion_in_systems_and_directions():
+def test_the_sign_of_diffusion_is_checked_in_systems_and_directions():
     k = {"k": lp.LogNormal(1.0, std=0.1)}
     line, plate = lp.interval(0.0, 1.0, 8), lp.rectangle((0.0, 1.0), (0.0, 1.0), (3, 3))
 
@@ -819,7 +819,7 @@ def test_the_sign_of_diffusion_in_systems_and_directions():
         lp.Model(
             fields("u")["u"], k, A=lambda q, u, v, x: q.k * flux(u, v), M=lambda u, v, x: -u * v
         )
-    # Right ones: both signs turned, no change of d in time, and diffusion across that makes up.
+    # Valid: both signs reversed, no time derivative of d, and sufficient diffusion across.
     lp.Model(fields("u")["u"], k, A=lambda q, u, v, x: -q.k * flux(u, v), M=lambda u, v, x: -u * v)
     lp.Model(fields("c", "d"), k, A=opposed, M=lambda u, v, x: u.c * v.c)
     lp.Model(
@@ -837,7 +837,7 @@ def system() -> lp.Model:
 
 
 @pytest.mark.slow
-def test_the_initial_state_of_a_system_names_all_of_it_or_is_one_number():
+def test_the_initial_state_of_a_system_is_one_number_or_names_all_fields():
     sensors = lp.Points({"C": 0.5}, of="c", noise=0.1)
     assert (lp.Identifier(system(), sensors, u0=20.0).u0 == 20.0).all()
     both = lp.Identifier(system(), sensors, u0={"c": 1.0, "d": lambda x: 2.0 + 0.0 * x[0]})
@@ -873,7 +873,7 @@ def test_data_of_a_subdomain_by_coordinates():
     z = omega.sample(lambda x: x[0] ** 2, model.state_space)
     assert np.allclose(z, np.linspace(0.0, 0.4, 5) ** 2)
     assert (lp.Full().sample(lambda x: 3.0, model.state_space) == np.full(10, 3.0)).all()
-    camera = np.linspace(0.5, 0.0, 51)  # other places than the nodes, and downwards
+    camera = np.linspace(0.5, 0.0, 51)  # points that differ from the nodes, in descending order
     table = xr.DataArray(
         np.outer([1.0, 2.0], np.cos(camera)), {"time": [0.1, 0.2], "x": camera}, ("time", "x")
     )

@@ -1,4 +1,4 @@
-"""The journal: what a kill, a full disk, a damaged or a hostile file make of it."""
+"""The journal survives kills, full disks, and damaged or hostile files."""
 
 import csv
 import itertools
@@ -37,8 +37,8 @@ from livepde.streams.intake import Intake
 from livepde.streams.sources import Follow, Row, Rows, json_row
 
 NAME = "journal.sqlite"
-CHECKPOINT = 40  # samples between two checkpoints here: a run has several in less time
-GROUP = 8  # samples of one commit here
+CHECKPOINT = 40  # samples between two checkpoints, few so that a short run has several
+GROUP = 8  # samples per commit
 
 
 @pytest.fixture(autouse=True)
@@ -58,14 +58,14 @@ def started(folder: Path, count: int, **options) -> Live:
 
 
 def halved(some, two) -> list:
-    """Return all pairs, every other one of which is a long test."""
+    """Return all pairs of two axes, with every other pair marked as a long test."""
     pairs = enumerate(itertools.product(some, two))
-    rest = (1, 2)  # of four in a row, so that each member of both is in a usual test
+    rest = (1, 2)  # positions of long tests among four, so that usual tests cover each value
     return [pytest.param(*pair, marks=[pytest.mark.long] * (k % 4 in rest)) for k, pair in pairs]
 
 
 def ran(folder: Path, count: int, **options) -> Live:
-    """Return a run, begun or resumed, after so many samples."""
+    """Begin or resume a run, and return it after `samples` samples."""
     run = started(folder, count, **options)
     run.resume()
     run.run()
@@ -74,7 +74,7 @@ def ran(folder: Path, count: int, **options) -> Live:
 
 
 def same_runs(one: Path, other: Path) -> int:
-    """Assert that two folders have the same estimates; return how many samples were accepted."""
+    """Assert that two folders have equal estimates; return the number of accepted samples."""
     with Journal.open(one / NAME) as mine, Journal.open(other / NAME) as yours:
         same(mine, yours)
         assert mine.accepted == yours.accepted
@@ -86,8 +86,8 @@ def altered(path: Path, script: str) -> None:
         raw.executescript(script)
 
 
-class AtHand(Rows):
-    """Rows that are all there at once."""
+class Available(Rows):
+    """Source whose rows are all available at once."""
 
     def __init__(self, rows) -> None:
         self._found = [Row(values) for values in rows]
@@ -103,7 +103,7 @@ class AtHand(Rows):
 
 @cache
 def journal_bytes(count: int) -> bytes:
-    """Return the file that a run of so many samples leaves."""
+    """Return the journal file of a run of `samples` samples."""
     with TemporaryDirectory() as folder:
         ran(Path(folder), count)
         return (Path(folder) / NAME).read_bytes()
@@ -117,14 +117,14 @@ def finished(folder: Path, count: int = 30) -> Path:
 
 
 def folders(parent: Path) -> tuple[Path, Path]:
-    """Make a folder for a run as it should be, and one for what happens to it."""
+    """Create a folder for the undisturbed run and one for the disturbed run."""
     whole, other = parent / "whole", parent / "other"
     whole.mkdir(), other.mkdir()
     return whole, other
 
 
 def content(path: Path) -> dict[str, dict[int, tuple]]:
-    """Return all that a journal holds, row by row."""
+    """Return the full content of a journal, row by row."""
     with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as raw:
         tables = ("samples", "estimates", "fields", "events")
         return {name: {r[0]: r for r in raw.execute(f"SELECT * FROM {name}")} for name in tables}
@@ -134,11 +134,11 @@ def content(path: Path) -> dict[str, dict[int, tuple]]:
 
 
 class Crash(BaseException):
-    """As good as a kill, within the process."""
+    """Error that ends a run as a kill would, within the process."""
 
 
 class Listens:
-    """A sink that keeps the times of estimates."""
+    """Sink that stores the times of estimates."""
 
     def __init__(self) -> None:
         self.times: list[float] = []
@@ -151,7 +151,7 @@ class Listens:
 
 
 class Breaks:
-    """A sink that breaks the run after so many estimates."""
+    """Sink that crashes the run after a number of estimates."""
 
     def __init__(self, after: int) -> None:
         self.left = after
@@ -169,7 +169,7 @@ class Breaks:
 @pytest.mark.parametrize(
     ("method", "waits"), halved(["accept", "append", "commit", "checkpoint", "step"], [True, False])
 )
-def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(
+def test_after_a_crash_within_a_step_the_run_resumes_bit_by_bit(
     tmp_path, monkeypatch, method, waits
 ):
     count = CHECKPOINT + 40
@@ -196,11 +196,11 @@ def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(
 
 
 @pytest.mark.long
-def test_a_run_that_was_stopped_has_the_fields_of_one_that_was_not(tmp_path):
+def test_a_stopped_and_resumed_run_has_the_fields_of_an_undisturbed_run(tmp_path):
     whole, stopped = folders(tmp_path)
     finished(whole, 60)
     finished(stopped, 37)
-    for _ in range(2):  # then nothing is left to do
+    for _ in range(2):  # the second run has nothing left to do
         ran(stopped, 60)
     same_runs(stopped, whole)
     with Journal.open(stopped / NAME) as kept:
@@ -211,7 +211,7 @@ def test_a_run_that_was_stopped_has_the_fields_of_one_that_was_not(tmp_path):
 def test_an_event_of_a_refused_sample_comes_with_its_withdrawal(tmp_path):
     feed = Rows([{"t": 0.0, "a": 1.0, "b": 1.0, "left": 1.0}, {"t": 0.1, "a": 1.0}])
     run = live(tmp_path, feed)
-    run.journal.accept(-1.0, {"a": 1.0})  # left over: without input
+    run.journal.accept(-1.0, {"a": 1.0})  # remains without its input
     run.resume()
     run.run()
     assert [event.kind for event in run.journal.events if event.kind == "refused"] == ["refused"]
@@ -221,8 +221,8 @@ def test_an_event_of_a_refused_sample_comes_with_its_withdrawal(tmp_path):
 # --- groups of samples ----------------------------------------------------------------------------
 
 
-class Watched(AtHand):
-    """A source and a sink that look at what a reader of the journal finds when they are told."""
+class Watched(Available):
+    """Source and sink that record what a reader of the journal sees when they are notified."""
 
     def __init__(self, path: Path, rows) -> None:
         super().__init__(rows)
@@ -239,8 +239,8 @@ class Watched(AtHand):
 
 
 @pytest.mark.slow
-def test_nobody_is_told_of_what_is_not_committed(tmp_path, monkeypatch):
-    """Sources and sinks are told after the commit, of a whole group where samples are at hand."""
+def test_sources_and_sinks_are_notified_after_the_commit(tmp_path, monkeypatch):
+    """They are notified of a whole group if several samples are available."""
     monkeypatch.setattr("livepde.runs.live_loop.AGE", np.inf)
     watched = Watched(tmp_path / NAME, rows(40))
     run = live(tmp_path, watched, sinks=[watched])
@@ -249,7 +249,7 @@ def test_nobody_is_told_of_what_is_not_committed(tmp_path, monkeypatch):
     for told in (watched.acknowledged, watched.told):
         assert [t for t, _ in told] == times
         assert all(number >= k for k, (_, number) in enumerate(told, start=1))
-    # One by one at first, since the last session may have ended in one of these, then in groups.
+    # First singly, because the last session may have crashed in one of these, then in groups.
     ends = [*range(1, GROUP + 1), 16, 24, 32, 40]
     assert sorted({number for _, number in watched.acknowledged}) == ends
     # The estimate of the last sample of a group comes with the next one.
@@ -257,7 +257,7 @@ def test_nobody_is_told_of_what_is_not_committed(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_no_step_begins_before_what_is_old_is_committed(tmp_path):
+def test_no_step_begins_before_old_samples_are_committed(tmp_path):
     now = itertools.count()
     watched = Watched(tmp_path / NAME, rows(30))
     run = live(tmp_path, watched, sinks=[watched], clock=lambda: float(next(now)))
@@ -267,13 +267,11 @@ def test_no_step_begins_before_what_is_old_is_committed(tmp_path):
 
 @pytest.mark.long
 @pytest.mark.parametrize("error", [np.linalg.LinAlgError("no SVD"), TypeError("a defect")])
-def test_an_estimate_of_a_group_that_cannot_be_computed_is_that_of_its_sample(
-    tmp_path, monkeypatch, error
-):
-    """As one by one: a failure of the numerics sets the sample aside, others go on."""
+def test_a_failed_estimate_within_a_group_skips_only_its_sample(tmp_path, monkeypatch, error):
+    """A numerical failure skips its sample, and the others continue, as with single samples."""
     monkeypatch.setattr("livepde.runs.live_loop.AGE", np.inf)
     found = []
-    for name, source in (("one", Rows), ("group", AtHand)):
+    for name, source in (("one", Rows), ("group", Available)):
         folder = tmp_path / name
         folder.mkdir()
         sink = Listens()
@@ -309,14 +307,14 @@ def test_an_estimate_of_a_group_that_cannot_be_computed_is_that_of_its_sample(
 
 
 @pytest.mark.slow
-def test_after_a_failed_write_no_checkpoint_passes_over_what_was_lost(tmp_path):
+def test_after_a_failed_write_no_checkpoint_skips_lost_samples(tmp_path):
     run = started(tmp_path, 100)
     with closing(sqlite3.connect(tmp_path / NAME)) as raw:
         (pages,) = raw.execute("PRAGMA page_count").fetchone()
     run.journal._db.execute(f"PRAGMA max_page_count = {pages + 10}")
     with pytest.raises(lp.errors.RunError):
         run.run()
-    run.journal._db.execute("PRAGMA max_page_count = 100000")  # room again, too late
+    run.journal._db.execute("PRAGMA max_page_count = 100000")  # space is available again, too late
     with pytest.raises(lp.errors.RunError, match="full"):
         run.journal.checkpoint(run.identifier.dump())
     run.journal.close()
@@ -326,7 +324,7 @@ def test_after_a_failed_write_no_checkpoint_passes_over_what_was_lost(tmp_path):
 
 
 class Failing:
-    """A connection of which writes fail while it is told so, as those of a full disk do."""
+    """Connection whose writes fail on request, as on a full disk."""
 
     def __init__(self, path: Path, failing) -> None:
         self._raw, self._failing = database.writer(path), failing
@@ -351,7 +349,7 @@ class Failing:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("first", "source"), halved([2, 40, 43, 73], [Rows, AtHand]))
+@pytest.mark.parametrize(("first", "source"), halved([2, 40, 43, 73], [Rows, Available]))
 def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypatch, first, source):
     whole, failing = folders(tmp_path)
     broken = [*rows(40)]
@@ -360,7 +358,7 @@ def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypa
     calm.run()
     calm.journal.close()
     writes = itertools.count(1)
-    bad = {first, first + 1, first + 9, first + 80}  # also while it is mended
+    bad = {first, first + 1, first + 9, first + 80}  # also while the journal recovers
     monkeypatch.setattr("livepde.runs.live_loop.LOOK", 0.0)
     monkeypatch.setattr(
         "livepde.runs.journal.writer", lambda path: Failing(path, lambda: next(writes) in bad)
@@ -377,7 +375,7 @@ def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypa
         same(other, one)
         assert other.counts == one.counts
         assert other.accepted == one.accepted == 40
-        # Counted: rows that go back make the calm run unwell for a while, too.
+        # Count events, because rows that go back make the undisturbed run unhealthy, too.
         told, found = (
             Counter((event.kind, event.channel, event.message) for event in kept.events)
             for kept in (one, other)
@@ -387,9 +385,7 @@ def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypa
 
 
 @pytest.mark.slow
-def test_a_disk_that_does_not_come_back_is_no_health_until_the_run_is_stopped(
-    tmp_path, monkeypatch
-):
+def test_a_disk_that_stays_full_is_unhealthy_until_the_run_is_stopped(tmp_path, monkeypatch):
     away = []
     monkeypatch.setattr(
         "livepde.runs.journal.writer", lambda path: Failing(path, lambda: bool(away))
@@ -406,7 +402,7 @@ def test_a_disk_that_does_not_come_back_is_no_health_until_the_run_is_stopped(
     class Leaving(Rows):
         def poll(self, wait):
             if wait == 0.0:
-                return []  # no row is at hand: samples that wait are taken, and committed
+                return []  # without a new row, waiting samples are processed and committed
             if run.journal.accepted == 10:
                 away.append(True)
             return super().poll(wait)
@@ -444,7 +440,7 @@ except livepde.errors.RunError as error:
 
 @pytest.mark.process
 @pytest.mark.skipif(sys.platform == "win32", reason="needs limits of POSIX")
-def test_a_file_that_may_not_grow(tmp_path):
+def test_a_run_whose_file_cannot_grow_reports_it_and_resumes(tmp_path):
     whole, full = folders(tmp_path)
     finished(whole, 400)
     for size in (150_000, 300_000):
@@ -461,9 +457,9 @@ def test_a_file_that_may_not_grow(tmp_path):
 
 
 def as_nobody(code: str, *arguments: object) -> str:
-    """Run code as a user who may write nothing here; return what it prints."""
+    """Run code as a user without write permission here; return its output."""
     command = [sys.executable, "-c", code, *map(str, arguments)]
-    # Nobody may write what was covered, either.
+    # The user cannot write coverage data either.
     env = {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE")}
     found = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, env=env)
     assert not found.stderr
@@ -491,10 +487,10 @@ for write in (False, True):
 
 @pytest.fixture
 def shared():
-    """A folder that everybody can read and only its owner write."""
+    """Provide a folder that all users can read and only its owner can write."""
     import tempfile
 
-    folder = Path(tempfile.mkdtemp())  # tmp_path is for its owner only
+    folder = Path(tempfile.mkdtemp())  # only its owner can read tmp_path
     folder.chmod(0o755)
     yield folder
     folder.chmod(0o755)
@@ -504,10 +500,10 @@ def shared():
 @pytest.mark.process
 @pytest.mark.skipif(sys.platform == "win32", reason="needs permissions of POSIX")
 @pytest.mark.parametrize("killed", [False, True])
-def test_a_folder_that_may_only_be_read(shared, killed):
+def test_a_journal_in_a_read_only_folder_can_be_read(shared, killed):
     run = started(shared, 30)
     run.run()
-    if killed:  # its write-ahead log stays
+    if killed:  # the write-ahead log remains
         copy = shared / "copy"
         copy.mkdir()
         for path in shared.glob(f"{NAME}*"):
@@ -535,11 +531,11 @@ def test_a_journal_appears_whole_or_not_at_all(tmp_path):
     kept.close()
     with pytest.raises(lp.errors.RunError, match="already; go on with it"):
         journal(path)
-    Journal.open(path, write=True).close()  # the lock is free
+    Journal.open(path, write=True).close()  # the lock is released
 
 
 @pytest.mark.slow
-def test_whether_a_journal_is_written_and_when(tmp_path):
+def test_the_last_write_and_the_writer_of_a_journal_are_known(tmp_path):
     path = tmp_path / NAME
     assert written(path) == 0.0
     run = started(tmp_path, 5)
@@ -553,8 +549,8 @@ def test_whether_a_journal_is_written_and_when(tmp_path):
 
 
 @pytest.mark.slow
-def test_who_asks_whether_it_is_written_keeps_no_writer_out(tmp_path, monkeypatch):
-    """To ask takes the lock for a moment."""
+def test_asking_whether_a_journal_is_written_does_not_block_a_writer(tmp_path, monkeypatch):
+    """The query holds the lock only for a moment."""
     monkeypatch.setattr("livepde.runs.database.MOMENT", PATIENCE)
     journal(tmp_path / NAME).close()
     asked = FileLock(tmp_path / f"{NAME}.lock", thread_local=False)
@@ -564,7 +560,7 @@ def test_who_asks_whether_it_is_written_keeps_no_writer_out(tmp_path, monkeypatc
 
 
 @pytest.mark.slow
-def test_a_journal_that_is_held_is_not_read_as_if_nobody_wrote(tmp_path, monkeypatch):
+def test_a_locked_journal_is_refused_with_a_remedy(tmp_path, monkeypatch):
     path = finished(tmp_path)
     connect = database._connect
 
@@ -583,11 +579,11 @@ def test_a_journal_that_is_held_is_not_read_as_if_nobody_wrote(tmp_path, monkeyp
             Journal.open(path)
 
 
-# --- files that are damaged, or made to do harm --------------------------------------------------
+# --- damaged and hostile files -------------------------------------------------------------------
 
 
 def reads(path: Path) -> None:
-    """Read all of a journal, and go on with it."""
+    """Read a whole journal, and resume it."""
     with Journal.open(path) as kept:
         kept.dataset()
         _ = kept.events, kept.counts, kept.position, kept.last, kept.first, len(kept)
@@ -596,7 +592,7 @@ def reads(path: Path) -> None:
 
 
 def refused(path: Path, match: str = "damaged|not a journal|malformed|not a database") -> None:
-    """Reading ends in one sentence that names the file."""
+    """Assert that reading fails with one sentence that names the file."""
     with pytest.raises(lp.errors.RunError, match=match) as caught:
         reads(path)
     text = str(caught.value)
@@ -609,7 +605,7 @@ def refused(path: Path, match: str = "damaged|not a journal|malformed|not a data
 
 @pytest.mark.long
 @pytest.mark.parametrize("keep", [0, 1, 50, 99, 4096, 5000, 20000])
-def test_a_file_that_was_cut_off(tmp_path, keep):
+def test_a_truncated_journal_is_refused_with_one_sentence(tmp_path, keep):
     path = finished(tmp_path)
     path.write_bytes(path.read_bytes()[:keep])
     refused(path)
@@ -623,7 +619,9 @@ def test_a_file_that_was_cut_off(tmp_path, keep):
     derandomize=True,
 )
 @given(seed=st.integers(0, 2**32), share=st.sampled_from([1e-5, 1e-4, 1e-3, 1e-2, 0.3]))
-def test_a_file_with_wrong_bytes_is_read_or_one_sentence(tmp_path_factory, seed, share):
+def test_a_journal_with_wrong_bytes_is_read_or_refused_with_one_sentence(
+    tmp_path_factory, seed, share
+):
     folder = tmp_path_factory.mktemp("bytes")
     path = folder / NAME
     rng = np.random.default_rng(seed)
@@ -631,7 +629,7 @@ def test_a_file_with_wrong_bytes_is_read_or_one_sentence(tmp_path_factory, seed,
     where = rng.integers(0, len(data), max(int(share * len(data)), 1))
     data[where] = rng.integers(0, 256, len(where))
     path.write_bytes(data.tobytes())
-    with suppress(lp.LivepdeError):  # and nothing else
+    with suppress(lp.LivepdeError):  # no other exception is allowed
         reads(path)
     shutil.rmtree(folder)
 
@@ -672,16 +670,16 @@ HOSTILE = [
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", HOSTILE)
-def test_a_file_made_to_do_harm_is_one_sentence(tmp_path, command):
+def test_a_hostile_journal_is_refused_with_one_sentence(tmp_path, command):
     path = finished(tmp_path)
     altered(path, command)
-    with suppress(sqlite3.Error):  # of a table that is no table of a journal any more
+    with suppress(sqlite3.Error):  # the table may no longer be a table of a journal
         signed(path)
     refused(path)
 
 
 def signed(path: Path) -> None:
-    """Give all records the checksums of what they hold: they guard against accidents only."""
+    """Recompute the checksums of all records, which only protect against accidents."""
     with sqlite3.connect(path) as raw:
         for (table,) in raw.execute(
             "SELECT name FROM sqlite_schema WHERE type = 'table'"
@@ -699,7 +697,7 @@ def signed(path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["text", "complex", "shape"])
-def test_a_checkpoint_made_to_do_harm_is_one_sentence(tmp_path, kind):
+def test_a_hostile_checkpoint_is_refused_with_one_sentence(tmp_path, kind):
     path = finished(tmp_path)
     good = identifier()
     good.step(0.0, {"a": 1.0, "b": 1.0, "left": 1.0})
@@ -743,7 +741,7 @@ def test_readers_see_whole_estimates_while_another_process_writes_and_is_killed(
                 with Journal.open(path) as kept:
                     records = list(kept)
                     assert all(isinstance(record, Record) for record in records)
-                    assert len(records) >= seen  # nothing that was there goes away
+                    assert len(records) >= seen  # no record disappears
                     seen = len(records)
         child.kill()
         child.wait()
@@ -764,7 +762,7 @@ def test_an_open_reader_does_not_let_the_log_grow(tmp_path):
 
 
 class First:
-    """A reader that looks at one estimate and never ends."""
+    """Reader that reads one estimate and stays open."""
 
     def __init__(self, slow) -> None:
         self.slow, self.begun = slow, False
@@ -812,7 +810,7 @@ def test_thinning_keeps_what_a_resume_needs_and_the_phase_of_the_fields(tmp_path
 
 
 @pytest.mark.long
-def test_thinning_while_somebody_iterates(tmp_path):
+def test_thinning_does_not_disturb_an_open_iteration(tmp_path):
     run = started(tmp_path, 3 * CHECKPOINT)
     run.run()
     seen = []
@@ -826,7 +824,7 @@ def test_thinning_while_somebody_iterates(tmp_path):
 
 
 @pytest.mark.long
-def test_a_journal_that_is_thinned_stops_growing(tmp_path):
+def test_a_thinned_journal_stops_growing(tmp_path):
     run = started(tmp_path, 1)
     run.run()
     kept, sizes = run.journal, []
@@ -887,13 +885,13 @@ def test_any_row_becomes_part_of_a_sample_or_has_a_reason(found):
 @pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=200) | st.text(max_size=100) | ROWS.map(json.dumps))
-def test_any_line_of_json_is_a_row_or_says_why_not(line):
+def test_any_line_of_json_is_a_row_or_has_a_reason(line):
     row = json_row(line)
     assert row.broken or isinstance(row.values, dict)
 
 
 def _labels(line: bytes) -> bool:
-    """Return whether a line of a CSV file has labels, and no values."""
+    """Return whether a line of a CSV file has labels instead of values."""
     try:
         cells = next(csv.reader([line.decode()], skipinitialspace=True), [])
     except (UnicodeError, csv.Error):
@@ -910,7 +908,7 @@ def _labels(line: bytes) -> bool:
 @given(
     lines=st.lists(st.binary(max_size=60), max_size=12), suffix=st.sampled_from(["csv", "jsonl"])
 )
-def test_any_line_of_a_file_is_a_row_or_says_why_not(tmp_path, lines, suffix):
+def test_any_line_of_a_file_is_a_row_or_has_a_reason(tmp_path, lines, suffix):
     lines = [line.replace(b"\n", b"?") for line in lines]
     path = tmp_path / f"rows.{suffix}"
     path.write_bytes(b"t,a,b,left\n" * (suffix == "csv") + b"".join(x + b"\n" for x in lines))
@@ -920,7 +918,7 @@ def test_any_line_of_a_file_is_a_row_or_says_why_not(tmp_path, lines, suffix):
     shown = [line for line in lines if line.strip()]
     if suffix == "csv":
         shown = [line for line in shown if not line.lstrip(b' "').startswith(b"#")]
-    # The first two lines under a header may be labels, as of units.
+    # The first two lines below a header may be labels, such as units.
     under = itertools.takewhile(_labels, shown[:2] if suffix == "csv" else [])
     assert len(found) == len(shown) - len(list(under))
     intake = Intake(COLUMNS, CLOCK)
@@ -930,7 +928,7 @@ def test_any_line_of_a_file_is_a_row_or_says_why_not(tmp_path, lines, suffix):
 
 
 @pytest.mark.slow
-def test_right_lines_arrive_between_any_others(tmp_path):
+def test_valid_lines_arrive_between_arbitrary_lines(tmp_path):
     write(tmp_path, 40)
     path = tmp_path / "data.csv"
     head, *right = path.read_bytes().splitlines()
@@ -948,7 +946,7 @@ def test_right_lines_arrive_between_any_others(tmp_path):
 # --- the folder around it ------------------------------------------------------------------------
 
 
-def test_a_folder_whose_making_was_ended_is_made_again(tmp_path):
+def test_a_partly_created_run_folder_is_created_again(tmp_path):
     def create():
         return RunWriter.create(
             tmp_path / "run", version="1", command=["x"], title="A run", case="abc = 1\n"
@@ -972,7 +970,7 @@ def test_a_folder_whose_making_was_ended_is_made_again(tmp_path):
         shutil.rmtree(folder)
 
 
-def test_a_record_that_cannot_be_written_is_one_sentence(tmp_path, monkeypatch):
+def test_a_record_that_cannot_be_written_is_refused_with_one_sentence(tmp_path, monkeypatch):
     options = {"version": "1", "case": "a = 1\n"}
     path = tmp_path / "run"
     RunWriter.create(path, command=["x"], title="A run", **options)
@@ -982,7 +980,7 @@ def test_a_record_that_cannot_be_written_is_one_sentence(tmp_path, monkeypatch):
         RunWriter.reopen(path, command=["x"], settings=(), **options)
 
 
-def test_an_error_while_a_journal_is_opened_is_told_once(tmp_path, monkeypatch):
+def test_an_error_while_a_journal_is_opened_is_reported_once(tmp_path, monkeypatch):
     def full(path):
         raise lp.errors.RunError("the disk is full; make room.")
 
@@ -1016,7 +1014,7 @@ def test_estimates_that_are_deleted_are_read_from_the_journal(tmp_path):
         "INSERT INTO counts VALUES ('late', '', 3, 0)",
     ],
 )
-def test_a_record_that_is_not_as_it_was_is_told(tmp_path, command):
+def test_a_changed_record_is_reported(tmp_path, command):
     path = finished(tmp_path)
     altered(path, command)
     refused(path, match="damaged.*restore it from a copy, or run the case again")
@@ -1024,7 +1022,7 @@ def test_a_record_that_is_not_as_it_was_is_told(tmp_path, command):
 
 @pytest.mark.long
 @pytest.mark.parametrize("rest", [1, 0])
-def test_the_older_checkpoint_serves_where_the_newest_is_broken(tmp_path, rest):
+def test_the_older_checkpoint_is_used_if_the_newest_is_damaged(tmp_path, rest):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     for folder in (whole, broken):
         folder.mkdir()
@@ -1050,7 +1048,7 @@ def test_the_older_checkpoint_serves_where_the_newest_is_broken(tmp_path, rest):
 
 
 @pytest.mark.long
-def test_a_checkpoint_that_is_gone_for_good_is_told(tmp_path):
+def test_a_missing_checkpoint_is_reported(tmp_path):
     ran(tmp_path, 3 * CHECKPOINT, retention=Retention(span=1.0))
     altered(tmp_path / NAME, "UPDATE checkpoints SET crc = crc + 1")
     with (
@@ -1061,8 +1059,8 @@ def test_a_checkpoint_that_is_gone_for_good_is_told(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_page_that_hides_rows_is_found(tmp_path):
-    """The checksums of the rows that are left do not show it, the pages do."""
+def test_a_page_that_hides_rows_is_detected(tmp_path):
+    """Checksums of the remaining rows do not show it; the pages do."""
     path = finished(tmp_path, 200)
     with sqlite3.connect(path) as raw:
         (size,) = raw.execute("PRAGMA page_size").fetchone()
@@ -1070,7 +1068,7 @@ def test_a_page_that_hides_rows_is_found(tmp_path):
     content, hidden = bytearray(path.read_bytes()), 0
     for page in range(size, len(content), size):
         count = int.from_bytes(content[page + 3 : page + 5])
-        if content[page] != 13 or count < 2:  # no leaf of a table
+        if content[page] != 13 or count < 2:  # not a leaf page of a table
             continue
         damaged = bytearray(content)
         damaged[page + 3 : page + 5] = (count - 1).to_bytes(2)
