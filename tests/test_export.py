@@ -1,4 +1,4 @@
-"""Runs in formats of other programs, read back with their readers."""
+"""Exports of runs to formats of other programs, read back with their readers."""
 
 import importlib.util
 import json
@@ -85,7 +85,7 @@ def files_of_a_run(kind: str, count: int, attrs: tuple) -> dict[str, bytes]:
 
 
 def made(folder, kind: str = "line", count: int = SAMPLES, **attrs) -> runs.Run:
-    """Return a finished run on a mesh of some kind."""
+    """Provide a finished run on a mesh of a given kind."""
     folder.mkdir()
     for name, content in files_of_a_run(kind, count, tuple(attrs.items())).items():
         (folder / name).write_bytes(content)
@@ -112,8 +112,8 @@ def rod(tmp_path) -> runs.Run:
         ("um", "um"),
         ("%", "%"),
         ("", "1"),
-        ("1/year", "year-1"),  # "a" is an are
-        ("m^0.5", None),  # there are no roots
+        ("1/year", "year-1"),  # in UDUNITS "a" is an are
+        ("m^0.5", None),  # UDUNITS has no roots
         ("cells per well", None),
         ("3 m", None),
     ],
@@ -123,7 +123,7 @@ def test_units_are_those_of_udunits(unit, expected):
 
 
 @pytest.mark.slow
-def test_every_name_is_one_of_cf_and_tells_its_own(rod):
+def test_every_exported_name_is_valid_in_cf_and_keeps_the_original(rod):
     found = cf(rod.dataset)
     assert all(str(name).isidentifier() and str(name).isascii() for name in found.variables)
     assert found["alpha_near_side"].attrs["long_name"] == "alpha[near side]"
@@ -132,7 +132,7 @@ def test_every_name_is_one_of_cf_and_tells_its_own(rod):
     assert np.array_equal(found["alpha_far"], rod.dataset["alpha[far]"])
 
 
-def test_names_that_would_be_the_same_are_told_apart():
+def test_names_that_would_coincide_stay_distinct():
     time = ("time", [0.0])
     data = xr.Dataset({"k[a b]": time, "k[a_b]": time, "κ": time, "2k": time}, {"time": [0.0]})
     found = cf(data)
@@ -140,7 +140,7 @@ def test_names_that_would_be_the_same_are_told_apart():
     assert found["v"].attrs["long_name"] == "κ"
 
 
-def test_a_unit_that_udunits_has_not_is_said_in_words(tmp_path):
+def test_a_unit_unknown_to_udunits_is_described_in_words(tmp_path):
     data = xr.Dataset({"k": ("time", [1.0], {"units": "m^0.5"})}, {"time": [0.0]}, {"scalars": "k"})
     found = cf(data)["k"].attrs
     assert found["comment"] == "unit: m^0.5"
@@ -148,7 +148,7 @@ def test_a_unit_that_udunits_has_not_is_said_in_words(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_belongs_to_a_number(rod):
+def test_a_number_is_exported_with_its_deviation_and_unit(rod):
     found = cf(rod.dataset)
     beside = found["loss"].attrs["ancillary_variables"].split()
     assert beside == ["loss_std", "loss_low", "loss_high", "loss_left"]
@@ -223,7 +223,7 @@ def test_times_of_a_model_without_units_are_plain_numbers(tmp_path):
 
 
 @pytest.mark.slow
-def test_fields_are_bound_to_places_on_disk(rod, tmp_path):
+def test_fields_have_coordinates_in_the_file(rod, tmp_path):
     export(rod, tmp_path / "rod.nc")
     with xr.open_dataset(tmp_path / "rod.nc", engine="scipy", decode_cf=False) as found:
         assert found["u"].attrs["coordinates"] == "x"
@@ -234,7 +234,7 @@ def test_fields_are_bound_to_places_on_disk(rod, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind in BODIES if kind != "line"])
-def test_a_mesh_after_ugrid(tmp_path, kind):
+def test_a_mesh_follows_ugrid(tmp_path, kind):
     export(made(tmp_path / "run", kind), tmp_path / "run.nc")
     with xr.open_dataset(tmp_path / "run.nc", engine="scipy") as found:
         found.load()
@@ -256,7 +256,7 @@ def test_a_mesh_after_ugrid(tmp_path, kind):
 
 
 def volume(points, kind, corners) -> float:
-    """Return the size of a mesh whose cells turn one way; of boxes by the edges at a corner."""
+    """Return the volume of a mesh of consistently oriented cells; boxes by edges at a corner."""
     ends = {"triangle": (1, 2), "quad": (1, 3), "tetra": (1, 2, 3), "hexahedron": (1, 3, 4)}[kind]
     share = {"triangle": 0.5, "quad": 1.0, "tetra": 1.0 / 6.0, "hexahedron": 1.0}[kind]
     edges = np.stack([points[corners[:, k]] - points[corners[:, 0]] for k in ends], axis=1)
@@ -267,11 +267,11 @@ def volume(points, kind, corners) -> float:
 
 
 @pytest.mark.slow
-def test_pandas_opens_what_is_over_time(rod, tmp_path):
+def test_pandas_opens_the_time_series(rod, tmp_path):
     export(rod, tmp_path / "rod.csv")
     found = pd.read_csv(tmp_path / "rod.csv", dtype=str)
     numbers = [name for name in found if name.endswith("]")]
-    found[numbers] = found[numbers].astype(float)  # exactly, as no parser of pandas 2 does
+    found[numbers] = found[numbers].astype(float)  # exact, unlike the parsers of pandas 2
     data = rod.dataset
     assert pd.Timestamp(found["date"].iloc[1]) == pd.Timestamp("2025-04-01 06:01")
     assert np.array_equal(found["time [s]"], data["time"])
@@ -298,7 +298,7 @@ def test_pandas_opens_what_is_over_time(rod, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", BODIES)
-def test_xdmf_holds_all_times(tmp_path, kind, monkeypatch):
+def test_xdmf_contains_all_times(tmp_path, kind, monkeypatch):
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
@@ -326,7 +326,7 @@ def test_xdmf_holds_all_times(tmp_path, kind, monkeypatch):
 
 
 @pytest.mark.slow
-def test_unknown_fields_are_on_the_mesh_too(tmp_path):
+def test_unknown_fields_are_also_on_the_mesh(tmp_path):
     writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="A rod")
     data = drive(identifier(field=True), samples()).result.to_xarray()
     writer.finish(status="finished", dataset=data)
@@ -335,11 +335,11 @@ def test_unknown_fields_are_on_the_mesh_too(tmp_path):
     assert {"u", "u_std", "alpha", "alpha_std"} <= set(found.point_data)
 
 
-# --- a run that goes on ----------------------------------------------------------------------
+# --- a run in progress ------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_a_run_that_goes_on_is_exported_as_far_as_it_is(tmp_path):
+def test_a_run_in_progress_is_exported_up_to_its_last_estimate(tmp_path):
     folder, who = tmp_path / "rod", identifier()
     RunWriter.create(folder, version="1", command=["livepde"], title="A rod")
     with journal(folder / "journal.sqlite", who) as kept:
@@ -366,7 +366,7 @@ HOSTILE = '</script><img src="http://evil.example/x"><script>alert(1)</script>'
 
 
 class Page(HTMLParser):
-    """What a page would fetch, its scripts, and its text."""
+    """Parser that collects external addresses, scripts and text of a page."""
 
     FETCHING = ("src", "href", "srcset", "data", "poster", "action", "background", "xlink:href")
 
@@ -390,7 +390,7 @@ class Page(HTMLParser):
 
 
 def watched_run(folder, title="A rod", status="finished"):
-    """Return a run with notes, checks, events and counts, under any title."""
+    """Return a run with notes, checks, events and counts, under a given title."""
     who = identifier()
     writer = RunWriter.create(folder, version="1.2", command=["livepde"], title=title, case=title)
     with journal(folder / "journal.sqlite", who, origin=ORIGIN) as kept:
@@ -406,7 +406,7 @@ def watched_run(folder, title="A rod", status="finished"):
 
 
 @pytest.mark.slow
-def test_a_report_says_what_there_is_to_say(tmp_path):
+def test_a_report_contains_notes_checks_events_and_counts(tmp_path):
     run = watched_run(tmp_path / "run")
     code, output = call("export", run.path, tmp_path / "run.html")
     assert code == 0
@@ -429,9 +429,9 @@ def test_a_report_says_what_there_is_to_say(tmp_path):
 
 
 @pytest.mark.slow
-def test_all_formats_are_looked_at_before_one_is_written(tmp_path, monkeypatch):
+def test_all_formats_are_checked_before_one_is_written(tmp_path, monkeypatch):
     run = watched_run(tmp_path / "run")
-    monkeypatch.setitem(sys.modules, "meshio", None)  # as if it were not there
+    monkeypatch.setitem(sys.modules, "meshio", None)  # simulates a missing package
     with pytest.raises(ConfigurationError, match=r"rod\.xdmf: this format needs meshio: pip"):
         call("export", run.path, tmp_path / "rod.csv", tmp_path / "rod.xdmf")
     assert not (tmp_path / "rod.csv").exists()
@@ -456,17 +456,17 @@ def test_vtk_reads_the_meshes(tmp_path, kind):
 
 
 def complaints(path) -> list[str]:
-    """Return the errors that a checker of the CF conventions finds, each with its section."""
+    """Return the errors of a CF checker, each with its section of the conventions."""
     runner = pytest.importorskip("compliance_checker.runner")
     suite = runner.CheckSuite()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the checker calls what its dependencies deprecate
+        warnings.simplefilter("ignore")  # the checker calls deprecated functions
         suite.load_all_available_checkers()
         with suite.load_dataset(str(path)) as data:
             ((found, crashed),) = suite.run_all(data, ["cf:1.11"]).values()
     assert not crashed
     highest = suite.checkers["cf:1.11"].HIGH
-    # The value is whether a check has passed, or how many parts of how many.
+    # The value is a boolean, or the number of passed parts and the number of parts.
     missed = [one for one in found if one.weight == highest and not passed(one.value)]
     return [f"{one.name}: {text}" for one in missed for text in one.msgs]
 
@@ -482,7 +482,7 @@ def passed(value: bool | tuple[int, int]) -> bool:
 )
 def test_a_checker_of_cf_accepts_the_files(tmp_path, kind):
     export(made(tmp_path / "run", kind, origin=ORIGIN), tmp_path / "run.nc")
-    # The roles of UGRID are part of CF 1.11, appendix A; the checker only knows the older ones.
+    # The roles of UGRID are part of CF 1.11, appendix A; the checker only knows older versions.
     found = [text for text in complaints(tmp_path / "run.nc") if "cf_role" not in text]
     assert not found
 
@@ -490,7 +490,7 @@ def test_a_checker_of_cf_accepts_the_files(tmp_path, kind):
 @pytest.mark.long
 def test_a_checker_of_cf_accepts_times_without_a_date(tmp_path):
     export(made(tmp_path / "run"), tmp_path / "run.nc")
-    # Seconds since nothing are no time of CF. The checker expects one for the name alone.
+    # Seconds without a date are not a CF time. The checker expects one because of the name.
     name_alone = "'time' should have standard_name='time'"
     assert all(name_alone in text for text in complaints(tmp_path / "run.nc"))
     with xr.open_dataset(tmp_path / "run.nc", engine="scipy") as found:
@@ -508,7 +508,7 @@ def test_coordinates_have_no_fill_value(rod):
 
 
 @pytest.mark.slow
-def test_a_copied_case_that_is_no_text_is_shown_as_far_as_it_is(tmp_path):
+def test_a_copied_case_that_is_not_text_is_shown_up_to_its_error(tmp_path):
     run = watched_run(tmp_path / "run")
     (run.path / "case.toml").write_bytes('title = "Fühler"'.encode("cp1252"))
     write_report(run, tmp_path / "run.html")
@@ -524,7 +524,7 @@ def test_a_copied_case_that_is_no_text_is_shown_as_far_as_it_is(tmp_path):
         (0.5, [], "Expected error <= 0.1, but it is 0.5"),
     ],
 )
-def test_a_report_says_first_whether_anything_is_wrong(tmp_path, monkeypatch, value, doubts, said):
+def test_a_report_starts_with_its_problems(tmp_path, monkeypatch, value, doubts, said):
     monkeypatch.setattr(runs, "doubts", lambda data: doubts)
     writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="A rod")
     data = drive(identifier(), samples()).result.to_xarray()
@@ -538,7 +538,7 @@ def test_a_report_says_first_whether_anything_is_wrong(tmp_path, monkeypatch, va
 
 
 @pytest.mark.slow
-def test_a_report_fetches_nothing(tmp_path):
+def test_a_report_loads_nothing_from_the_network(tmp_path):
     write_report(watched_run(tmp_path / "run"), tmp_path / "run.html")
     page = Page(tmp_path / "run.html")
     assert page.text.index("Measured and modelled") < page.text.index("Residuals")
@@ -550,9 +550,9 @@ def test_a_report_fetches_nothing(tmp_path):
 
 
 @pytest.mark.slow
-def test_titles_names_and_texts_are_shown_as_they_stand(tmp_path):
+def test_titles_names_and_texts_are_escaped(tmp_path):
     run = watched_run(tmp_path / "run", HOSTILE)
-    run.dataset = run.dataset.assign_coords(sensor=[HOSTILE])  # which come into a script
+    run.dataset = run.dataset.assign_coords(sensor=[HOSTILE])  # which become part of a script
     write_report(run, tmp_path / "run.html")
     text = (tmp_path / "run.html").read_text(encoding="utf-8")
     assert HOSTILE not in text
@@ -587,7 +587,7 @@ def browser():
 
 @pytest.mark.browser
 @pytest.mark.parametrize("kind", ["line", "triangle", "tetra"])
-def test_a_browser_draws_a_report_and_asks_nobody(tmp_path, browser, kind):
+def test_a_browser_draws_a_report_without_the_network(tmp_path, browser, kind):
     run = made(tmp_path / "run", kind, origin=ORIGIN)
     write_report(run, tmp_path / "run.html")
     browser.get((tmp_path / "run.html").as_uri())
@@ -615,7 +615,7 @@ def test_a_browser_draws_a_report_and_asks_nobody(tmp_path, browser, kind):
 
 
 @pytest.mark.slow
-def test_the_command_writes_several(rod, tmp_path):
+def test_the_command_writes_several_formats(rod, tmp_path):
     targets = [tmp_path / name for name in ("a.nc", "a.CSV", "a.xdmf", "a.zarr")]
     code, output = call("export", rod.path, *targets)
     assert code == 0
@@ -627,7 +627,7 @@ def test_the_command_writes_several(rod, tmp_path):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["a.nc", "a.csv", "a.xdmf", "a.vtu", "a.zarr"])
-def test_nothing_is_written_over_unasked(rod, tmp_path, name):
+def test_files_are_only_overwritten_with_force(rod, tmp_path, name):
     target = tmp_path / name
     export(rod, target)
     other = made(tmp_path / "other", count=3)
@@ -641,7 +641,7 @@ def test_nothing_is_written_over_unasked(rod, tmp_path, name):
 
 
 @pytest.mark.slow
-def test_the_file_beside_xdmf_is_not_written_over_either(rod, tmp_path):
+def test_the_data_file_of_xdmf_is_not_overwritten_either(rod, tmp_path):
     (tmp_path / "a.h5").write_text("mine")
     with pytest.raises(RunError, match=r"a\.h5 exists"):
         export(rod, tmp_path / "a.xdmf")
@@ -650,7 +650,7 @@ def test_the_file_beside_xdmf_is_not_written_over_either(rod, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_folder_that_is_no_store_stays(rod, tmp_path):
+def test_a_folder_that_is_not_a_store_is_not_overwritten(rod, tmp_path):
     mine = tmp_path / "mine.zarr"
     mine.mkdir()
     (mine / "notes").write_text("mine")
@@ -670,7 +670,7 @@ def test_a_folder_that_is_no_store_stays(rod, tmp_path):
         (["a.vtu", "--at", "3 m"], "--at: 'm' cannot be converted to 's'"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_sentence(rod, tmp_path, arguments, said):
+def test_impossible_exports_are_refused_with_one_sentence(rod, tmp_path, arguments, said):
     first, *more = arguments
     with pytest.raises(LivepdeError, match=said):
         call("export", rod.path, tmp_path / first, *more)

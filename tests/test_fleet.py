@@ -1,4 +1,4 @@
-"""A fleet: the numbers of separate identifiers, whatever happens to some of its members."""
+"""A fleet gives the numbers of separate identifiers, also if some members fail."""
 
 from functools import partial
 
@@ -21,7 +21,7 @@ BOUNDED = lp.Normal(0.5, std=0.25, bounds=(0.45, 0.55))
 
 
 def rod(prior=ALPHA, **alpha):
-    """Two unknowns; inputs in the boundary values and beside an unknown."""
+    """Return a rod with two unknowns, and inputs in boundary values and as factor of an unknown."""
     ends = {"left": lp.Channel("T_0"), "right": 0.0}
     return heat(
         line(16), lp.Scalar(prior, unit="m^2/s", **alpha), ends, loss=lp.Normal(0.3, std=0.2)
@@ -29,7 +29,7 @@ def rod(prior=ALPHA, **alpha):
 
 
 def sources():
-    """Sources that depend on time, without inputs; elements of second order."""
+    """Return a model with time-dependent sources, no inputs, and quadratic elements."""
     return lp.Model(
         lp.Field(line(12), ElementLineP2(), dirichlet={"boundary": 0.0}),
         {"a": lp.Normal(0.5, std=2.0), "b": lp.Normal(-1.0, std=0.5)},
@@ -39,7 +39,7 @@ def sources():
 
 
 def layers():
-    """One unknown for each of two layers, and a source that is an input."""
+    """Return a model with one unknown per layer, and an input as source."""
     halves = {"top": lambda x: x[0] < 0.4, "bottom": lambda x: x[0] >= 0.4}
     return lp.Model(
         lp.Field(line(16), ElementLineP1(), dirichlet={"left": lp.Channel("T_0")}),
@@ -51,7 +51,7 @@ def layers():
 
 
 def walks():
-    """An unknown that walks, one that reverts, one with harmonics, and one that stays."""
+    """Return a model with a random walk, a mean-reverting, a harmonic and a constant unknown."""
     evolutions = {
         "a": lp.RandomWalk(0.1),
         "b": lp.MeanReverting(2.0),
@@ -82,7 +82,7 @@ MODELS = {
 
 
 def law(**options) -> lp.SensitivityLaw:
-    """Return a law whose runs are not judged: those of a fleet are not.
+    """Return a law without a verdict, because a fleet has none.
 
     Its start is short and without shadows: "usual" is the law that has both as they are by default.
     """
@@ -132,7 +132,7 @@ def samples(fleet, steps=16, seed=0):
 
 
 def assert_equal(estimate, others, tolerance=1e-8):
-    """Every number of the estimate is that of separate identifiers."""
+    """Assert that every number of the estimate equals that of separate identifiers."""
     for k, other in enumerate(others):
         one = estimate.member(k)
         pairs = [(estimate.q[k], other.q), (one.q, other.q), (one.u, other.u)]
@@ -148,7 +148,7 @@ def assert_equal(estimate, others, tolerance=1e-8):
 
 
 def compare(model, law, stream=samples, members=4, sensors=SENSORS, **options):
-    """Step a fleet and separate identifiers by the same samples."""
+    """Step a fleet and separate identifiers with the same samples, and compare them."""
     fleet = lp.Fleet(model, sensors, law, members, **options)
 
     def each(name, k):
@@ -166,7 +166,7 @@ def compare(model, law, stream=samples, members=4, sensors=SENSORS, **options):
             for k, one in enumerate(separate)
         ]
         assert_equal(estimate, others)
-    for k, one in enumerate(separate):  # verdicts count failed steps and gaps of each
+    for k, one in enumerate(separate):  # each verdict counts failed steps and gaps
         mine, own = fleet.identifier(k)._so_far, one._so_far
         assert mine.steps.counts.tolist() == own.steps.counts.tolist()
         for name in ("counts", "held", "unstated"):
@@ -194,7 +194,7 @@ def test_equals_separate_identifiers(model, law):
 
 
 @pytest.mark.long
-def test_members_start_where_they_are_told_to():
+def test_members_start_at_their_initial_values():
     starts = [{"alpha": 0.3 + 0.1 * k, "loss": 0.2} for k in range(4)]
     states = [0.0, 0.2, lambda x: x[0], 1.0]
     _, estimate = compare(rod(), LAWS["plain"], q0=starts, u0=states, assimilate_from=0.75)
@@ -220,7 +220,7 @@ def test_an_unknown_initial_state_learns_from_a_first_sample():
 
 
 @pytest.mark.long
-def test_a_bound_is_kept_and_left_again():
+def test_a_bound_is_active_and_later_inactive():
     model = rod(BOUNDED)
     fleet, estimate = compare(model, law(), members=6)
     assert fleet.together
@@ -231,7 +231,7 @@ def test_a_bound_is_kept_and_left_again():
 
 @pytest.mark.long
 def test_a_member_that_fails_does_not_disturb_the_others():
-    """Its input overflows for some samples: it stays as it was, and later goes on."""
+    """If its input overflows for some samples, its state is kept, and later it continues."""
 
     def stream(fleet):
         for k, (t, z, inputs) in enumerate(samples(fleet)):
@@ -252,7 +252,7 @@ def test_a_member_that_fails_does_not_disturb_the_others():
 
 
 class Singular(lp.GradientLaw):
-    """A law that solves no sample of 9."""
+    """Law that cannot solve samples with the value 9."""
 
     def step(self, work, state, interval):
         if interval.z1[0] == 9.0:
@@ -260,7 +260,7 @@ class Singular(lp.GradientLaw):
         return super().step(work, state, interval)
 
 
-def test_a_law_that_raises_or_overflows_for_a_member_is_a_status_of_it():
+def test_a_law_that_fails_for_a_member_gives_it_a_status():
     fleet = lp.Fleet(rod(), SENSORS, Singular(), 2)
     inputs, good = {"T_0": 1.0, "ambient": 0.0}, [0.3, 0.2, 0.1]
     for k, (first, code) in enumerate([(0.3, "ok"), (9.0, "singular"), (1e200, "not_finite")]):
@@ -339,8 +339,8 @@ def test_sensors_that_see_an_unknown_step_one_by_one():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cut", [0, 10])
-def test_goes_on_from_a_checkpoint_with_the_same_numbers(cut, tmp_path):
-    """Also before the first sample. At any sample, with other laws: test_shard.py."""
+def test_a_fleet_resumes_from_a_checkpoint_with_equal_numbers(cut, tmp_path):
+    """Also before the first sample; test_shard.py tests any sample and other laws."""
     model, law = rod(), LAWS["usual"]
     fleet, other, strange = (lp.Fleet(model, SENSORS, law, ["a", end]) for end in "bbc")
     stream = samples(fleet, steps=20)
@@ -369,8 +369,8 @@ def test_channels_by_name_and_validation_sensors():
     assert estimate.innovation[0, 0] == pytest.approx(estimate.innovation[1, 0] + 0.7)
 
 
-def test_values_with_names_are_those_of_the_members_of_these_names():
-    """They were taken in their order: each member took the readings of another."""
+def test_values_are_assigned_to_members_by_name():
+    """They were once used in their order, so that members got the readings of others."""
     z = np.array([[0.1, 0.2, np.nan], [0.4, 0.5, 0.6]])
     rows = pd.DataFrame(z, ["north", "south"], ["T_1", "T_2", "T_3"]).loc[["south", "north"]]
     heated = pd.Series({"south": 1.0, "north": 0.5})
@@ -396,8 +396,8 @@ def test_a_missing_input_leaves_the_value_among_the_readings():
     np.testing.assert_array_equal(estimate.innovation, other.innovation)
 
 
-def test_a_gap_of_one_member_changes_nothing_of_another():
-    """Its covariance had rows of zeros then, and its intervals were other ones after a refit."""
+def test_a_gap_of_one_member_does_not_change_another():
+    """Its covariance once had rows of zeros, and its intervals changed after a refit."""
     flux = lp.Scalar(lp.Normal(0.0, 0.5), evolution=lp.fem.Periodic(2.0, harmonics=2))
     model = heat(line(12), lp.LogNormal(0.3, 0.15), {"left": lp.Channel("T_0")})
     model = with_conditions(model, {"right": Flux("J")}, unknowns={"J": flux})
@@ -491,7 +491,7 @@ def test_bad_members():
         fleet.run(pd.DataFrame())
 
 
-def test_blocks_solve_what_each_would_and_a_singular_one_disturbs_none():
+def test_blocks_are_solved_separately_and_a_singular_one_fails_alone():
     rng = np.random.default_rng(0)
     n, blocks = 9, 6
     near = np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= 2
@@ -510,7 +510,7 @@ def test_blocks_solve_what_each_would_and_a_singular_one_disturbs_none():
 
 
 @pytest.mark.slow
-def test_estimates_are_computed_when_they_are_read_and_are_those_of_their_sample(monkeypatch):
+def test_lazy_estimates_are_those_of_their_sample(monkeypatch):
     kept, eager = (lp.Fleet(rod(), SENSORS, law(), 3) for _ in range(2))
     stream, calls, beliefs = samples(kept, 6), [], kept._engine.beliefs
 
@@ -549,7 +549,7 @@ def test_symmetric_tridiagonal_blocks_are_solved_whether_definite_or_not(shift):
     for k in range(blocks):
         wanted = np.linalg.solve(matrices[k], right[:, k].T).T
         np.testing.assert_allclose(x[:, k], wanted, rtol=1e-10)
-    data[1, 3] = np.nan  # disturbs no other block
+    data[1, 3] = np.nan  # does not affect other blocks
     x = solver.factorise(solver.band(data)).solve(right.copy())
     assert np.isnan(x[:, 1]).all()
     for k in (0, 2):
@@ -562,8 +562,8 @@ def test_symmetric_tridiagonal_blocks_are_solved_whether_definite_or_not(shift):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", MODELS)
-def test_what_is_kept_is_what_the_results_of_separate_runs_keep(name):
-    """Numbers, ends of intervals, shares of the prior, fields, correlations, notes."""
+def test_results_equal_the_results_of_separate_runs(name):
+    """Compares numbers, interval ends, shares of the prior, fields, correlations and notes."""
     model = MODELS[name]()
     law = lp.SensitivityLaw(gate=3.0, noise="auto", refit=lp.laws.Refit(start=4), verdict=False)
     fleet = lp.Fleet(model, SENSORS, law, 3, validation=lp.Points({"hidden": 0.4}))
@@ -586,7 +586,7 @@ def test_what_is_kept_is_what_the_results_of_separate_runs_keep(name):
 
 @pytest.mark.parametrize("law", ["drift", "gate, noise"])
 @pytest.mark.slow
-def test_an_identifier_goes_on_from_where_a_member_is(law):
+def test_an_identifier_continues_from_the_state_of_a_member(law):
     fleet = lp.Fleet(rod(), SENSORS, LAWS[law], ["a", "b"])
     stream = samples(fleet, 24)
     for sample in stream[:12]:
@@ -605,7 +605,7 @@ def test_an_identifier_goes_on_from_where_a_member_is(law):
 
 
 def test_an_identifier_of_a_member_without_samples_begins_as_the_member_does():
-    """With its own errors of the initial state, and its own state on the mesh of the shadow."""
+    """It has its own initial errors, and its own state on the shadow's mesh."""
     starts = [0.0, lambda x: np.sin(3.0 * np.pi * x[0])]
     errors = [(0.1,), (lambda x: 0.3 * x[0], lambda x: 0.2 * (1.0 - x[0]))]
     model, law = rod(), lp.SensitivityLaw()
@@ -657,7 +657,7 @@ def test_the_verdict_on_a_member_is_that_of_a_separate_run():
     assert levels[1] != "trusted"
 
 
-def test_a_member_whose_first_samples_are_gone_is_not_judged():
+def test_a_member_without_its_first_samples_is_not_judged():
     law = lp.SensitivityLaw(refit=lp.laws.Refit(start=4, window=10))
     fleet = lp.Fleet(rod(), SENSORS, law, 2)
     for sample in samples(fleet, steps=40):

@@ -1,4 +1,4 @@
-"""`livepde init --data`: what a table tells is filled in, what it does not tell is named."""
+"""`livepde init --data` fills in what the table determines, and names what is missing."""
 
 import json
 import re
@@ -37,14 +37,14 @@ FILLED = {
 
 
 def begun(text: str, encoding: str = "utf-8", equation: str = "heat") -> dict:
-    """Return the document of the case for a table."""
+    """Return the parsed case that `init` writes for a table."""
     Path("my.csv").write_bytes(text.encode(encoding))
     case, _ = write_template(Path("mine"), Path("my.csv"), EQUATIONS[equation])
     return tomllib.loads(case.read_text())
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "cp1252"])
-def test_a_table_of_a_german_excel(here, encoding):
+def test_a_table_from_a_german_excel_is_read(here, encoding):
     found = begun(GERMAN, encoding)
     how = {} if encoding.startswith("utf-8") else {"encoding": encoding}
     assert found["data"] == {
@@ -77,7 +77,7 @@ def test_a_table_of_a_german_excel(here, encoding):
         ("index,T_0.05,T_b", "index", "?", "? s"),
     ],
 )
-def test_numbers_as_times(here, header, time, unit, step):
+def test_numbers_are_read_as_times(here, header, time, unit, step):
     found = begun(f"{header}\n0,20,20\n10,21,\n20,20,21\n60,20,21\n")
     assert found["data"] == {"file": "../my.csv", "time": time, "time_unit": unit}
     assert found["steps"]["dt_max"] == step
@@ -116,7 +116,7 @@ def test_a_table_that_cannot_be_used_is_one_sentence(here, text, told):
     assert not Path("mine").exists()
 
 
-def test_only_tables_with_a_header(here):
+def test_a_table_without_a_header_is_refused(here):
     Path("my.jsonl").write_text('{"time": 0}')
     with pytest.raises(lp.errors.DataError, match=r"my\.jsonl: expected a CSV file"):
         write_template(Path("mine"), Path("my.jsonl"))
@@ -124,7 +124,7 @@ def test_only_tables_with_a_header(here):
         write_template(Path("mine"), Path("my.csv"))
 
 
-def test_a_table_is_no_folder(here):
+def test_a_folder_is_refused_as_a_table(here):
     Path("my.csv").write_text("time_s,T\n0,20\n")
     with pytest.raises(
         lp.errors.RunError, match=r"my\.csv is a file: 'livepde init DIR --data my\.csv'"
@@ -158,7 +158,7 @@ def test_an_order_of_day_and_month_that_cannot_be_known_is_refused(here, first, 
         ("28-Jun-2016 23:45", "29-Jun-2016 00:00", "%d-%b-%Y %H:%M", "2016-06-28 23:45:00"),
     ],
 )
-def test_dates_whose_order_the_rows_tell(here, first, second, form, origin):
+def test_the_order_of_day_and_month_is_inferred_from_the_rows(here, first, second, form, origin):
     third = second.replace("00:00", "00:15").replace("12:00", "12:15")
     text = f"id,time,T\n1,{first},20\n2,{second},20\n3,{third},21\n"
     found = begun(text)
@@ -178,7 +178,7 @@ def test_dates_whose_order_the_rows_tell(here, first, second, form, origin):
         ("01.04.2025", "12:00:00", "%d.%m.%Y %H:%M:%S"),
     ],
 )
-def test_days_and_times_of_day_in_two_columns(here, day, hour, form):
+def test_dates_and_times_of_day_may_be_two_columns(here, day, hour, form):
     later = hour.replace(":00", ":10", 1)
     found = begun(f"date,hour,T_5cm,T_10cm\n{day},{hour},20,20\n{day},{later},21,20\n")
     assert found["data"]["time"] == ["date", "hour"]
@@ -192,7 +192,7 @@ def test_days_and_times_of_day_in_two_columns(here, day, hour, form):
         cases.load("mine/case.toml", settings=FILLED).prepare("rows.parquet")
 
 
-def test_title_lines_before_the_header(here):
+def test_title_lines_before_the_header_are_skipped(here):
     title = "Logger 17, made by A\n\nbench 3;\n"
     table = "time_s;T_5cm;T_10cm\n0;20,5;20,5\n10;21,5;20,5\n"
     found = begun(title + table)
@@ -246,10 +246,10 @@ def test_a_column_named_like_an_input_is_that_input(here, name):
     assert found["options"] == {"L": "? m", "ratio": "?"}
 
 
-def test_without_that_input_another_unknown_is_taken(here):
+def test_without_that_input_another_unknown_is_proposed(here):
     found = begun("time_s,T_5cm\n0,20\n1,20\n", equation="advection_diffusion")
     assert set(found["unknowns"]) == {"kappa", "v"}
-    assert "transform" not in found["unknowns"]["v"]  # a flux may have any sign
+    assert "transform" not in found["unknowns"]["v"]  # a flux may be negative
     assert found["options"] == {"ratio": "?"}
     assert set(found["channels"]) == {"T_5cm"}
 
@@ -261,10 +261,10 @@ def test_a_column_of_the_flow_needs_no_unknown_flux(here):
 
 
 @pytest.mark.parametrize("name", ["borehole", "grouted_borehole", "pumping_test"])
-def test_graded_meshes_where_the_equation_wants_them(here, name):
+def test_equations_that_need_it_get_a_graded_mesh(here, name):
     found = begun("time_s,a\n0,1\n1,1\n", equation=name)
     assert found["mesh"]["spacing"] == "geometric"
-    assert found["initial"].startswith("?")  # a line between sensors is no state around a well
+    assert found["initial"].startswith("?")  # a line between sensors is not the head around a well
     if name != "pumping_test":
         return
     filled = {"mesh.from": "0.1 m", "mesh.to": "900 m", "options.b": "10 m", "law.noise": "1 cm"}
@@ -277,19 +277,19 @@ def test_graded_meshes_where_the_equation_wants_them(here, name):
         assert any(told in note for note in case.notes) is expected
 
 
-def test_names_that_are_alike_without_signs_and_units(here):
+def test_similar_names_without_signs_and_units_stay_distinct(here):
     found = begun("time_s,T 1,T-1,T [K],T [degC],[K],state\n0,1,1,1,1,1,ok\n1,1,1,1,1,1,ok\n")
     assert set(found["channels"]) == {"T 1", "T-1", "T [K]", "T [degC]", "[K]"}
 
 
-def test_names_whose_numbers_are_no_places(here):
+def test_numbers_in_names_are_not_always_positions(here):
     names = ["depth -0.5 m", "Q_5 m3/h", "flux_30_m2", "T 0.5 m"]
     found = begun(f"time_s,{','.join(names)}\n0,1,1,1,1\n1,1,1,1,1\n")["channels"]
     places = [item["at"] for item in found.values()]
     assert places == ["? m", "? m", "? m", "0.5 m"]
 
 
-def test_a_case_behind_a_link_finds_its_table(here):
+def test_a_case_behind_a_link_reads_its_table(here):
     (here / "far" / "away").mkdir(parents=True)
     (here / "link").symlink_to(here / "far" / "away")
     (here / "table.csv").write_text("time_s,T\n0,1\n1,1\n")
@@ -318,7 +318,7 @@ def test_inputs_and_units_of_another_equation(here):
     assert found["inputs"] == {"Q": "? m^3/s"}
     assert "t0" not in found["data"]
     Path("mine/case.toml").unlink()
-    # At the first row the process has gone on for a while: when did it begin?
+    # The process began before the first row, at an unknown time.
     found = begun("time (min),near 8 m\n2,0.1\n3,0.2\n", equation="pumping_test")
     assert found["data"]["t0"] == "? min"
 
@@ -347,7 +347,7 @@ def test_a_case_of_every_equation_has_what_it_needs(here, name):
         assert f"mine/case.toml: {side} = " in str(error.value)
 
 
-def test_a_preview_of_what_was_read(here):
+def test_init_previews_the_table_it_read(here):
     Path("my.csv").write_text(
         "Logger 17\nid;when;T_5cm [degF];Q;note;T_b\n"
         "1;01.04.2025 12:00;68;1;a;20\n2;01.04.2025 12:10;;1;b;20\n3;01.04.2025 13:00;70;1;c;21\n"
@@ -366,7 +366,7 @@ def test_a_preview_of_what_was_read(here):
 
 
 @pytest.mark.slow
-def test_options_for_what_the_table_does_not_tell(here):
+def test_options_provide_what_the_table_does_not_contain(here):
     Path("my.csv").write_text("a;b\ntime;T\n03/02/2026 08:00;20\n03/02/2026 08:10;20\n")
     runner = CliRunner()
     begin = ["init", "mine", "--data", "my.csv"]
@@ -400,7 +400,7 @@ def test_options_for_what_the_table_does_not_tell(here):
 
 
 def test_each_place_that_is_left_open_is_named(here):
-    """By `init`, and by `check` and `run` in a sentence each."""
+    """`init` names them, and `check` and `run` report each in one sentence."""
     names = [f"T {k}" for k in range(1, 10)]
     row = ",".join("20" for _ in names)
     Path("my.csv").write_text(f"time,Q [gpm],{','.join(names)}\n0,1,{row}\n9,1,{row}\n")
@@ -425,7 +425,7 @@ def test_each_place_that_is_left_open_is_named(here):
         ]
 
 
-def test_an_equation_belongs_to_a_table(here):
+def test_the_option_equation_requires_a_table(here):
     Path("my.csv").write_text("time_s,T\n0,20\n")
     runner = CliRunner()
     for arguments, told in (
@@ -461,7 +461,7 @@ WALL = {
         ({"mesh.cells": 400, "mesh.to": "20 m", "unknowns.source.std": 1}, True),
     ],
 )
-def test_a_process_that_nothing_drives_is_noted(here, more, driven):
+def test_a_process_without_excitation_is_noted(here, more, driven):
     begun("time_s,T_5mm,T_10mm\n0,20,20\n10,21,21\n", equation="conduction")
     case = Path("mine/case.toml")
     if "unknowns.source.std" in more:
@@ -507,7 +507,7 @@ def two_tables() -> list[str]:
 
 
 @pytest.mark.long
-def test_two_tables_are_joined_by_time(here):
+def test_two_tables_are_joined_by_their_times(here):
     begin = ["init", "mine", *two_tables()]
     sets = [part for key, value in FILES.items() for part in ("--set", f"{key}={value}")]
     done = CliRunner().invoke(app, [*begin, *sets])
@@ -524,7 +524,7 @@ def test_two_tables_are_joined_by_time(here):
     }
     prepared = cases.load("mine/case.toml").prepare()
     raw = prepared.raw
-    # It begins where both tables have begun, and the rows are those of both.
+    # The joined table begins when both tables have begun, and has the rows of both.
     np.testing.assert_allclose(raw.t, [0, 60, 120, 150, 180, 240])
     at = {name: raw.values[:, k] for k, name in enumerate(raw.names)}
     np.testing.assert_allclose(at["T_5cm"], [20, 21, 22, np.nan, 23, 24])
@@ -562,7 +562,7 @@ T_2 = { role = "sensor", column = "T_2cm", at = "2 cm" }
     assert skipped.raw.remarks["skipped", "T_1"] == 1
 
 
-def test_a_late_sensor_begins_no_run_before_its_stated_state(here):
+def test_a_late_sensor_does_not_start_a_run_before_its_initial_state(here):
     Path("a.csv").write_text("t,T_1cm,T_2cm\n0,20,20\n10,21,20\n20,22,21\n30,23,22\n")
     Path("case.toml").write_text("""
 equation = "heat"
@@ -597,7 +597,7 @@ T_2 = { role = "sensor", column = "T_2cm", at = "2 cm", late = "10 s" }
         (("t,a\n0,\n1,\n", "t,b\n0,\n1,\n"), "", "no sensor has a value where all files have one"),
     ],
 )
-def test_tables_that_cannot_be_joined(here, files, channel, told):
+def test_tables_that_cannot_be_joined_are_refused(here, files, channel, told):
     for name, text in zip(("a.csv", "b.csv"), files, strict=True):
         Path(name).write_text(text)
     both = {"s": channel} if channel else {"s": "a", "r": "b"}
@@ -628,7 +628,7 @@ def test_several_tables_are_not_followed(here):
         ("time,Q\n2026-03-02 08:00,5\n", "has dates as times, the other has numbers"),
     ],
 )
-def test_tables_that_init_refuses(here, text, told):
+def test_init_refuses_unsuitable_tables(here, text, told):
     arguments = two_tables()
     Path("heater.csv").write_text(text)
     error = CliRunner().invoke(app, ["init", "mine", *arguments]).exception
@@ -637,16 +637,16 @@ def test_tables_that_init_refuses(here, text, told):
 
 
 def test_a_column_with_a_unit_fits_a_model_without_one(tmp_path):
-    """`unit = "? mg/L"` could not be filled in: a concentration of the model has no unit."""
+    """`unit = "? mg/L"` could not be filled in, because the model's concentration has no unit."""
     (tmp_path / "t.csv").write_text("t (h),c_in (mg/L),c_10cm (mg/L)\n0,50,0\n1,50,9\n2,50,20\n")
     found = channels_in(measured(tmp_path / "t.csv", "h"), EQUATIONS["advection_dispersion"])
     assert ["unit" in one.given for one in found] == [False, False]
-    assert convert("1.44", "", "options.ratio") == 1.44  # as `"?"` is filled in
+    assert convert("1.44", "", "options.ratio") == 1.44  # if `"?"` is filled in
     with pytest.raises(CaseError, match="'mg/L' cannot be converted to '1'; expected no unit"):
         conversion("mg/L", "", "channels.c.unit")
 
 
-def test_a_comment_with_as_many_cells_as_a_row_is_no_header(here):
+def test_a_comment_with_as_many_cells_as_a_row_is_not_a_header(here):
     Path("t.csv").write_text("# chain; mooring Z3; local time\ntime;a;b\n0;1,5;2,5\n1;2,5;3,5\n")
     assert measured(Path("t.csv"), "s").samples.names == ("a", "b")
     Path("t.csv").write_text("# time;a;b\n0;1,5;2,5\n1;2,5;3,5\n")
@@ -654,7 +654,7 @@ def test_a_comment_with_as_many_cells_as_a_row_is_no_header(here):
 
 
 def test_a_moisture_in_percent_is_the_state_of_a_case(here):
-    """The equations of a diffusion were refused as no temperature, and named C without a unit."""
+    """Moisture was once refused because diffusion equations expected a temperature."""
     rows = "".join(f"{h},{20 - h},{20 - h / 2}\n" for h in range(30))
     Path("t.csv").write_text(f"time_s,u_1cm (%),u_3cm (%)\n{rows}")
     settings = ["mesh.from=0", "mesh.to=5 cm", "law.noise=0.2 %", "unknowns.alpha.prior=1e-6 m^2/s"]
@@ -670,7 +670,7 @@ def test_a_moisture_in_percent_is_the_state_of_a_case(here):
 
 
 def test_a_power_is_not_read_as_power_per_volume(here):
-    """A column `P(W)` of a source in W/m^3 was used as it was, without a word."""
+    """A column `P(W)` was once used as a source in W/m^3 without a warning."""
     rows = "".join(f"{s},20,{20 + s},5\n" for s in range(30))
     Path("t.csv").write_text(f"time_s,T_room (C),T_1cm,P(W)\n{rows}")
     case = Path("case.toml")

@@ -1,4 +1,4 @@
-"""Runs beside a process: journal, resume after a kill, rows out of order."""
+"""Live runs: journal, resume after a kill, rows out of order, faults of the source."""
 
 import json
 import math
@@ -68,7 +68,7 @@ run.journal.close()
 
 
 @pytest.mark.slow
-def test_killed_at_any_moment_it_goes_on_as_if_nothing_had_happened(tmp_path):
+def test_a_run_killed_at_any_moment_resumes_bit_by_bit(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     for folder in (whole, killed):
         folder.mkdir()
@@ -78,7 +78,7 @@ def test_killed_at_any_moment_it_goes_on_as_if_nothing_had_happened(tmp_path):
     here = str(Path(__file__).parent)
     rng, kills = np.random.default_rng(1), 0
     for samples in (0, 50):
-        fuse = str(samples), f"{rng.uniform(0.001, 0.012)}"  # and seconds of a processor
+        fuse = str(samples), f"{rng.uniform(0.001, 0.012)}"  # and processor seconds
         child = subprocess.run([sys.executable, "-c", CHILD, str(killed), here, *fuse], check=False)
         assert child.returncode in (0, -signal.SIGPROF)
         kills += child.returncode != 0
@@ -91,7 +91,7 @@ def test_killed_at_any_moment_it_goes_on_as_if_nothing_had_happened(tmp_path):
 
 
 def test_a_session_without_samples_ends_as_the_one_before_it(tmp_path):
-    """It may have been killed at the end of its data, before it wrote results."""
+    """The session before may have been killed at the end of its data, before writing results."""
     write(tmp_path, 27)
     found = []
     for _ in range(2):
@@ -148,7 +148,7 @@ def test_channels_that_come_one_by_one_make_one_sample():
 
 
 @pytest.mark.parametrize(("repeated", "value"), [("first", 1.0), ("last", 2.0)])
-def test_a_second_value_is_counted(repeated, value):
+def test_a_second_value_of_a_reading_is_counted(repeated, value):
     intake = Intake(COLUMNS, CLOCK, Policy(repeated=repeated), last=-1.0)
     intake.take({"t": 0.0, "a": 1.0})
     (remark,) = intake.take({"t": 0.0, "a": 2.0}).remarks
@@ -157,7 +157,7 @@ def test_a_second_value_is_counted(repeated, value):
     assert sample.values == {"a": value}
 
 
-def test_each_channel_has_habits_of_its_own():
+def test_each_channel_has_its_own_rules():
     columns = {
         "a": Column(("a",), valid=(0.0, 1.0)),
         "b": Column(("b",)),
@@ -166,9 +166,9 @@ def test_each_channel_has_habits_of_its_own():
     intake = Intake(columns, CLOCK, Policy(channels={"b": Habit(wait=5.0)}))
     found, kinds = [], []
     for row in (
-        {"t": 0.0, "a": 2.0, "b": 0.1, "left": 1.0},  # not valid
+        {"t": 0.0, "a": 2.0, "b": 0.1, "left": 1.0},  # invalid
         {"t": 1.0, "a": 0.5, "left": 1.0},  # b comes later
-        {"t": 2.0, "a": 0.5, "b": 0.2, "left": None},  # left out
+        {"t": 2.0, "a": 0.5, "b": 0.2, "left": None},  # missing
         {"t": 1.0, "b": 0.3},
         {"t": 3.0, "a": 0.5, "left": 1.0},  # b never comes
         {"t": 9.0, "a": 0.5, "b": 0.4, "left": 1.0},
@@ -189,7 +189,7 @@ def test_each_channel_has_habits_of_its_own():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("overflow", ["merge", "drop"])
-def test_what_comes_too_fast_is_merged_or_dropped_and_counted(tmp_path, overflow):
+def test_rows_that_arrive_too_fast_are_merged_or_dropped_and_counted(tmp_path, overflow):
     write(tmp_path, 100)
     run = live(tmp_path, backlog=Backlog(overflow, 10))
     run.run()
@@ -216,14 +216,14 @@ def test_broken_rows_are_counted_and_the_rest_arrives(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", "nan", "1" * 2_000_000, "[" * 100_000])
-def test_lines_that_are_no_rows(text):
+def test_lines_that_are_not_rows_are_counted(text):
     assert json_row(text).broken
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong_rows", [1, 40])
-def test_a_clock_that_is_wrong_for_long_does_not_hold_a_run_up(tmp_path, wrong_rows):
-    """Also if its rows continue for so long that they are believed: the step is short."""
+def test_a_clock_that_is_wrong_for_long_does_not_delay_a_run(tmp_path, wrong_rows):
+    """Even if its rows continue so long that the clock is accepted, the step is short."""
     mixed = list(rows(20))
     wrong = {"a": 0.7, "b": 0.4, "left": 1.0}
     mixed[8:8] = [{"t": 1e12 + k, **wrong} for k in range(wrong_rows)]
@@ -238,16 +238,16 @@ def test_a_clock_that_is_wrong_for_long_does_not_hold_a_run_up(tmp_path, wrong_r
         (event,) = [event for event in run.journal.events if event.kind == "pause"]
         assert "longer than dt_max = 0.1" in event.message
         assert len(run.journal) == 48
-        # The right rows are late now, and the remedy is stated.
+        # The correct rows are late now, and the message states the remedy.
         assert run.journal.counts["late", "a"] == 12
         assert "specify its correction with `intake.shift`" in run.health["why"]
 
 
 @pytest.mark.slow
-def test_a_refused_sample_does_not_let_known_ones_come_again(tmp_path):
+def test_after_a_refused_sample_known_rows_are_not_used_again(tmp_path):
     mixed = list(rows(20))
-    mixed[1:1] = [{"t": 0.05, "a": 0.7, "b": 0.4, "left": None}]  # of the moment it is refused
-    mixed[10:10] = mixed[3:7]  # the next rows after it has been refused
+    mixed[1:1] = [{"t": 0.05, "a": 0.7, "b": 0.4, "left": None}]  # at the refused time
+    mixed[10:10] = mixed[3:7]  # follows the refusal
     run = live(tmp_path, Batch(mixed))
     step = run.identifier.step
 
@@ -265,14 +265,14 @@ def test_a_refused_sample_does_not_let_known_ones_come_again(tmp_path):
 
 
 class Batch(Rows):
-    """Brings several rows at once, as a file does."""
+    """Source that provides several rows at once, as a file does."""
 
     def poll(self, wait):
         return [row for _ in range(5) for row in super(Batch, self).poll(wait)]
 
 
 @pytest.mark.long
-def test_what_is_irregular_is_counted_once_whenever_it_is_killed(tmp_path):
+def test_irregular_rows_are_counted_once_whenever_a_run_is_killed(tmp_path):
     write(tmp_path, 30)
     path = tmp_path / "data.csv"
     lines = path.read_text().splitlines()
@@ -291,7 +291,7 @@ def test_what_is_irregular_is_counted_once_whenever_it_is_killed(tmp_path):
         with suppress(Killed):
             run.resume()
             run._run()
-        run.journal._db.rollback()  # what is not committed is lost
+        run.journal._db.rollback()  # uncommitted rows are lost
         run.journal.close()
         OPENED.pop().close()
     with Journal.open(tmp_path / "journal.sqlite") as kept:
@@ -304,7 +304,7 @@ class Killed(Exception):
 
 
 class Stop:
-    """A sink that ends a run as a kill would, at its n-th estimate."""
+    """Sink that ends a run at its n-th estimate, as a kill would."""
 
     def __init__(self, n: int) -> None:
         self.left = n
@@ -331,12 +331,12 @@ def test_a_file_that_is_rotated_is_read_to_its_end(tmp_path):
     source = Follow(path, follow=True)
     assert followed(source) == [0.0, 1.0]
     with path.open("a") as file:
-        file.write("2,1\n3,1")  # the last line is not ended
+        file.write("2,1\n3,1")  # the last line is incomplete
     path.rename(tmp_path / "log.1.csv")
     assert followed(source) == [2.0]
     path.write_text("\nt,a\n\n4,1\n")
     assert followed(source) == [4.0]
-    path.write_text("t,a\n5,1\n")  # cut short
+    path.write_text("t,a\n5,1\n")  # truncated
     told, row = [*source.poll(0.0), *source.poll(0.0)]
     assert told.kind == "rewritten"
     assert row.values == {"t": "5", "a": "1"}
@@ -371,7 +371,7 @@ def test_silence_is_noticed(tmp_path):
             now[0] += 1.0
             if now[0] > 20.0:
                 run.stopping.set()
-            count = {1.0: 3, 12.0: 1}.get(now[0], 0)  # the first rows wait for one another
+            count = {1.0: 3, 12.0: 1}.get(now[0], 0)  # the first rows wait for further rows
             return [row for _ in range(count) for row in super(Silent, self).poll(wait)]
 
     now = [0.0]
@@ -381,8 +381,8 @@ def test_silence_is_noticed(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_source_that_is_dead_is_silent_without_a_key(tmp_path):
-    """By ten of its usual steps, a minute or more, and not in the silence that it is used to."""
+def test_a_dead_source_is_reported_as_silent_by_default(tmp_path):
+    """Silence means ten usual steps, at least a minute, and more than the usual silence."""
 
     class Bursts(Rows):
         def poll(self, wait):
@@ -407,7 +407,7 @@ def test_a_source_that_is_dead_is_silent_without_a_key(tmp_path):
 
 
 class Sequence_(Rows):
-    """Brings one row a poll, and lets the clock go on; None: nothing then."""
+    """Source with one row per poll, None for no row, which advances the clock."""
 
     def __init__(self, rows_, now):
         super().__init__(())
@@ -433,8 +433,8 @@ def health_of(run: Live) -> list[tuple[str, str]]:
 
 
 @pytest.mark.slow
-def test_rows_that_come_and_are_all_refused_are_no_health(tmp_path):
-    now, right = [0.0], [*rows(45)]  # so few that no verdict is looked at
+def test_a_run_whose_rows_are_all_refused_is_unhealthy(tmp_path):
+    now, right = [0.0], [*rows(45)]  # too few rows for a verdict
     old = [{**right[0], "t": -1.0 - k} for k in range(10)]
     source = Sequence_([*right[:5], *old, *right[5:]], now)
     run = live(tmp_path, source, silence=5.0, clock=lambda: now[0])
@@ -450,14 +450,14 @@ def test_rows_that_come_and_are_all_refused_are_no_health(tmp_path):
 
 
 def looked(run: Live, number: int, level: str) -> str:
-    """Let a run look at a verdict of some level, and return the level that counts."""
+    """Show a run a verdict of a given level, and return the level that it reports."""
     run.result._count = 1000 + JUDGED * number
     findings = [Finding("x", level, "It is off.")] if level != "trusted" else []
     run._judge(SimpleNamespace(verdict=Verdict.of(findings)))
     return run.health["verdict"]
 
 
-def test_looks_that_alternate_between_two_worse_levels_are_not_trusted(tmp_path):
+def test_checks_that_alternate_between_two_worse_levels_are_not_trusted(tmp_path):
     run = live(tmp_path, Rows(rows(3)))
     run.run()
     each = ["trusted", "caution", "do not trust", "caution", "do not trust"]
@@ -466,7 +466,7 @@ def test_looks_that_alternate_between_two_worse_levels_are_not_trusted(tmp_path)
 
 
 @pytest.mark.slow
-def test_a_run_whose_model_is_wrong_is_well_and_says_so_once(tmp_path):
+def test_a_run_with_a_wrong_model_is_healthy_and_reports_it_once(tmp_path):
     biased = ({**row, "b": row["b"] + 0.2} for row in rows(201))
     run = live(tmp_path, Rows(biased))
     run.run()
@@ -475,13 +475,13 @@ def test_a_run_whose_model_is_wrong_is_well_and_says_so_once(tmp_path):
     assert len(set(levels)) == len(levels)
     assert run.health["ok"]
     assert not health_of(run)
-    # One verdict, which is that of the last fit in the end.
+    # The only verdict is the verdict of the last fit.
     assert run.health["verdict"] == run.result.verdict.level
     assert run.health["verdict"] == json.loads(run.journal.verdict)["level"]
     assert run.health["findings"]
 
 
-def test_a_level_counts_once_two_looks_have_found_it(tmp_path):
+def test_a_level_is_reported_after_two_equal_checks(tmp_path):
     run = live(tmp_path, Rows(rows(3)))
     run.run()
     told = len([e for e in run.journal.events if e.kind == "verdict"])
@@ -489,18 +489,18 @@ def test_a_level_counts_once_two_looks_have_found_it(tmp_path):
     each = ["trusted", "trusted", "caution", "trusted", "caution", "caution"]
     for number, level in enumerate(each):
         looked(run, number, level)
-        found.append(looked(run, number, "trusted"))  # taken again, it is not looked at again
+        found.append(looked(run, number, "trusted"))  # a repeated sample is not checked again
     assert found == ["trusted"] * 5 + ["caution"]
     events = [e.message for e in run.journal.events if e.kind == "verdict"][told:]
     assert [text.partition(":")[0] for text in events] == ["trusted", "caution"]
-    # Who goes on with the run knows of the last look: the next one is the second.
+    # A resumed run knows the last check, so that its next check is the second.
     looked(run, 6, "trusted")
     run.journal.close()
     assert looked(live(tmp_path, Rows([])), 7, "trusted") == "trusted"
 
 
 @pytest.mark.slow
-def test_refused_rows_are_told_also_without_a_limit_of_silence(tmp_path):
+def test_refused_rows_are_reported_without_a_limit_of_silence(tmp_path):
     right = [*rows(10)]
     run = live(tmp_path, Rows([*right, *({**right[0], "t": -1.0 - k} for k in range(9))]))
     run.run()
@@ -510,7 +510,7 @@ def test_refused_rows_are_told_also_without_a_limit_of_silence(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_run_whose_directory_is_gone_is_not_well(tmp_path):
+def test_a_run_without_its_directory_is_unhealthy(tmp_path):
     class Vanishing(Rows):
         def poll(self, wait):
             if run.journal.accepted == 5:
@@ -527,7 +527,7 @@ def test_a_run_whose_directory_is_gone_is_not_well(tmp_path):
 
 
 @pytest.mark.slow
-def test_steps_that_fail_are_no_health_and_the_stream_goes_on(tmp_path):
+def test_failed_steps_are_unhealthy_and_the_stream_continues(tmp_path):
     class Fails(type(identifier())):
         def step(self, t, z, inputs=None):
             if 0.35 < t < 0.65:
@@ -555,8 +555,8 @@ def test_steps_that_fail_are_no_health_and_the_stream_goes_on(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("deaths", [2, 3])
-def test_a_sample_in_which_the_process_ends_again_and_again_is_set_aside(tmp_path, deaths):
-    """The mark in the journal counts; a process that was killed once or twice loses nothing."""
+def test_a_sample_that_repeatedly_crashes_the_process_is_skipped(tmp_path, deaths):
+    """The journal counts the attempts; a process that was killed once or twice loses nothing."""
 
     class Killed(BaseException):
         pass
@@ -606,8 +606,8 @@ run.run()
 
 @pytest.mark.process
 @pytest.mark.parametrize("deaths", [3, 4])
-def test_a_deadly_sample_amid_others_at_hand_is_set_aside(tmp_path, deaths):
-    """It is not committed before the first death, and once by itself from the second on."""
+def test_a_crashing_sample_among_available_ones_is_skipped(tmp_path, deaths):
+    """It is not committed before the first crash, and is committed alone from the second on."""
     write(tmp_path, 100)
     child = [sys.executable, "-c", DEADLY, str(tmp_path), str(Path(__file__).parent)]
     accepted = []
@@ -683,8 +683,8 @@ def test_health_and_metrics(tmp_path):
     monitor.close()
 
 
-def test_two_columns_of_one_name_are_told(tmp_path):
-    """And not only missing: nobody would know why."""
+def test_two_columns_of_one_name_are_reported(tmp_path):
+    """The message names the duplicate, instead of a missing column."""
     path = tmp_path / "log.csv"
     path.write_text("t,a,a,,\n0,1,2,,\n1,1,2,,\n")
     source = Follow(path)
@@ -707,7 +707,7 @@ def test_a_followed_file_in_utf_16_is_named(tmp_path):
 
 
 def test_a_full_disk_in_a_silence_is_reported_as_what_it_is():
-    """It was an event of the kind "silent", and its end had none."""
+    """It was once an event of kind "silent", and its end had no event."""
     now = [0.0]
     feed = SimpleNamespace(interval=1.0, doubt="", done=False)
     journal = SimpleNamespace(in_place=True)
