@@ -1,4 +1,4 @@
-"""How inputs behave between two readings: lines, values that hold, and means since the last one."""
+"""Inputs between two readings: linear, held, or means over the interval."""
 
 import json
 import math
@@ -64,14 +64,14 @@ def identifier(law: Any = LAWS["kalman"], **options: Any) -> lp.Identifier:
 
 
 def drives(times: np.ndarray) -> np.ndarray:
-    """Return values of T_0 and Q: levels that switch now and then."""
+    """Return values of T_0 and Q with occasional switches between levels."""
     k = np.rint(times / PERIOD).astype(int)
     return np.column_stack([1.0 + 0.5 * (k // 5 % 2), 2.0 * (k // 3 % 2)])
 
 
 @cache
 def readings() -> np.ndarray:
-    """Return what a rod with k = 0.5 shows whose inputs hold until the next reading."""
+    """Return readings of a rod with k = 0.5 and inputs held until the next reading."""
     truth = identifier(q0={"k": 0.5}, between=dict.fromkeys(CHANNELS, "hold"))
     truth.step(0.0, np.full(2, NAN), row(drives(np.zeros(1))[0]))
     planned = dict(zip(CHANNELS, drives(TIMES).T, strict=True))
@@ -94,7 +94,7 @@ def close(one: lp.Estimate, other: lp.Estimate, rtol: float = 1e-9) -> None:
 
 @pytest.mark.parametrize("law", ["kalman", "refit"])
 def test_held_inputs_equal_dense_rows_that_repeat_the_value(law: str) -> None:
-    """Rows of the inputs alone at every substep, as straight lines that end in a switch."""
+    """The dense table has input rows at every substep, so that lines are steps."""
     between = dict.fromkeys(CHANNELS, "hold")
     sparse, dense = identifier(LAWS[law], between=between), identifier(LAWS[law], between=between)
     z, values, last = readings(), drives(TIMES), drives(np.zeros(1))[0]
@@ -114,26 +114,26 @@ def test_held_inputs_equal_dense_rows_that_repeat_the_value(law: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
-def test_next_is_hold_of_the_shifted_column(law: str) -> None:
+def test_next_equals_hold_of_the_shifted_column(law: str) -> None:
     held = identifier(LAWS[law], between=dict.fromkeys(CHANNELS, "hold"))
     means = identifier(LAWS[law], between=dict.fromkeys(CHANNELS, "next"))
     z, values = readings(), drives(np.append(0.0, TIMES))
     held.step(0.0, np.full(2, NAN), row(values[0]))
     means.step(0.0, np.full(2, NAN), row(values[0]))
     for k, t in enumerate(TIMES.tolist()):
-        # The value that holds from the last reading on is that of the row that ends the interval.
+        # The value held since the last reading is in the row that ends the interval.
         close(held.step(t, z[k], row(values[k + 1])), means.step(t, z[k], row(values[k])))
 
 
 def test_a_mean_needs_no_reading_before_its_interval() -> None:
-    """The first row after the start states the first interval: nothing was held backwards."""
+    """The first row after the start has the mean of the first interval; nothing is extrapolated."""
     z, values = readings(), drives(TIMES)
     for between, held in (("next", ()), ("line", ("Q",)), ("hold", ("Q",))):
         who = identifier(between={"Q": between})
         assert who.step(TIMES[0], z[0], row(values[0])).held == held
 
 
-def test_a_missing_value_that_holds_is_no_gap() -> None:
+def test_a_missing_held_value_is_not_a_gap() -> None:
     dense, sparse = (identifier(between=dict.fromkeys(CHANNELS, "hold")) for _ in range(2))
     z, values, last = readings(), drives(TIMES), {}
     for k, t in enumerate(TIMES.tolist()):
@@ -147,12 +147,12 @@ def test_a_missing_value_that_holds_is_no_gap() -> None:
     mean.step(TIMES[0], z[0], row(values[0]))
     assert mean.step(TIMES[1], z[1], {"T_0": 1.0}).held == ("Q",)
     fleet = lp.Fleet(rod(), SENSORS, LAWS["kalman"], 2, u0=0.0, between=between)
-    first = fleet.step(TIMES[0], [z[0], z[0]], row(values[0]))  # means need no value at t0
+    first = fleet.step(TIMES[0], [z[0], z[0]], row(values[0]))  # means require no value at t0
     assert [first.member(k).held for k in range(2)] == [(), ()]
 
 
 def test_a_sensor_reads_the_input_of_its_row() -> None:
-    """A voltage with a drop that is proportional to the current, which switches at a sample."""
+    """A voltage drop is proportional to the current, which switches at a sample."""
     sensor = lp.observation.Calibrated(
         lp.Points({"V": 0.9}), lambda c, q, x: c + 10.0 * x.inputs["Q"], inputs=("Q",), noise=0.1
     )
@@ -187,7 +187,7 @@ def test_a_checkpoint_continues_the_same_behaviour_and_no_other() -> None:
         other.restore(who.dump())
 
 
-def test_behaviours_that_are_none_are_refused() -> None:
+def test_invalid_behaviours_are_refused() -> None:
     with pytest.raises(ConfigurationError, match="'heat' is not an input of this model"):
         identifier(between={"heat": "hold"})
     with pytest.raises(ConfigurationError, match="got 'step'; expected 'line', 'hold' or 'next'"):
@@ -204,7 +204,7 @@ def test_behaviours_that_are_none_are_refused() -> None:
 
 
 def shifted(times: np.ndarray, values: np.ndarray, between: str) -> dict[str, float]:
-    """Return the shifts of k, in standard deviations, after rows of an input."""
+    """Return the shifts of k in standard deviations after the given rows of an input."""
     law = lp.SensitivityLaw(shadows=lp.laws.Shadows(step=False, mesh=False))
     who = identifier(law, between={"Q": between}, dt_max=np.inf)
     truth = identifier(q0={"k": 0.5}, between={"Q": "hold"})
@@ -223,7 +223,7 @@ def test_a_step_in_two_rows_has_no_curvature(monkeypatch: pytest.MonkeyPatch) ->
     rows = np.insert(times, k, before), np.insert(whole, k, 0.0)
     assert shifted(*rows, "line")["input"] < 0.02
     monkeypatch.setattr(shadow_kinds, "SHORT", 0.0)
-    assert shifted(*rows, "line")["input"] > 1.0  # that of a curve with this slope
+    assert shifted(*rows, "line")["input"] > 1.0  # as for a curve with this slope
 
 
 @pytest.mark.slow
@@ -231,7 +231,7 @@ def test_held_inputs_have_no_curvature() -> None:
     times = np.arange(0.0, 4.0, PERIOD)
     for between in ("hold", "next"):
         sizes = shifted(times, 5.0 * (times > 2.0), between)
-        # T_0 is a line, and constant.
+        # T_0 is linear and constant.
         assert sizes["input"] == 0.0
         assert sizes["hold"] == 0.0
 
@@ -240,7 +240,7 @@ def test_held_inputs_have_no_curvature() -> None:
 
 
 def two_rows() -> tuple[np.ndarray, np.ndarray]:
-    """Return a rate that switches each 20 min, with the old rate one second before."""
+    """Return a rate that switches every 20 min, with the old rate repeated one second before."""
     t = 60.0 * np.arange(200)
     x = np.array([0.0, 8.0, 12.0, 15.5])[np.arange(200) // 20 % 4]
     at = np.flatnonzero(np.diff(x)) + 1
@@ -248,7 +248,7 @@ def two_rows() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
-def test_a_step_in_two_rows_is_no_spike_and_a_spike_beside_it_is_one(noise: float) -> None:
+def test_a_step_in_two_rows_is_not_a_spike_but_an_adjacent_spike_is(noise: float) -> None:
     t, x = two_rows()
     x = x + noise * np.random.default_rng(1).standard_normal(len(x))
     assert not find_spikes(t, x).any()
@@ -257,8 +257,8 @@ def test_a_step_in_two_rows_is_no_spike_and_a_spike_beside_it_is_one(noise: floa
     assert np.flatnonzero(find_spikes(t, x)).tolist() == [wild]
 
 
-def test_noise_beside_the_two_rows_of_another_channel_is_no_spike() -> None:
-    """A channel that is measured whenever another one switches: the cubic took noise for slopes."""
+def test_noise_at_a_step_of_another_channel_is_not_a_spike() -> None:
+    """If a channel is sampled at switches of another, the cubic fit once took noise for slopes."""
     t, _ = two_rows()
     for seed in range(20):
         noise = 0.1 * np.random.default_rng(seed).standard_normal(len(t))
@@ -278,7 +278,7 @@ HELD = {"hold": Column(("h",), between="hold"), "mean": Column(("m",), between="
 COLUMNS = {"a": Column(("a",)), **HELD}
 
 
-def test_held_channels_are_not_screened_and_gaps_are_what_they_are() -> None:
+def test_held_channels_are_not_screened_for_spikes_and_gaps() -> None:
     t = np.arange(40.0)
     h, m = np.full(40, 1.0), np.full(40, 2.0)
     h[20], m[20], h[10:13], m[10:13] = 90.0, 90.0, NAN, NAN
@@ -297,7 +297,7 @@ def test_held_channels_are_not_screened_and_gaps_are_what_they_are() -> None:
         FillGaps(["hold"], between={"hold": "linear"})  # type: ignore[dict-item]
 
 
-def test_rows_that_are_left_out_keep_switches_and_means() -> None:
+def test_omitted_rows_keep_switches_and_means() -> None:
     t = np.arange(12.0)
     h = np.array([1.0, NAN, NAN, NAN, 0.0, NAN, NAN, 1.0, NAN, NAN, NAN, NAN])
     m = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, NAN, 7.0, 8.0, 9.0, 10.0, 11.0])
@@ -306,7 +306,7 @@ def test_rows_that_are_left_out_keep_switches_and_means() -> None:
     np.testing.assert_array_equal(table.t, [0.0, 4.0, 5.0, 7.0, 10.0])
     np.testing.assert_array_equal(table.values[:, 0], [0.0, NAN, 5.0, NAN, 10.0])
     np.testing.assert_array_equal(table.values[:, 1], [1.0, 0.0, NAN, 1.0, NAN])
-    # Means since the row before that stays: of 1 to 4, 5, twice 7 (one was missing), 8 to 10.
+    # Means since the last remaining row: of 1 to 4, 5, twice 7 (one was missing), 8 to 10.
     np.testing.assert_array_equal(table.values[:, 2], [0.0, 2.5, 5.0, 7.0, 9.0])
     lines = [
         json.dumps({"t": s, "a": s, "h": None if x != x else x, "m": None if y != y else y})
@@ -319,8 +319,8 @@ def test_rows_that_are_left_out_keep_switches_and_means() -> None:
     assert len(tabulated(t, columns, plain, Clock("t"), every=5)) == 3
 
 
-def test_every_nth_row_has_the_integral_of_all(tmp_path: Path) -> None:
-    """The drive of a thinned table is that of the whole one, whatever its spelling."""
+def test_every_nth_row_keeps_the_input_integral(tmp_path: Path) -> None:
+    """A thinned table has the input integral of the whole table, however `every` is written."""
     rng = np.random.default_rng(3)
     t = np.cumsum(rng.uniform(0.5, 1.5, 200))
     x = rng.integers(0, 2, 200).astype(float)
@@ -348,7 +348,7 @@ def test_a_row_without_a_needed_sensor_keeps_its_switch() -> None:
     np.testing.assert_array_equal(table.values[:, 1], [5.0, 7.0, NAN, NAN])
     assert dict(table.remarks) == {("skipped", "a"): 3}
     late = tabulated(t, {"a": a, "h": h}, needed, Clock("t", start=2.5))
-    np.testing.assert_array_equal(late.values[:, 1], [7.0, NAN])  # as it was before the start
+    np.testing.assert_array_equal(late.values[:, 1], [7.0, NAN])  # the value before the start
 
 
 def test_a_value_that_is_repeated_keeps_no_row_without_a_needed_channel() -> None:
@@ -375,7 +375,7 @@ def test_a_value_that_is_repeated_keeps_no_row_without_a_needed_channel() -> Non
 
 def test_what_held_before_the_start_of_the_data_holds_in_each_kind_of_source() -> None:
     rows = [{"t": 0.0, "h": 7.0, "a": 0.0}, *({"t": float(k), "a": float(k)} for k in range(1, 6))]
-    rows.append({"t": 6.0, "h": 9.0, "a": 6.0})  # after the stop, while the first samples wait
+    rows.append({"t": 6.0, "h": 9.0, "a": 6.0})  # after the switch, while the first samples wait
     columns = {"a": Column(("a",)), "h": Column(("h",), between="hold")}
     clock = Clock("t", start=3, stop=5)
     known = {n: [one.get(n, NAN) for one in rows] for n in ("a", "h")}
@@ -393,7 +393,7 @@ def test_what_held_before_the_start_of_the_data_holds_in_each_kind_of_source() -
 
 
 def test_a_live_intake_has_the_samples_of_the_table() -> None:
-    """A controller writes its heater at changes only, between the rows of the sensor."""
+    """A controller logs its heater only at changes, between the rows of the sensor."""
     rng = np.random.default_rng(8)
     rows: list[dict[str, float]] = [{"t": float(k), "a": float(k)} for k in range(60)]
     rows[0] |= {"h": 0.0, "m": 0.0}
@@ -431,7 +431,7 @@ def test_a_log_of_changes_is_joined_with_what_held_before() -> None:
     np.testing.assert_array_equal(found.t, [10.0, 11.0, 12.0, 12.5, 13.0, 14.0, 15.0, 20.0])
     k = [found.names.index(name) for name in ("a", "hold", "mean")]
     np.testing.assert_array_equal(found.values[0, k], [0.0, 1.0, 4.0])
-    # The row of the log lacks the sensor that each sample needs, and keeps its inputs.
+    # The row of the log has no reading of the required sensor, but its inputs are used.
     np.testing.assert_array_equal(found.values[3, k], [NAN, 0.0, 4.0])
     np.testing.assert_array_equal(found.values[-1, k], [NAN, 1.0, 5.0])
 
@@ -443,13 +443,13 @@ def test_a_log_whose_last_change_was_before_the_sensors_is_joined() -> None:
     found = join_tables([sensors, log], 1.0, ["a"], [], "here", {"hold": "hold"}, together=True)
     np.testing.assert_array_equal(found.t, sensors.t)
     assert found.values[0, found.names.index("hold")] == 7.0
-    with pytest.raises(DataError, match="no time in common"):  # a line ends with its last reading
+    with pytest.raises(DataError, match="no time in common"):  # lines end at the last reading
         join_tables([sensors, log], 1.0, ["a"], [], "here", together=True)
 
 
 @pytest.mark.parametrize("together", [True, False])
 def test_readings_before_another_file_of_sensors_are_used_or_counted(together: bool) -> None:
-    """A profile of the start needs all sensors; a pumping test has its first readings in one."""
+    """An initial profile needs all sensors; a pumping test begins with readings of one sensor."""
     first = tabulated(np.arange(6.0), {"a": np.arange(6.0)}, {"a": COLUMNS["a"]}, CLOCK)
     other = {"b": Column(("b",))}
     later = tabulated(2.0 + np.arange(4.0), {"b": np.arange(4.0)}, other, CLOCK)
@@ -460,7 +460,7 @@ def test_readings_before_another_file_of_sensors_are_used_or_counted(together: b
 
 
 def test_a_live_intake_remembers_what_held_before_its_first_sample() -> None:
-    """A heater is stated before the sensor that each sample needs, and not once more."""
+    """The heater is logged once, before the first reading of the required sensor."""
     needed = {"a": Column(("a",), needed=True), "h": Column(("h",), between="hold")}
     habits = {"h": Habit(0.0, None, False, False, "hold")}
     sink = Intake(needed, CLOCK, Policy(channels=habits))
@@ -474,7 +474,7 @@ def test_a_live_intake_remembers_what_held_before_its_first_sample() -> None:
 # --- in cases ----------------------------------------------------------------------------------
 
 
-def test_switches_are_recognised_and_measured_values_are_not() -> None:
+def test_switched_inputs_are_recognised_and_measured_values_are_not() -> None:
     t, rng = np.arange(200.0), np.random.default_rng(2)
     pump = np.array([0.0, 8.0, 12.0, 15.5])[np.arange(200) // 20 % 4]
     heater = 500.0 * (np.arange(200) // 11 % 2)
@@ -485,7 +485,7 @@ def test_switches_are_recognised_and_measured_values_are_not() -> None:
         (pump, True),
         (heater, True),
         (only_changes, True),
-        (once, True),  # a log of five changes
+        (once, True),  # logged at five changes
         (coarse, False),
         (pump + 0.01 * rng.standard_normal(200), False),
         (np.full(200, 7.0), False),
@@ -493,11 +493,11 @@ def test_switches_are_recognised_and_measured_values_are_not() -> None:
     ):
         assert switches(t, values) == expected
     assert not switches(*two_rows())  # the rows state the steps
-    assert sentinels(pump) == []  # no level of a pump stands for a missing reading
+    assert sentinels(pump) == []  # a pump level is not a code for missing readings
     assert [one.value for one in sentinels(np.append(pump, 9999.0))] == [9999.0]
 
 
-def test_init_proposes_what_the_table_shows(tmp_path: Path) -> None:
+def test_init_proposes_the_behaviour_that_the_table_shows(tmp_path: Path) -> None:
     text = (REPORTS / "pumping_steps.csv").read_text().replace("pump rate [L/s]", "Q [L/s]")
     (tmp_path / "well.csv").write_text(text)
     equation = EQUATIONS["pumping_test"]
@@ -518,7 +518,7 @@ def pumping(tmp_path: Path, more: str = "", data: str = "pumping_steps.csv") -> 
 
 
 def switched(tmp_path: Path, name: str = "case.toml", factor: float = 1.0) -> Path:
-    """Write a case of a column whose inlet is logged at its changes only."""
+    """Write a case of a column whose inlet is logged only at changes."""
     lines = (REPORTS / "column_pulse.csv").read_text().splitlines()
     rows, last = lines[:1], ""
     for line in lines[1:]:
@@ -539,7 +539,7 @@ def switched(tmp_path: Path, name: str = "case.toml", factor: float = 1.0) -> Pa
 @pytest.mark.slow
 def test_a_live_run_of_a_log_of_changes_is_the_batch_run(tmp_path: Path) -> None:
     path = switched(tmp_path)
-    # A row without any value divides a step of the batch run: so steps are as stated here.
+    # Rows without values split a step of the batch run, so both runs need equal steps.
     stated = "noise = 0.01, shadows = { parts = 1 } }"
     path.write_text(path.read_text().replace("noise = 0.01 }", stated))
     prepared = cases.load(path).prepare()
@@ -572,7 +572,7 @@ def test_a_block_of_members_has_the_behaviour_of_the_case(tmp_path: Path) -> Non
             np.testing.assert_allclose(found.q[k], expected.q, rtol=1e-6)
 
 
-# --- reports of users --------------------------------------------------------------------------
+# --- cases that users reported -----------------------------------------------------------------
 
 
 def run(path: Path, **settings: Any) -> lp.Estimate:
@@ -591,7 +591,7 @@ def holds(estimate: lp.Estimate, **truths: float) -> None:
 
 
 def with_two_rows(source: Path, target: Path) -> None:
-    """Write the table as its user did: the old rate in a row one second before each step."""
+    """Write the table with the old rate in a row one second before each step, as a user did."""
     header, *lines = source.read_text().splitlines()
     rows, before = [], None
     for line in lines:
@@ -608,8 +608,8 @@ def with_two_rows(source: Path, target: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("table", ["held", "two rows"])
-def test_a_pumping_test_with_rate_steps(tmp_path: Path, table: str) -> None:
-    """Truths of finite volumes, with Theis: T 4.2e-3 m^2/s, S 3.1e-4; b = 1 m."""
+def test_a_pumping_test_with_rate_steps_finds_its_truth(tmp_path: Path, table: str) -> None:
+    """Data from finite volumes with Theis: true T 4.2e-3 m^2/s, S 3.1e-4; b = 1 m."""
     path = pumping(tmp_path, ', between = "hold"' if table == "held" else "")
     if table != "held":
         source = tmp_path / "pumping_steps.csv"
@@ -620,8 +620,8 @@ def test_a_pumping_test_with_rate_steps(tmp_path: Path, table: str) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("between", ["line", "hold"])
-def test_a_tracer_pulse_through_a_column(tmp_path: Path, between: str) -> None:
-    """Truths of the analytic solution: v 27 cm/h, D 16.2 cm^2/h."""
+def test_a_tracer_pulse_through_a_column_finds_its_truth(tmp_path: Path, between: str) -> None:
+    """Data from the analytic solution: true v 27 cm/h, D 16.2 cm^2/h."""
     text = (REPORTS / "column_pulse.toml").read_text()
     path = tmp_path / "case.toml"
     path.write_text(text.replace('"c_in" }', f'"c_in", between = "{between}" }}'))
@@ -629,10 +629,10 @@ def test_a_tracer_pulse_through_a_column(tmp_path: Path, between: str) -> None:
     estimate = run(path)
     holds(estimate, v=27.0, D=16.2)
     low, high = estimate["v"].interval()
-    assert high - low < 0.5  # as the data allow: +- 0.19
+    assert high - low < 0.5  # the data allow ±0.19
 
 
-def test_a_table_of_two_rows_reads_as_it_is_written(tmp_path: Path) -> None:
+def test_a_table_of_two_rows_is_read_unchanged(tmp_path: Path) -> None:
     with_two_rows(REPORTS / "pumping_steps.csv", tmp_path / "well.csv")
     columns = {"Q": Column(("pump rate [L/s]",))}
     table = read_csv(tmp_path / "well.csv", columns, Clock("date", format="%d/%m/%Y %H:%M:%S"))
@@ -643,7 +643,7 @@ def test_a_table_of_two_rows_reads_as_it_is_written(tmp_path: Path) -> None:
 
 
 def test_an_input_that_is_off_is_not_missing(tmp_path: Path) -> None:
-    # The power of a thermal response test scatters while it is on, and is zero in the recovery.
+    # In a thermal response test, the power fluctuates while on, and is zero during the recovery.
     rng = np.random.default_rng(1)
     hours = np.arange(60.0)
     on = hours < 40.0

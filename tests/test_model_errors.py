@@ -1,4 +1,4 @@
-"""Intervals that allow for errors of the model, and the level that follows from fit and effect."""
+"""Intervals that allow for model errors, and verdict levels that follow from fit and effect."""
 
 import json
 import math
@@ -19,8 +19,8 @@ from livepde.verdict import Allowed, Cause, Finding, ModelErrors, Shifts, Verdic
 from livepde.verdict.evidence import NU, TEMPER, Causes, Family, LinearModel, Mixture, averaged
 
 
-def test_harmonics_of_an_unknown_are_not_those_behind_it():
-    """An unknown with harmonics has more coefficients than numbers, in whatever place."""
+def test_harmonics_of_an_unknown_do_not_shift_other_unknowns():
+    """An unknown with harmonics has more coefficients than numbers, at any position."""
     mesh, times = lp.interval(0.0, 1.0, 20), np.arange(0.0, 12.01, 0.1)
     unknowns = {
         "s": lp.Scalar(lp.Normal(0.0, 1.0), evolution=lp.fem.Periodic(5.0)),
@@ -49,7 +49,7 @@ def test_harmonics_of_an_unknown_are_not_those_behind_it():
 
 
 def dense(model: LinearModel, tried: list[tuple[Any, Any]]) -> tuple[Any, Any, Any]:
-    """Return log evidence, mean and deviation of each hypothesis with dense matrices.
+    """Return log evidence, mean and standard deviation of each hypothesis with dense matrices.
 
     A hypothesis is: columns, and a square root of the covariance of their amplitudes.
     """
@@ -68,7 +68,7 @@ def dense(model: LinearModel, tried: list[tuple[Any, Any]]) -> tuple[Any, Any, A
 
 
 @pytest.mark.parametrize("strength", [0.3, 30.0])
-def test_the_average_is_that_of_dense_normal_models(strength):
+def test_the_average_equals_dense_gaussian_models(strength):
     rng = np.random.default_rng(1)
     n, p = 40, 3
     J, Z = strength * rng.standard_normal((n, p)), rng.standard_normal((n, 9))
@@ -100,7 +100,7 @@ def test_the_average_is_that_of_dense_normal_models(strength):
     ]
     several.append((np.arange(3, 9), 3.0 * both))
     tried = [(nothing, np.zeros((0, 0))), *single, *several]
-    # Those of one kind differ in their size alone.
+    # Hypotheses of one kind differ only in size.
     kinds = np.array([0, 1, 2, 3, 1, 2, 3, 4, 4, 5, 6, 7, 8])
 
     logs, means, deviations = dense(model, tried)
@@ -115,14 +115,14 @@ def test_the_average_is_that_of_dense_normal_models(strength):
     assert found.weights == pytest.approx(weights / weights.sum(), rel=1e-6)
     assert found.means == pytest.approx(means, rel=1e-8)
     assert found.deviations == pytest.approx(deviations, rel=1e-8)
-    # Quantiles are those of the mixture.
+    # Quantiles are quantiles of the mixture.
     for share in (0.025, 0.5, 0.975):
         at = scipy.special.ndtr((found.quantile(share) - means) / deviations)
         assert found.weights @ at == pytest.approx(share, abs=1e-9)
 
 
 def test_quantiles_take_few_evaluations(monkeypatch):
-    """Components are apart by their deviations, which differ by a factor of ten."""
+    """The standard deviations of the components differ by a factor of ten."""
     rng = np.random.default_rng(2)
     means, deviations = (
         3.0 * rng.standard_normal((200, 30)),
@@ -132,7 +132,7 @@ def test_quantiles_take_few_evaluations(monkeypatch):
     calls, ndtr = [], scipy.special.ndtr
     monkeypatch.setattr(scipy.special, "ndtr", lambda x: (calls.append(x), ndtr(x))[1])
     low, high = mixture.interval
-    assert len(calls) < 20  # halves of the interval alone take 100
+    assert len(calls) < 20  # pure bisection takes 100
     for end, share in ((low, 0.025), (high, 0.975)):
         below = mixture.weights @ ndtr((end - means) / deviations)
         assert below == pytest.approx(np.full(30, share), abs=1e-9)
@@ -145,12 +145,12 @@ def test_hypotheses_without_weight_are_left_out():
     model = LinearModel(J=J, Z=Z, z=z, T=np.eye(2))
     causes = Causes(np.arange(5), np.full(5, math.inf), (1.0, 40.0))
     found = averaged(model, causes, [])
-    # The first cause explains the readings with its larger size alone.
+    # Only the larger size of the first cause explains the readings.
     assert len(found.weights) == len(found.means) == len(found.deviations) == 10
     assert found.weights.sum() == pytest.approx(1.0, abs=1e-12)
 
 
-# --- responses of the process ---------------------------------------------------------------------
+# --- responses of the process --------------------------------------------------------------------
 
 
 LENGTH, STEP, COUNT = 1.0, 0.02, 120
@@ -189,7 +189,7 @@ EULER = lp.ImplicitEuler()
 
 
 def readings(model: lp.Model, q: float = 0.12) -> Any:
-    """Return the readings without noise, (samples, sensors)."""
+    """Return noise-free readings, shape (samples, sensors)."""
     spaces = model.state_space, model.X, model.parameter_space
     observed = lp.Points(SENSORS, noise=0.01).bind(*spaces)
     control = lp.stepping.Advance(EULER)
@@ -204,9 +204,9 @@ def readings(model: lp.Model, q: float = 0.12) -> Any:
 
 
 def identified(z: Any) -> lp.Identifier:
-    """Return the identifier of a model without errors after some readings."""
+    """Return the identifier of an error-free model after processing the readings."""
     sensors = lp.Points(SENSORS, noise=0.01)
-    law = lp.SensitivityLaw(shadows=None)  # its steps are not divided
+    law = lp.SensitivityLaw(shadows=None)  # steps are not divided
     found = lp.Identifier(rod(), sensors, law, u0=0.0, scheme=EULER)
     for t, row in zip(TIMES, z, strict=True):
         found.step(t, row, ends(t))
@@ -222,7 +222,7 @@ def identified(z: Any) -> lp.Identifier:
         ("conductivity", 1, {"bent": 1e-6}),
     ],
 )
-def test_a_response_is_the_change_of_the_readings_by_that_error(kind, mode, size):
+def test_a_response_is_the_change_of_the_readings_by_an_error(kind, mode, size):
     identifier = identified(readings(rod()))
     samples = StoredSamples.of(identifier._work, identifier._state)
     one = samples.about(samples.reached)
@@ -230,9 +230,9 @@ def test_a_response_is_the_change_of_the_readings_by_that_error(kind, mode, size
     responses, _, predicted = errors.followed(one)
     (x, *_) = samples.along(one)
     q = float(identifier.model.latent.value(x.q[0])[0])
-    # The first steps of the law are shorter than those of `readings`.
+    # The first steps of the law are shorter than the steps of `readings`.
     assert predicted == pytest.approx(readings(rod(), q)[1:], abs=0.01)
-    # The hat functions of a family add up to one.
+    # The hat functions of a family sum to one.
     found = 0.0
     for first, (shape, course) in zip(errors.first, errors.shapes, strict=True):
         if (shape.kind, shape.mode) == (kind, mode):
@@ -245,7 +245,7 @@ def test_a_response_is_the_change_of_the_readings_by_that_error(kind, mode, size
 
 
 def best_fit(model: lp.Model, sensors: Any, z: Any) -> tuple[StoredSamples, Any]:
-    """Return the samples of a run, and the fit that ended it."""
+    """Return the samples of a run, and its final fit."""
     identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=0.0)
     for t, row in zip(TIMES[: len(z)], z, strict=True):
         identifier.step(t, row, ends(t))
@@ -254,8 +254,8 @@ def best_fit(model: lp.Model, sensors: Any, z: Any) -> tuple[StoredSamples, Any]
 
 
 @pytest.mark.parametrize("what", ["flow", "source", "loss"])
-def test_what_an_unknown_does_is_no_error_of_the_model(what):
-    """Where the velocity is unknown, a steady flow is no error, and one that varies is."""
+def test_an_effect_of_an_unknown_is_not_a_model_error(what):
+    """If the velocity is unknown, a steady flow is not an error, but a varying flow is."""
     more = {
         "flow": lambda q, u, v, x: q.s * lp.grad(u)[0] * v,
         "source": lambda q, u, v, x: -q.s * v,
@@ -279,14 +279,14 @@ def test_what_an_unknown_does_is_no_error_of_the_model(what):
             assert own[:, :, 0].any()
         if shape.kind in varies and shape.mode == 0:
             assert own.any()
-        if shape.kind in ("flow", "source"):  # hat functions that add up to one
+        if shape.kind in ("flow", "source"):  # hat functions that sum to one
             same = shape.kind == what and shape.mode == 0
             size = np.abs(own).max()
             assert (np.abs(own.sum(axis=2)).max() < 1e-9 * size) == same
 
 
-def test_an_error_that_is_an_unknown_of_a_sensor_is_no_error_of_the_model():
-    """An offset that is estimated has a prior, which says how large it may be."""
+def test_an_estimated_sensor_error_is_not_a_model_error():
+    """The prior of an estimated offset already limits its size."""
     process = lp.Model(
         rod().state,
         {"k": PRIOR, "offset": lp.Normal(0.0, std=0.05)},
@@ -310,7 +310,7 @@ def test_an_error_that_is_an_unknown_of_a_sensor_is_no_error_of_the_model():
 
 @cache
 def truth(seed: int, *wrong: tuple[str, float]) -> Any:
-    """Return readings of a finer model by another scheme, with noise."""
+    """Return noisy readings of a finer model with a different time scheme."""
     errors = dict(wrong)
     cells = 200
     x = (np.arange(cells) + 0.5) / cells
@@ -327,7 +327,7 @@ def truth(seed: int, *wrong: tuple[str, float]) -> Any:
     right, u, shown = one + 0.5 * h * L, np.zeros(cells), [np.zeros(3)]
     for k in range(8 * (COUNT - 1)):
         t = h * (k + 0.5)
-        # Inputs are straight lines between readings, as the model takes them.
+        # Inputs are linear between readings, as in the model.
         at = {name: np.interp(t, TIMES, [ends(s)[name] for s in TIMES]) for name in ends(0.0)}
         b = np.full(cells, errors.get("source", 0.0))
         b[0] += 2.0 * q * cells**2 * at["left"] + flow * 2.0 * at["left"]
@@ -347,7 +347,7 @@ def ended(z: Any) -> lp.Estimate:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_sound_run_is_trusted_with_hardly_a_wider_interval(seed):
+def test_a_correct_run_is_trusted_with_a_barely_wider_interval(seed):
     verdict = ended(truth(seed)).verdict
     assert verdict.level == "trusted"
     assert verdict.errors.misfit == pytest.approx(1.0, abs=0.15)
@@ -361,7 +361,7 @@ WRONG = [pytest.param(one, marks=pytest.mark.long) for one in (("loss", 0.5), ("
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", [("source", 0.06), *WRONG])
-def test_a_model_that_lacks_a_term_ends_in_an_interval_that_holds(wrong):
+def test_a_model_without_a_term_ends_in_an_interval_with_the_truth(wrong):
     verdict = ended(truth(3, wrong)).verdict
     (one,) = verdict.errors.unknowns
     assert one.low < 0.12 < one.high
@@ -384,7 +384,7 @@ WALK = lp.Scalar(PRIOR, evolution=lp.RandomWalk(0.05))
 
 
 def innovations_of(z: Any, prior: Any = PRIOR, **options: Any) -> Verdict:
-    """Return the verdict of a run whose samples cannot be fitted again."""
+    """Return the verdict of a run without a refit, which uses innovations."""
     law = lp.SensitivityLaw(**options)
     identifier = lp.Identifier(rod(prior), lp.Points(SENSORS, noise=0.01), law, u0=0.0)
     samples = [(t, row, ends(t)) for t, row in zip(TIMES, z, strict=True)]
@@ -402,7 +402,7 @@ UNFITTED = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("why", UNFITTED)
-def test_a_sound_run_without_a_fit_has_hardly_a_wider_interval(why):
+def test_a_correct_run_without_a_fit_has_a_barely_wider_interval(why):
     verdict = innovations_of(truth(1), **UNFITTED[why])
     assert verdict.level == "trusted"
     assert verdict.errors.misfit == pytest.approx(1.0, abs=0.15)
@@ -413,7 +413,7 @@ def test_a_sound_run_without_a_fit_has_hardly_a_wider_interval(why):
 
 
 FAULTS = ("source", "gain", "lag")
-# One kind of run with each fault, two with one of them; the rest on demand.
+# Usual tests have one kind of run per fault, and two for one fault; others are long tests.
 OFTEN = {("moves", "gain"), ("fades", "gain"), *product(["not stored"], FAULTS)}
 
 
@@ -437,8 +437,8 @@ def test_an_interval_of_innovations_allows_for_errors_of_process_and_sensors(why
     assert one.low < 0.12 < one.high
     if wrong == "source":
         return
-    # An unknown that moves takes up a part, and its plain interval is wide. The other one is wider
-    # on the side of the truth.
+    # A time-varying unknown absorbs a part, and its plain interval is wide. The other interval is
+    # wider on the side of the truth.
     assert (one.plain_low < 0.12 < one.plain_high) == (why == "moves")
     below, above = one.plain_low - one.low, one.high - one.plain_high
     assert max(below, above) > 0.0
@@ -446,7 +446,7 @@ def test_an_interval_of_innovations_allows_for_errors_of_process_and_sensors(why
 
 
 def numbers(estimate: lp.Estimate) -> Any:
-    """Return misfit, and relative ends and width of the interval of the only unknown."""
+    """Return the misfit, and relative ends and width of the only unknown's interval."""
     errors = estimate.verdict.errors
     one = errors["q"] if "q" in estimate.space.labels else errors.unknowns[0]
     relative = [end / one.value for end in (one.low, one.high, one.plain_low, one.plain_high)]
@@ -454,7 +454,7 @@ def numbers(estimate: lp.Estimate) -> Any:
 
 
 def ended_with(z: Any, order: Any = None, scale: float = 1.0, **options: Any) -> lp.Estimate:
-    """Return the end of a run with sensors in another order, and a state in another unit."""
+    """Return the end of a run with reordered sensors and a state in another unit."""
     names = order or list(SENSORS)
     sensors = lp.Points({name: SENSORS[name] for name in names}, noise=0.01 * scale)
     identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0, **options)
@@ -476,7 +476,7 @@ def ended_with(z: Any, order: Any = None, scale: float = 1.0, **options: Any) ->
 @pytest.mark.parametrize("gaps", [False, True])
 def test_order_and_units_of_the_readings_change_no_interval(wrong, gaps):
     z = truth(4, *wrong).copy()
-    if gaps:  # single readings, and a sensor for a while
+    if gaps:  # gaps of single readings, and of one sensor for a while
         z[7::11, 0] = z[30:60, 2] = np.nan
     expected = numbers(ended_with(z))
     assert numbers(ended_with(z, order=["T_7", "T_2", "T_5"])) == pytest.approx(expected, rel=1e-4)
@@ -484,8 +484,8 @@ def test_order_and_units_of_the_readings_change_no_interval(wrong, gaps):
 
 
 @pytest.mark.long
-def test_what_is_uncertain_of_the_start_is_no_misfit():
-    """The residuals are those of the best fit, in which the start has its most probable value."""
+def test_an_uncertain_initial_state_is_not_a_misfit():
+    """Residuals are from the best fit, in which the initial state has its most probable value."""
     clean = truth(5)
     bump = 0.3 * np.sin(np.pi * np.array(list(SENSORS.values())))
     decay = np.exp(-0.12 * np.pi**2 * np.array(TIMES))
@@ -526,7 +526,7 @@ def test_the_level_follows_from_fit_and_effect(of, doubted, level):
     misfit = Finding("misfit", "do not trust", "Model misfit.", causes=(cause,))
     verdict = Verdict.of([misfit] if doubted else []).with_errors(of)
     assert verdict.level == level
-    # Once more, after a file, and with more findings, it is the same.
+    # The level is unchanged if repeated, read from a file, or with more findings.
     again = Verdict.from_dict(json.loads(json.dumps(verdict.to_dict())))
     assert again == verdict
     assert verdict.with_errors(of) == verdict
@@ -535,13 +535,13 @@ def test_the_level_follows_from_fit_and_effect(of, doubted, level):
     assert sum(finding.what == "effect" for finding in more.findings) == (level != "trusted")
 
 
-def test_intervals_that_are_the_plain_ones_are_not_told_apart_from_others():
-    """The table had one column of intervals, and the remedy named others."""
+def test_the_remedy_mentions_plain_intervals_that_include_the_errors():
+    """The table once had one column of intervals, while the remedy mentioned others."""
     same = ModelErrors(1.6, 0.05, {"T": 1.6}, (Allowed("c", "", 1.0, 0.9, 1.1, 0.9, 1.1, 1.0),))
     assert same.remedy == "The plain intervals include these errors."
 
 
-def test_one_unknown_that_is_too_uncertain_leaves_the_others_their_use():
+def test_one_uncertain_unknown_leaves_the_others_usable():
     wide, narrow = errors(0.8, 9.0), Allowed("c", "", 1.0, 0.8, 1.3, 0.99, 1.01, 12.0)
     misfit = Finding("misfit", "do not trust", "Model misfit.")
     both = ModelErrors(2.0, 0.01, {"T": 2.0}, (*wide.unknowns, narrow))
@@ -554,8 +554,8 @@ def test_one_unknown_that_is_too_uncertain_leaves_the_others_their_use():
     assert "These intervals are too wide to use." in alone.sentences[0]
 
 
-def test_an_unknown_near_zero_is_known_well_if_little_of_its_prior_is_left():
-    """A velocity of either sign: relative to its value any error is large."""
+def test_an_unknown_near_zero_is_well_determined_relative_to_its_prior():
+    """For a velocity of either sign near zero, any error is large relative to its value."""
     misfit = Finding("misfit", "do not trust", "Model misfit.")
     for size, level in ((0.001, "trusted"), (0.05, "caution"), (0.3, "do not trust")):
         v = Allowed("v", "m/s", 0.0, -size, size, -0.01 * size, 0.01 * size, 9.0, usual=0.2)
@@ -573,14 +573,14 @@ def test_a_doubted_run_without_unknowns_of_the_model_is_not_trusted():
     assert Verdict.of([misfit]).with_errors(only).level == "caution"
 
 
-def test_numbers_without_a_bound_are_json():
+def test_unbounded_numbers_are_valid_json():
     one = Allowed("k", "", 0.0, -1.0, math.inf, 0.0, 0.0, math.inf)
     verdict = Verdict.of([]).with_errors(ModelErrors(1.0, math.inf, {"T": 1.0}, (one,)))
     text = json.dumps(verdict.to_dict(), allow_nan=False)
     assert Verdict.from_dict(json.loads(text)) == verdict
 
 
-def test_a_later_estimate_has_an_interval_as_much_wider_as_before():
+def test_a_later_estimate_keeps_the_widening_of_its_interval():
     before = errors(0.3, 4.0)
     after = before.about({"k": (2.0, 1.99, 2.02)})["k"]
     assert after.low == pytest.approx(2.0 - 0.01 * 0.3 / 0.001)
@@ -608,7 +608,7 @@ def test_a_guessed_curvature_of_inputs_is_a_caution_unless_an_interval_holds_it(
 
 @pytest.mark.slow
 def test_an_initial_time_long_before_the_samples_changes_no_course_in_time():
-    """Forgotten t0: sources that begin within the run must not begin before the first sample."""
+    """With a forgotten t0, sources that begin within the run cannot begin before its samples."""
     rng = np.random.default_rng(4)
     ends = {"left": lp.Channel("T"), "right": 0.0}
     rod = lp.models.heat(lp.interval(0.0, 1.0, 20), lp.LogNormal(0.1, std=0.05), dirichlet=ends)
@@ -628,8 +628,8 @@ def test_an_initial_time_long_before_the_samples_changes_no_course_in_time():
 
 @pytest.mark.parametrize("options", [{}, pytest.param({"refit": None}, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("what", ["noisy", "silent"])
-def test_the_noise_of_a_sensor_is_no_error_of_the_model(what, options):
-    """One is eight times as noisy as stated; or all are by five times, and two have one reading."""
+def test_sensor_noise_is_not_a_model_error(what, options):
+    """One sensor is eight times as noisy as stated, or all five times and two have one reading."""
     clean = truth(6)
     rng = np.random.default_rng(7)
     if what == "noisy":

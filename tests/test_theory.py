@@ -1,4 +1,4 @@
-"""The theory of the paper, computed: constants, error bounds, T*, excitation, link conditions."""
+"""Numerical evaluation of the paper's theory: constants, bounds, T*, excitation, links."""
 
 import importlib
 import json
@@ -28,7 +28,7 @@ from livepde.observation import Tikhonov
 from livepde.reproduce import seed, seed_excited
 from livepde.streams import RelativeNoise
 
-# The functions of the same names hide these modules in their package.
+# Functions of equal names hide these modules in their package.
 constants_module = importlib.import_module("livepde.diagnostics.theory.constants")
 parts_module = importlib.import_module("livepde.diagnostics.theory.state_parts")
 excitation_module = importlib.import_module("livepde.diagnostics.theory.excitation")
@@ -67,7 +67,7 @@ def test_embeddings_of_the_whole_interval():
 
 @pytest.mark.parametrize("q", [1.0, 6.0, 20.0])
 def test_lipschitz_constant_of_reaction_and_diffusion(q):
-    """-u'' + q u against u - u'': the quotient (l + q)/(l + 1) is largest for l = pi^2."""
+    """For -u'' + q u and u - u'', the quotient (l + q)/(l + 1) is largest for l = pi^2."""
     model = rod()
     spaces = dg.Spaces(model, observe(model, lp.Full()))
     c = dg.constants(spaces, np.array([q]), [np.zeros(model.X.dim)])
@@ -76,7 +76,7 @@ def test_lipschitz_constant_of_reaction_and_diffusion(q):
 
 
 def test_norm_of_A_for_a_number():
-    """A(u) q = q u with q of deviation s: ||A(u)|| = s ||u||, and the gain enters as its root."""
+    """For A(u) q = q u and std s of q, ||A(u)|| = s ||u||, scaled by the root of the gain."""
     model = rod(lp.Normal(std=2.0), dirichlet={})
     spaces = dg.Spaces(model, observe(model, lp.Full()))
     u = np.full(model.X.dim, 3.0)
@@ -109,7 +109,7 @@ HERMITE_NODES = (16, 31, 61, 121)
 
 
 def papers_spaces(nodes, D=1.0):
-    """Return the paper's example with (MN1), (MN2) on a mesh with nodes at the ends of omega."""
+    """Return the paper's example with (MN1), (MN2) on a mesh fitted to omega."""
     mesh = lp.interval(0.0, 1.0, nodes - 1, through=seed.OMEGA)
     element = ElementLineHermite()
     model = lp.Model(
@@ -134,7 +134,7 @@ def papers_constants(spaces):
 @pytest.mark.parametrize("D", [1.0, -1.0, 0.1])
 @pytest.mark.parametrize("nodes", HERMITE_NODES)
 def test_the_papers_lipschitz_constant_is_one_on_every_mesh(nodes, D):
-    """L_C <= max{1, sup |q*|} with (MN1), (MN2), whatever the sign of D."""
+    """L_C <= max{1, sup |q*|} with (MN1), (MN2), for any sign of D."""
     c = papers_constants(papers_spaces(nodes, D))
     assert 0.99 < c.L_C <= 1.0 + 1e-6
     assert (c.c_M, c.C_M, c.c_N, c.C_N) == pytest.approx((1.0, 1.0, 1.0, 1.0), rel=1e-5)
@@ -154,13 +154,13 @@ def test_norms_of_the_two_parts_of_the_papers_state(nodes):
         assert np.sqrt(mass) == pytest.approx(found.X, rel=1e-4)
         assert np.sqrt(mass + gradient) == pytest.approx(found.VX, rel=1e-3)
         assert (1 + PI2) * np.sqrt(mass) == pytest.approx(found.V, rel=0.03)
-        assert part.stage_norms(u).V <= found.V  # the least of the functions that agree
+        assert part.stage_norms(u).V <= found.V  # the smallest norm of functions that agree
     assert pytest.approx(3.10, rel=0.03) == found.V
 
 
 @pytest.mark.slow
 def test_the_norm_of_a_part_with_a_flux_is_that_of_the_law():
-    """`stage_norms` is what the damping rule is given, and tends to `norms` with the mesh."""
+    """The damping rule uses `stage_norms`, which tends to `norms` as the mesh is refined."""
     gaps = []
     for nodes in HERMITE_NODES:
         spaces = papers_spaces(nodes)
@@ -223,7 +223,7 @@ def test_constants_hold_for_every_vector(name):
 
 
 def operators_of(spaces):
-    """Return M and N of the two parts, and X on what they are tested with."""
+    """Return the operators M and N of both parts, and X on their test functions."""
     model, split = spaces.model, spaces.split
     forms = StageForms(model, split, spaces.M_op, spaces.N_op, 1.0)
     return forms.pull, sp.diags_array(model.X.free) @ forms.hidden, forms.tests
@@ -249,7 +249,7 @@ def test_lanczos_gives_what_the_dense_solver_gives(monkeypatch):
         assert getattr(lanczos, name) == pytest.approx(getattr(dense, name), rel=1e-6)
 
 
-def test_what_constants_refuse(monkeypatch):
+def test_constants_refuse_invalid_arguments(monkeypatch):
     model = rod()
     spaces = dg.Spaces(model, observe(model, lp.Points([0.3])))
     with pytest.raises(ConfigurationError, match="at least one state"):
@@ -285,7 +285,7 @@ def constants_of(twin, gain):
 @pytest.mark.parametrize("u0", [0.0, lambda x: seed_excited.u_true(x, 0.0)], ids=["zero", "exact"])
 @pytest.mark.parametrize("data", ["exact", "noisy", "smoothed"])
 def test_all_propositions_hold_on_the_excited_twin(u0, data):
-    """With exact data d = 0, so the three propositions speak about the same run."""
+    """With exact data d = 0, so that all three propositions apply to the same run."""
     gain = 1000.0
     twin = twin_of(seed_excited, 60)
     tracker = follow(twin, lp.GradientLaw(gain, lp.laws.ResidualDamping(1.0)), u0)
@@ -300,7 +300,7 @@ def test_all_propositions_hold_on_the_excited_twin(u0, data):
 @pytest.mark.long
 @pytest.mark.parametrize("nu", [0.0, None], ids=["nu = 0", "nu of the paper"])
 def test_all_propositions_hold_on_the_papers_twin(nu):
-    """Partial data: with gains that satisfy the conditions on mu (and nu)."""
+    """Partial data with gains that satisfy the conditions on mu and nu."""
     gain, floor = 100.0, 1e-8
     twin = twin_of(seed, 20)
     c = constants_of(twin, gain)
@@ -309,7 +309,7 @@ def test_all_propositions_hold_on_the_papers_twin(nu):
     p_bound = 0.01 if nu == 0 else 1000.0
     law = lp.GradientLaw(gain, ExactBound(c, p_bound, 1.0, floor), nu=nu)
     tracker = follow(twin, law, lambda x: seed.u_true(x, 0.0))
-    assert max(item.p.V for item in tracker.errors) <= p_bound  # what the user promised
+    assert max(item.p.V for item in tracker.errors) <= p_bound  # the bound given by the user
     report = dg.bounds(tracker.errors, c, nu=nu).raise_if_failed()
     assert len(report.lines) == (2 if nu == 0 else 3)
     met = dg.conditions(tracker.errors, c, nu=nu, floor=floor)
@@ -320,7 +320,7 @@ def test_all_propositions_hold_on_the_papers_twin(nu):
 @pytest.mark.slow
 @pytest.mark.parametrize("gain", [1.0, 100.0, 1e4])
 def test_the_energy_never_grows_with_the_default_rule(gain):
-    """ResidualDamping leaves out the part of the bound with p; bound 1 holds all the same."""
+    """ResidualDamping omits the part of the bound with p; nevertheless bound 1 holds."""
     twin = twin_of(seed, 20)
     tracker = follow(
         twin, lp.GradientLaw(gain, lp.laws.ResidualDamping(1.0)), lambda x: seed.u_true(x, 0.0)
@@ -330,7 +330,7 @@ def test_the_energy_never_grows_with_the_default_rule(gain):
 
 
 @pytest.mark.slow
-def test_a_condition_that_fails_says_what_to_do():
+def test_a_failed_condition_states_a_remedy():
     twin = twin_of(seed, 10)
     tracker = follow(twin, lp.GradientLaw(100.0, lp.laws.ResidualDamping(0.1)), 0.0)
     report = dg.conditions(tracker.errors, constants_of(twin, 100.0))
@@ -342,8 +342,8 @@ def test_a_condition_that_fails_says_what_to_do():
 
 
 @pytest.mark.slow
-def test_noise_and_T_star():
-    """Until T* the bounds of well_defined_noisy hold; (cond_d) fails from there on."""
+def test_the_noisy_bounds_hold_until_T_star():
+    """Until T* the bounds of well_defined_noisy hold; from T* (cond_d) fails."""
     gain = 1000.0
     full = lp.Full(reconstruction=Tikhonov("V", 1e-5))
     noise = RelativeNoise(0.01)
@@ -364,7 +364,7 @@ def test_noise_and_T_star():
 
 @pytest.mark.slow
 def test_smoothed_data_with_the_papers_rule():
-    """prop:wellposed_noisesmooth with the rule that fulfils its hypothesis."""
+    """prop:wellposed_noisesmooth holds with the damping rule that satisfies its hypothesis."""
     gain = 1000.0
     twin = twin_of(
         seed_excited,
@@ -389,7 +389,7 @@ def test_smoothed_data_with_the_papers_rule():
 @pytest.mark.long
 @pytest.mark.parametrize("row", [0, 3, 4])
 def test_the_surrogate_of_T_star_is_within_a_factor_of_two(row):
-    """Mean of five seeds, where noise (not the smoothing's own error) decides."""
+    """Mean of five seeds, in a setting where noise dominates the smoothing error."""
     stopping = experiment("stopping")
     ((_, exact, _, ratio, within),) = stopping.table([stopping.SETTINGS[row]], samples=40)
     assert exact > 0
@@ -440,7 +440,7 @@ def accumulated(excitation, states, step):
 
 
 def test_gramian_of_a_constant_state_is_that_of_one_matrix():
-    """w = sin(pi x): the integral is gamma_0 A(w), whose singular values are known by one solve."""
+    """For w = sin(pi x) the integral is gamma_0 A(w), whose singular values need one solve."""
     model = rod("field", cells=16)
     spaces = dg.Spaces(model, observe(model, lp.Full()))
     u = model.initial(lambda x: np.sin(np.pi * x[0]))
@@ -456,7 +456,7 @@ def test_gramian_of_a_constant_state_is_that_of_one_matrix():
 
 
 @pytest.mark.slow
-def test_what_is_not_observed_is_not_pinned():
+def test_unobserved_modes_are_not_determined():
     model = excited(20)
     omega = lp.Subdomain(lambda x: x[0] < 0.5)
     excitation = dg.Excitation(dg.Spaces(model, observe(model, omega)), 0.25)
@@ -499,7 +499,7 @@ def test_excitation_is_a_value_and_restarts():
     assert kept.windows == 1
 
 
-def test_excitation_refuses():
+def test_excitation_refuses_invalid_arguments():
     model = excited(8)
     spaces = dg.Spaces(model, observe(model, lp.Full()))
     with pytest.raises(ConfigurationError, match="window must be positive"):
@@ -543,7 +543,7 @@ def test_a_link_that_fails_grows():
         ({"window": 100.0, "exponent": 2.0}, "shorter than the window"),
     ],
 )
-def test_links_refuse(options, words):
+def test_links_refuse_invalid_arguments(options, words):
     t = np.arange(5.0)
     given = {"x": np.ones(5), "theta": np.ones(5), "window": 1.0, **options}
     with pytest.raises(ConfigurationError, match=words):
@@ -565,7 +565,7 @@ def test_interpolation_along_a_run_stays_within_its_bounds():
 
 
 @pytest.mark.slow
-def test_the_page_with_truth():
+def test_the_page_of_a_twin_shows_all_bounds():
     twin = twin_of(seed_excited, 40, noise=RelativeNoise(1e-4))
     law = lp.GradientLaw(1000.0, lp.laws.ResidualDamping(1.0))
     identifier = lp.Identifier(twin.model, twin.observation, law, q0=0.0, u0=0.0)
@@ -581,7 +581,7 @@ def test_the_page_with_truth():
     assert found.spectrum.pinned() > 1
 
 
-def test_the_page_without_truth_says_what_needs_it():
+def test_the_page_without_truth_names_what_requires_it():
     model = rod(lp.Normal(1.0), cells=8)
     identifier = lp.Identifier(model, lp.Points([0.4]), lp.SensitivityLaw(noise=0.1), u0=1.0)
     found = dg.theory_report(identifier, [(t, [np.exp(-t)]) for t in 0.1 * np.arange(9)])
@@ -630,7 +630,7 @@ def test_report_theory_of_a_run_directory(tmp_path):
 def test_the_oracle_satisfies_the_bounds():
     oracle = experiment("oracle")
     plain, bound, with_mu, with_nu = oracle.run(samples=8)
-    assert plain.error < with_mu.error < bound.error  # the paper's bound damps what would learn
+    assert plain.error < with_mu.error < bound.error  # the bound damps what q learns from
     for found in (plain, bound, with_mu):
         energies = [item.energy for item in found.errors]
         assert max(energies) <= energies[0] * (1 + 1e-9)
