@@ -152,7 +152,7 @@ def test_bad_options(here):
 
 
 def test_an_interruption_ends_all(here, monkeypatch):
-    """Members after the one that was interrupted do not begin."""
+    """Members after the interrupted one do not begin."""
     begun = []
 
     def alone(self, member, prepared):
@@ -180,7 +180,7 @@ FIRST = ["fleet", "rod/case.toml", "--members", "rods.csv", "--out"]
 
 @pytest.fixture
 def alike(here):
-    """Three members that differ in data and start alone; with values that are missing."""
+    """Provide three members with different data and initial values, and with missing values."""
     head, *rows = Path("rod/rod.csv").read_text().splitlines()
     for name, shift in {"other": 0.1, "third": -0.2}.items():
         changed = [head]
@@ -198,7 +198,7 @@ def alike(here):
 
 
 def equal(one: Path, other: Path) -> None:
-    """Hold two run directories against each other."""
+    """Assert that two run directories are equal."""
     mine, wanted = runs.open(one), runs.open(other)
     assert {file.name for file in one.iterdir()} == {file.name for file in other.iterdir()}
     assert mine.record.keys() == wanted.record.keys()
@@ -211,7 +211,7 @@ def equal(one: Path, other: Path) -> None:
     same(mine.dataset, wanted.dataset)
     with Journal.open(one / JOURNAL) as left, Journal.open(other / JOURNAL) as right:
         rest, judged = left.dataset(), right.dataset()
-        judged.attrs.pop("verdict", None)  # of a run that steps by itself
+        judged.attrs.pop("verdict", None)  # only separate runs have a verdict
         rest.attrs.pop("verdict", None)
         same(rest, judged)
         assert (left.counts, told(left)) == (right.counts, told(right))
@@ -219,12 +219,12 @@ def equal(one: Path, other: Path) -> None:
 
 
 def told(journal: Journal) -> list[Event]:
-    """Return events of samples; a run that steps by itself also has those of its health."""
+    """Return events of samples, without the health events that only separate runs have."""
     return [event for event in journal.events if event.kind not in ("unwell", "well")]
 
 
 def same(one: xr.Dataset, other: xr.Dataset) -> None:
-    """Hold two datasets against each other: all is equal, numbers to rounding."""
+    """Assert that two datasets are equal, with numbers equal to rounding."""
     xr.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-9)
     for name in other.variables:
         assert str(one[name].attrs) == str(other[name].attrs)
@@ -232,9 +232,9 @@ def same(one: xr.Dataset, other: xr.Dataset) -> None:
 
 
 def _attrs(data: xr.Dataset) -> dict:
-    """Return what a dataset says, of its verdict the kinds and subjects of findings."""
+    """Return the attributes of a dataset, with kinds and subjects of its verdict's findings."""
     found = dict(data.attrs)
-    if "log_evidence" in found:  # a number to rounding, too
+    if "log_evidence" in found:  # also a number, compared to rounding
         found["log_evidence"] = round(float(found["log_evidence"]), 6)
     if "verdict" in found:
         findings = json.loads(found["verdict"])["findings"]
@@ -244,9 +244,9 @@ def _attrs(data: xr.Dataset) -> dict:
 
 @pytest.mark.long
 def test_members_that_are_alike_step_together(alike):
-    """What each leaves is what a run of its own leaves."""
+    """The results of each member equal those of a separate run."""
     code, output = call(*FIRST, "rods", "--json")
-    assert code == 1  # the case expects more than so few samples can tell
+    assert code == 1  # too few samples for the expectations of the case
     assert json.loads(output)["notes"][0] == "Of 3 members 3 were stepped together."
     _, output = call(*FIRST, "apart", "--separately", "--json")
     assert "3 separately: --separately (3)" in json.loads(output)["notes"][0]
@@ -280,7 +280,7 @@ def workers(parent: int) -> list[int]:
 
 @pytest.fixture
 def longer(alike):
-    """Data that take a while: of eight times as many samples."""
+    """Provide longer data, with eight times as many samples."""
     case = Path("rod/case.toml")
     case.write_text(case.read_text().replace("[law]\n", "[law]\nshadows = false\n"))
     for path in (Path("rod/rod.csv"), Path("rod/other.csv"), Path("rod/third.csv")):
@@ -296,9 +296,9 @@ def longer(alike):
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="workers are found in /proc")
 @pytest.mark.usefixtures("longer")
 def test_a_killed_worker_is_replaced_and_told():
-    """All members finish, with the numbers of runs that nobody killed."""
+    """All members finish with the numbers of undisturbed runs."""
     pytest.importorskip("joblib", reason="'fleet' is not installed")
-    with threadpool_limits(1):  # as in the program: the last digits depend on the threads of BLAS
+    with threadpool_limits(1):  # as in the program, because last digits depend on BLAS threads
         call(*FIRST, "one", "--separately")
     command = [sys.executable, "-m", "livepde", *FIRST, "two", "--separately", "--jobs", "2"]
     pipe = subprocess.PIPE
@@ -319,7 +319,7 @@ def test_a_killed_worker_is_replaced_and_told():
 @pytest.mark.process
 @pytest.mark.usefixtures("processes")
 def test_workers_that_die_again_and_again_end_the_command(here, monkeypatch):
-    """With a sentence for each member, a summary, and no run that seems to go on."""
+    """It reports each member and a summary, and no run appears to continue."""
     Path("rods.csv").write_text("name,data\nplain,\nwarm,rod/warm.csv\n")
     call("fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods")
     opened = runs.open(Path("rods/plain"))
@@ -393,7 +393,7 @@ WORKERS = {"dask": "--multiprocessing-fork", "ray": "ray::PoolActor"}
 @pytest.mark.usefixtures("longer")
 @pytest.mark.parametrize("backend", WORKERS)
 def test_a_worker_of_another_engine_is_killed(backend):
-    """Members of its part go on from their run directories, in another process."""
+    """Its members resume from their run directories in another process."""
     name = {"dask": "distributed"}.get(backend, backend)
     pytest.importorskip(name, reason=f"{backend} is not installed")
     call(*FIRST, "one", "--separately")
@@ -441,7 +441,7 @@ def test_what_it_leaves_serves_other_commands(alike):
     [(250, "3 separately: resumed runs (3)."), (10**9, "3 were stepped together.")],
 )
 def test_goes_on_after_a_kill(alike, monkeypatch, waiting, how):
-    """Separately from what was written, or together where nothing was."""
+    """Members with results resume separately, members without begin together."""
     call(*FIRST, "rods")
     monkeypatch.setattr(member_blocks, "WAITING", waiting)
     stepped = Fleet.step
@@ -465,12 +465,12 @@ def test_goes_on_after_a_kill(alike, monkeypatch, waiting, how):
 
 
 class Killed(BaseException):
-    """What a kill looks like from inside."""
+    """Exception that simulates a kill within the process."""
 
 
 @pytest.mark.long
 def test_a_signal_ends_all_members_where_they_are(alike, monkeypatch):
-    """Others do not begin."""
+    """Later members do not begin."""
     others = "d,,,0.1 K\ne,rod/other.csv,,0.1 K\nf,,,0.2 K\n"
     lines = [line + "," for line in ALIKE.splitlines()[1:]]
     Path("rods.csv").write_text("\n".join(["name,data,initial,law.noise", *lines, others]))
@@ -496,7 +496,7 @@ def test_a_signal_ends_all_members_where_they_are(alike, monkeypatch):
 
 
 def test_what_is_another_run_is_refused_alone(alike):
-    """It does not keep the others from going on."""
+    """The other members continue."""
     call(*FIRST, "rods")
     for name in "abc":
         for file in (JOURNAL, "estimates.nc"):
@@ -511,7 +511,7 @@ def test_what_is_another_run_is_refused_alone(alike):
 def test_what_is_finished_is_not_run_again(alike, monkeypatch):
     call(*FIRST, "rods")
     table = pd.read_csv("rods/fleet.csv")
-    monkeypatch.setattr(cases.Prepared, "identifier", None)  # nobody asks for one
+    monkeypatch.setattr(cases.Prepared, "identifier", None)  # no identifier is created
     call(*FIRST, "rods", "--resume")
     pd.testing.assert_frame_equal(pd.read_csv("rods/fleet.csv"), table)
     _, output = call(*FIRST, "rods", "--resume", "--set", "law.noise=1 K", "--json")
@@ -520,7 +520,7 @@ def test_what_is_finished_is_not_run_again(alike, monkeypatch):
 
 @pytest.mark.parametrize(("key", "value"), [("late", "20 s"), ("noise_column", "T_right")])
 def test_members_whose_tables_have_other_channels_step_apart(here, key, value):
-    """Their columns have another order, and were read as those of the first member."""
+    """Their columns were once read in the order of the first member."""
     case, names = Path("rod/case.toml"), ("T_10", "T_30")
     settings = [{f"channels.{name}.{key}": value} for name in names]
     members = {k: cases.load(case, settings=one).prepare() for k, one in enumerate(settings)}
@@ -571,7 +571,7 @@ def test_a_step_that_fails_is_told_of_that_member_alone(alike):
 
 @pytest.mark.long
 def test_a_pause_of_decades_ends_none(alike):
-    """It is longer than a step may be divided; fleets and single runs end alike."""
+    """The pause exceeds the number of substeps; fleets and single runs finish equally."""
     for name in ("rod", "other", "third"):
         path = Path(f"rod/{name}.csv")
         rows = path.read_text().splitlines()

@@ -1,4 +1,4 @@
-"""The live page: figures of datasets, the view of a run, and the page in a real browser."""
+"""The live page: figures of datasets, the view of a run, and the page in Chromium."""
 
 import json
 import os
@@ -64,14 +64,14 @@ def samples(count: int, pause: float = 0.0):
 
 
 def begun(folder: Path, who: lp.Identifier, title: str = "A rod", **attrs) -> Journal:
-    """Make a run directory, and return the journal to fill."""
+    """Create a run directory, and return its empty journal."""
     RunWriter.create(folder, version="1", command=["livepde"], title=title)
     layout = layout_of(who.model, who.observed, who.validation)
     return Journal.create(folder / JOURNAL, who.channels, replace(layout, attrs=attrs))
 
 
 def slow_run(folder: Path) -> None:
-    """Run until somebody ends it, ten samples a second; what the child of a test does."""
+    """Run at ten samples per second until stopped; the main function of a child process."""
     who = identifier()
     with begun(folder, who, origin="2025-04-01 00:00:00") as journal:
         drive(who, samples(100_000, 0.1), journal=journal, fields_every=2)
@@ -241,7 +241,7 @@ def test_what_is_kept_is_spread_evenly():
     spread = Spread(50)
     for number in range(1, 100_001):
         spread.add(number, -number)
-        spread.add(number, number)  # the newest again
+        spread.add(number, number)  # repeat the newest
     numbers = [number for number, _ in spread]
     assert 20 <= len(numbers) <= 50
     assert (numbers[0], numbers[-1]) == (1, 100_000)
@@ -262,7 +262,7 @@ def test_a_view_follows_a_run(tmp_path, monkeypatch):
     drive(who, first, journal=journal, fields_every=3)
     seen = view.look()
     assert (seen.status, seen.samples) == ("running", 10)
-    assert view.look() is seen  # nothing new
+    assert view.look() is seen  # nothing has changed
     assert float(seen.dataset["snapshot"][-1]) == first[-1].t  # kept after the estimate
     drive(who, stream, journal=journal, fields_every=3)
     journal.note(Event(5.8, "silent", "", "nothing from the source for 9 s"))
@@ -363,7 +363,7 @@ def test_ctrl_c_while_it_says_where_ends_it(tmp_path, monkeypatch):
 
     monkeypatch.setattr(sys.modules["livepde.cli.finished"], "terminal", interrupted)
     assert CliRunner().invoke(cli.app, ["watch", str(tmp_path), "--address", "0"]).exit_code == 0
-    assert {*threading.enumerate()} == before  # threads that serve would keep it from its end
+    assert {*threading.enumerate()} == before  # serving threads would keep the program alive
 
 
 @pytest.mark.process
@@ -395,7 +395,7 @@ def served(folder: Path, **options):
 
 
 def profile(page, name: str) -> list[float] | None:
-    """Return the estimate in the figure of a field."""
+    """Return the estimate that the figure of a field shows."""
     return page.execute_script(
         """
         const panel = [...document.querySelectorAll('figure.panel')]
@@ -409,7 +409,7 @@ def profile(page, name: str) -> list[float] | None:
 
 
 def colours(page, selector: str, visibility: str = "visible") -> int:
-    """Return how many colours an element is shown in, with or without what WebGL has drawn."""
+    """Return the number of colours of an element, with or without its WebGL canvas."""
     from PIL import Image
 
     element = page.find_element("css selector", selector)
@@ -457,11 +457,11 @@ def test_the_page_follows_a_run_and_looks_back(tmp_path):
             assert "m²/s" in text(page, ".card")
 
             seen, drawn = count(page), wait(page, lambda p: profile(p, "State u"))
-            wait(page, lambda p: count(p) > seen + 5)  # it goes on
+            wait(page, lambda p: count(p) > seen + 5)  # the run continues
             wait(page, lambda p: profile(p, "State u") != drawn)
 
             def at_start(p) -> bool:
-                # Each sample redraws the slider, and a key may be lost then.
+                # Each sample redraws the slider, which may lose a key press.
                 p.find_element(By.CSS_SELECTOR, "#slider [role=slider]").send_keys(Keys.HOME)
                 return text(p, "#shown") == "history: 2025-04-01 00:00:00"
 
@@ -476,7 +476,7 @@ def test_the_page_follows_a_run_and_looks_back(tmp_path):
             wait(page, at_start)
             wait(page, back)
             seen = count(page)
-            wait(page, lambda p: count(p) > seen + 5)  # the run goes on, the page stays there
+            wait(page, lambda p: count(p) > seen + 5)  # the run continues
             wait(page, lambda p: "history" in text(p, "#shown") and back(p))
 
             page.find_element(By.ID, "newest").click()
@@ -507,13 +507,13 @@ def test_text_from_files_is_shown_as_text(tmp_path):
         assert text(page, "h1") == HOSTILE
         wait(page, lambda p: HOSTILE in text(p, "#tables-sensors td"))
         assert page.title == f"{HOSTILE} – livepde"
-        # When all is drawn it fits a phone.
+        # The fully drawn page fits a phone.
         fits = "return document.documentElement.scrollWidth <= window.innerWidth"
         wait(page, lambda p: p.execute_script(fits))
 
 
 def rewrite_layout(path: Path, **changes) -> None:
-    """Change the layout of a journal as somebody might who means harm."""
+    """Change the layout of a journal maliciously."""
     import sqlite3
 
     with closing(sqlite3.connect(path)) as db, db:
@@ -549,7 +549,7 @@ def test_a_solid_is_drawn_and_a_token_is_asked_for(tmp_path):
 
 @pytest.mark.slow
 def test_every_visitor_has_a_page_that_needs_nothing_from_elsewhere(tmp_path):
-    """What the page names in its text, beside what it has asked for above."""
+    """Checks addresses in the page's text, in addition to its requests."""
     begun(tmp_path, identifier()).close()
     with served(tmp_path) as url, urllib.request.urlopen(url, timeout=PATIENCE) as answer:
         shown = answer.read().decode()
@@ -559,7 +559,7 @@ def test_every_visitor_has_a_page_that_needs_nothing_from_elsewhere(tmp_path):
 
 @pytest.fixture
 def several(tmp_path):
-    """A folder with two runs, of which one has failed at its first sample."""
+    """Provide a folder with two runs, one of which failed at its first sample."""
     for name in ("east", "north west"):
         who = identifier()
         with begun(tmp_path / name, who, title=name) as journal:
@@ -598,7 +598,7 @@ def test_each_run_has_its_page_behind_the_table(several):
             assert known in answer.read().decode()
             assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
         other = urllib.request.urlopen(f"{url}run/notes/", timeout=PATIENCE)
-        assert "/run/notes/" not in other.read().decode()  # no run: the table
+        assert "/run/notes/" not in other.read().decode()  # not a run: shows the table
     with served(several, token="secret") as url:
         address = url.partition("?")[0]
         with pytest.raises(urllib.error.HTTPError, match="403"):

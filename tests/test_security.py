@@ -1,4 +1,4 @@
-"""What comes from outside is read, never run; too large, refused; who asks must be allowed to."""
+"""Foreign files are never executed, excessive input is refused, requests need authorisation."""
 
 import hashlib
 import http.client
@@ -40,11 +40,11 @@ from livepde.streams.table import Column
 TOKEN = "long-enough-to-be-a-token"
 
 
-# --- nothing is run ------------------------------------------------------------------------------
+# --- no foreign code is executed -----------------------------------------------------------------
 
 
 class Hostile:
-    """Pickled, it makes a file where it is read."""
+    """Object whose unpickling creates a file."""
 
     def __init__(self, trace: Path) -> None:
         self.trace = trace
@@ -59,7 +59,7 @@ def test_the_hostile_object_would_be_run(tmp_path):
 
 
 def forged(described: object, numbers: bytes = b"", header: object = None) -> bytes:
-    """Return a checkpoint as a stranger could make it, its digest right."""
+    """Return a forged checkpoint with a valid digest."""
     text = json.dumps([header or {}, described]).encode()
     body = text + bytes(-len(text) % checkpoint.ALIGNED) + numbers
     digest = hashlib.blake2b(body, digest_size=checkpoint.DIGEST).digest()
@@ -82,7 +82,7 @@ def test_a_checkpoint_is_not_unpickled(tmp_path):
 @pytest.mark.parametrize(
     "described",
     [
-        [["z", "<f8", [10**13]]],  # more than there is
+        [["z", "<f8", [10**13]]],  # more than the file contains
         [["z", "<f8", [10**40, 10**40]]],
         [["z", "<f8", [-1]]],
         [["z", "<f8", ["many"]]],
@@ -110,7 +110,7 @@ def test_an_array_keeps_type_and_shape_in_a_checkpoint():
     for name, array in leaves.items():
         assert found[name].dtype == array.dtype
         assert np.array_equal(found[name], array)
-        found[name][...] = array  # it may be written to
+        found[name][...] = array  # it is writable
 
 
 def test_a_damaged_checkpoint_is_one_sentence():
@@ -135,7 +135,7 @@ CODE = 'from pathlib import Path\nPath("trace").touch()\ndef equation(*_, **__):
 
 @pytest.fixture(scope="module")
 def a_run(tmp_path_factory):
-    """The folder of a case and its run."""
+    """Provide the folder of a case and its run."""
     folder = tmp_path_factory.mktemp("run")
     case = short_rod(folder / "mycase", 21)
     assert call("run", str(case), "--out", str(folder / "run"))[0] == 0
@@ -144,7 +144,7 @@ def a_run(tmp_path_factory):
 
 @pytest.fixture
 def hostile(a_run, tmp_path, monkeypatch):
-    """A run directory that somebody else has made, with a case that names code."""
+    """Provide a run directory from someone else, with a case that names code."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(a_run, tmp_path, dirs_exist_ok=True)
     folder = tmp_path / "run"
@@ -152,7 +152,7 @@ def hostile(a_run, tmp_path, monkeypatch):
     equation = tomllib.loads(text)["equation"]
     (folder / "case.toml").write_text(text.replace(f'"{equation}"', '"evil.py:equation"'))
     assert "evil.py" in (folder / "case.toml").read_text()
-    # A stranger makes the digests fit.
+    # An attacker recomputes the digests.
     digest = hashlib.sha256((folder / "case.toml").read_bytes()).hexdigest()
     record = runs.open(folder).record | {"case_copy_sha256": digest}
     runs.RunWriter(folder, record)._save_record()
@@ -162,7 +162,7 @@ def hostile(a_run, tmp_path, monkeypatch):
 
 
 def call(*arguments: str) -> tuple[int, str]:
-    """Return how a command ended, and what it said."""
+    """Run a command; return its exit code and output."""
     result = CliRunner().invoke(app, list(arguments))
     if isinstance(result.exception, lp.LivepdeError):
         return 2, str(result.exception)
@@ -183,7 +183,7 @@ def test_a_run_of_somebody_else_runs_nothing(hostile):
     assert runs.open(hostile).dataset.sizes["time"] > 0
     assert not trace.exists()
     code, text = call("run", str(hostile / "case.toml"), "--out", "another", "--allow-code")
-    assert trace.exists()  # who allows it gets it
+    assert trace.exists()  # with permission the code runs
 
 
 @pytest.mark.slow
@@ -208,7 +208,7 @@ def test_a_case_cannot_allow_its_own_code(hostile):
     assert not Path("trace").exists()
 
 
-# --- nothing is too large ------------------------------------------------------------------------
+# --- excessive input -----------------------------------------------------------------------------
 
 
 def test_a_case_is_short(tmp_path):
@@ -278,7 +278,7 @@ def test_values_that_are_none(value):
         assert {r.kind for r in intake.take({"t": 1.0, "a": value}).remarks} >= {"malformed"}
 
 
-# --- who may ask ---------------------------------------------------------------------------------
+# --- authorisation -------------------------------------------------------------------------------
 
 
 def hello(environ, start):
@@ -300,7 +300,7 @@ def serving():
 
 
 def ask(server, path="/", **headers) -> tuple[int, str, http.client.HTTPMessage]:
-    """Return code, content and headers of an answer."""
+    """Send a request; return status code, content and headers."""
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
     connection.putrequest("GET", path, skip_host="Host" in headers)
     for name, value in headers.items():
@@ -356,7 +356,7 @@ def test_elsewhere_a_token_is_made(serving):
         server.url.replace("0.0.0.0", "127.0.0.1"), timeout=PATIENCE
     ) as answer:
         assert answer.status == 200
-    assert server.shown == server.url  # nobody else can say it
+    assert server.shown == server.url  # only the server can show it
 
 
 @pytest.mark.parametrize(
@@ -417,7 +417,7 @@ def test_no_thread_that_serves_keeps_a_program_from_its_end(serving):
 @pytest.mark.slow
 @pytest.mark.parametrize("token", ["", TOKEN])
 def test_slow_visitors_do_not_keep_others_out(serving, monkeypatch, token):
-    """Many more than there are threads, that send a little now and then: none holds one."""
+    """Many more slow clients than threads do not block a thread."""
     monkeypatch.setattr(visitors, "DEADLINE", 2)
     server = serving(token=token)
     slow = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(4 * THREADS)]
@@ -427,7 +427,7 @@ def test_slow_visitors_do_not_keep_others_out(serving, monkeypatch, token):
     for k in range(5):
         assert ask(server, Authorization=f"Bearer {token}")[0] == 200
         for one in slow[::2]:
-            with suppress(OSError):  # of who has had his time already
+            with suppress(OSError):  # the client's time may be over already
                 one.sendall(b"X-%d: 1\r\n" % k)
     for one in slow:
         one.settimeout(PATIENCE)
@@ -435,14 +435,14 @@ def test_slow_visitors_do_not_keep_others_out(serving, monkeypatch, token):
             answer = one.recv(1000)
         except ConnectionResetError:
             answer = b""
-        assert answer == b"" or b"403" in answer.split(b"\r\n")[0]  # they have had their time
+        assert answer == b"" or b"403" in answer.split(b"\r\n")[0]  # their time is over
         one.close()
     assert ask(server, Authorization=f"Bearer {token}")[0] == 200
 
 
 @pytest.mark.slow
 def test_a_server_closes_while_an_answer_wakes_it(monkeypatch):
-    """The threads that answer pull the same trigger, and another pull may be the one that ends."""
+    """Answering threads use the same trigger, and any of its pulls may be the last one."""
     server = Server(hello, Address())
     assert ask(server)[0] == 200
     trigger = server._server.trigger
@@ -476,7 +476,7 @@ def test_who_may_not_ask_is_answered_whatever_is_sent_along(serving):
 @pytest.mark.slow
 @pytest.mark.parametrize("chunked", [False, True])
 def test_bodies_of_who_may_not_ask_are_not_kept(serving, monkeypatch, chunked):
-    """Those of many strangers would fill memory and disk."""
+    """Bodies of many unauthorised clients would fill memory and disk."""
     kept: list[int] = []
 
     class Counting(parser.OverflowableBuffer):
@@ -498,7 +498,7 @@ def test_bodies_of_who_may_not_ask_are_not_kept(serving, monkeypatch, chunked):
 
 @pytest.mark.slow
 def test_bodies_reach_the_page():
-    """Those that are there at once, and one that is longer than what is kept in memory."""
+    """Short bodies, and one that exceeds the memory buffer, reach the page."""
 
     def size(environ, start):
         start("200 OK", [("Content-Type", "text/plain")])
@@ -507,7 +507,7 @@ def test_bodies_reach_the_page():
     server = Server(size, Address())
     for length in (0, 10, IN_MEMORY + 100_000):
         connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
-        for _ in range(2):  # the second one by the same connection
+        for _ in range(2):  # the second request uses the same connection
             connection.request("POST", "/", b"a" * length)
             answer = connection.getresponse()
             assert (answer.status, answer.read()) == (200, str(length).encode())
@@ -533,7 +533,7 @@ def test_who_sends_a_long_body_a_byte_at_a_time_is_sent_away(serving, monkeypatc
 
 @pytest.mark.slow
 def test_who_takes_a_long_answer_too_slowly_is_sent_away(monkeypatch):
-    """It holds a thread where the answer is longer than what the server buffers."""
+    """A slow reader blocks a thread if the answer exceeds the server's buffer."""
     monkeypatch.setattr(visitors, "LONGEST", 1)
     ended, piece = threading.Event(), b"a" * 1_000_000
 
@@ -585,7 +585,7 @@ def test_health_and_metrics_ask_for_the_token_too():
 
 
 def test_nothing_is_written_through_links_of_a_strangers_directory(tmp_path):
-    """Links named as files in the making lead nowhere; a run with links is not gone on with."""
+    """Links with the names of temporary files are not followed; a run with links is refused."""
     run, victim = tmp_path / "run", tmp_path / "victim"
     victim.write_text("mine")
     options = {"version": "1", "case": "a = 1\n"}

@@ -17,7 +17,7 @@ SCHEMES = {"euler": lp.ImplicitEuler(), "alexander": lp.Alexander2()}
 
 
 def cubic(**options):
-    """u_t - u_xx + q u + u^3 = f with u* = (1 + x) (2 + sin 3t), in every space with P1."""
+    """Return u_t - u_xx + q u + u^3 = f with u* = (1 + x) (2 + sin 3t), which P1 contains."""
 
     def exact(x, t):
         return (1 + x[0]) * (2 + np.sin(3 * t))
@@ -40,7 +40,7 @@ def cubic(**options):
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "order"), [("euler", 1), ("alexander", 2)])
 def test_order_in_time_with_moving_boundary_data(name, order):
-    """The solution lies in the space, so all of the error is the scheme's."""
+    """The space contains the solution, so that only the scheme has an error."""
     model, exact = cubic()
     assert SCHEMES[name].order == order
     errors = []
@@ -57,7 +57,7 @@ def test_order_in_time_with_moving_boundary_data(name, order):
     ("element", "order"), [(ElementLineP1(), 2), (ElementLineHermite(), 4)], ids=["P1", "Hermite"]
 )
 def test_order_in_space(element, order):
-    """Linear in time, so that implicit Euler is exact there; L2 norm by quadrature."""
+    """The solution is linear in time, so implicit Euler is exact; L2 norm by quadrature."""
 
     def exact(x, t):
         return (1 + t) * np.sin(np.pi * x[0])
@@ -85,7 +85,7 @@ def test_order_in_space(element, order):
 
 
 def test_schemes_are_L_stable():
-    """A stiff decay is damped away within a step, not turned over."""
+    """A stiff decay is damped within one step, without a change of sign."""
     model = reaction(line(8), ElementLineP1(), B=lambda u, v, x: 1e8 * u * v)
     for scheme in SCHEMES.values():
         u = truth(model, np.zeros(9), lambda x: np.sin(np.pi * x[0]), [0.0, 1.0], scheme)[-1]
@@ -120,7 +120,7 @@ def test_substeps_are_the_same_steps_taken_by_hand(scheme):
     q = np.full(9, 2.0)
 
     def inputs(t):
-        return {"T": 3 - 2 * t, "Q": 1 + 4 * t}  # linear: what lies between two samples
+        return {"T": 3 - 2 * t, "Q": 1 + 4 * t}  # linear between two samples
 
     control = lp.Advance(SCHEMES[scheme], dt_max=0.03)
     once = [u for _, u in lp.simulate(model, q, 1.0, [0.0, 0.05, 0.3], control, inputs)]
@@ -140,7 +140,7 @@ def interval(t0=1.0, t1=3.0, z0=(2.0, np.nan, 1.0), z1=(4.0, 6.0, np.nan)):
 def test_between_two_samples_data_are_linear():
     span = interval()
     np.testing.assert_array_equal(span.present, [True, True, False])
-    np.testing.assert_array_equal(span.z(2.0), [3.0, 6.0, np.nan])  # held where none was before
+    np.testing.assert_array_equal(span.z(2.0), [3.0, 6.0, np.nan])  # held without a previous value
     np.testing.assert_array_equal(span.z(3.0), [4.0, 6.0, np.nan])
     assert span.at(2.0).inputs["Q"] == 15.0
     assert span.at(3.0) is span.end
@@ -174,7 +174,7 @@ def test_a_failing_substep_is_halved_and_grows_again():
     np.testing.assert_allclose(y, 4.0)
 
 
-def test_a_substep_that_fails_for_good():
+def test_a_substep_that_always_fails_is_reported():
     def stage(c, t, h):
         if t > 2.0:
             raise StepFailed("not_finite", "no way")
@@ -189,7 +189,7 @@ def test_a_substep_that_fails_for_good():
 
 
 def test_equal_steps_are_one_number():
-    """Steps between equidistant times share their factorised matrix."""
+    """Steps between equidistant times share one factorised matrix."""
     widths = set()
 
     def stage(c, t, h):
@@ -204,7 +204,7 @@ def test_equal_steps_are_one_number():
 
 
 class Slope:
-    """The factor of a single number."""
+    """Factor of a 1 x 1 matrix."""
 
     def __init__(self, slope):
         self.slope = slope
@@ -214,7 +214,7 @@ class Slope:
 
 
 class Cubic:
-    """x^3 = x for x = y - 5, as an equation of `Newton`: roots at 4, 5 and 6."""
+    """Equation x^3 = x for x = y - 5, with roots at 4, 5 and 6."""
 
     def __init__(self):
         self.factors = 0
@@ -232,7 +232,7 @@ class Cubic:
 
 
 class Point:
-    """A point of an equation, with the size of its residual relative to a scale."""
+    """Point of an equation, with the residual relative to a scale."""
 
     def __init__(self, y, residual, scale=1.0, resolved=True):
         self.y, self.residual, self.resolved = y, residual, resolved
@@ -240,7 +240,7 @@ class Point:
 
 
 class Equation:
-    """y^3 = a, one unknown each; the Jacobian may be spoiled, and small differences be hidden."""
+    """Equations y^3 = a, with optional errors of the Jacobian and hidden small differences."""
 
     def __init__(self, a, slope=3.0, resolution=np.inf):
         self.a, self.slope, self.resolution = np.asarray(a, dtype=float), slope, resolution
@@ -279,7 +279,7 @@ def test_newton_keeps_its_factor_while_it_is_good():
 
 
 @pytest.mark.parametrize("tolerance", [1e-15, 1e-17, 0.0])
-def test_newton_goes_as_far_as_rounding_lets_it(tolerance):
+def test_newton_iterates_to_rounding_level(tolerance):
     found = (
         lp.stepping.Newton(tolerance=tolerance)
         .solve(Equation([3.0, 1e5]), np.array([1.5, 50.0]))
@@ -291,10 +291,10 @@ def test_newton_goes_as_far_as_rounding_lets_it(tolerance):
 @pytest.mark.parametrize(
     ("near", "kept", "made"),
     [
-        (6.01, None, 1),  # a good start: one factor
-        (6.01, Slope(2.0), 0),  # none at all
-        (6.01, Slope(0.1), 1),  # a kept one that is no good is replaced
-        (6.01, Slope(-2.0), 1),  # by it the residual grows
+        (6.01, None, 1),  # good start, one new factor
+        (6.01, Slope(2.0), 0),  # no new factor
+        (6.01, Slope(0.1), 1),  # a poor cached factor is replaced
+        (6.01, Slope(-2.0), 1),  # this factor increases the residual
     ],
 )
 def test_newton_begins_where_the_start_is_good(near, kept, made):
@@ -334,8 +334,8 @@ def test_a_stage_that_needs_a_small_difference_is_solved_until_it_is_resolved():
 
 
 @pytest.mark.parametrize("near", [5.5773, np.nan])
-def test_a_prediction_that_leads_nowhere_is_given_up(near):
-    """From there Newton goes far below, or does not even begin."""
+def test_a_prediction_from_which_newton_fails_is_discarded(near):
+    """Newton from there diverges far below, or cannot begin."""
     equation, plain = Cubic(), Cubic()
     newton = lp.stepping.Newton(tolerance=1e-10, iterations=12)
     y = newton.solve(equation, np.array([5.8]), Near(np.array([near]), Slope(1e-3))).at.y
@@ -344,7 +344,7 @@ def test_a_prediction_that_leads_nowhere_is_given_up(near):
 
 
 def test_an_update_that_goes_too_far_is_shortened():
-    """The full one leads away from the root of the arc tangent."""
+    """The full update diverges from the root of the arc tangent."""
 
     class Arc(Equation):
         def evaluate(self, y):
@@ -359,7 +359,7 @@ def test_an_update_that_goes_too_far_is_shortened():
 
 @pytest.mark.parametrize("slope", [0.01, 0.3, 30.0, 1e4])
 def test_a_wrong_factor_never_makes_a_solution(slope):
-    """Updates are as small as one likes with a factor that is too large; the residual is not."""
+    """With a factor that is too large, updates are arbitrarily small, but the residual is not."""
     newton = lp.stepping.Newton(tolerance=1e-8, share=0.0)
     near = Near(np.array([2.1]), Slope(slope * 12.0))
     found = newton.solve(Equation([8.0]), np.array([2.5]), near).at
@@ -376,7 +376,7 @@ def test_a_wrong_factor_never_makes_a_solution(slope):
         (Equation([np.nan]), 1.0, lp.stepping.Newton(), "not_finite"),
     ],
 )
-def test_newton_says_how_it_failed(equation, start, newton, code):
+def test_newton_reports_why_it_failed(equation, start, newton, code):
     with pytest.raises(StepFailed) as caught:
         newton.solve(equation, np.array([start]))
     assert caught.value.code == code
@@ -400,9 +400,9 @@ def test_forward_stage_of_an_affine_model_is_one_factorisation():
     kept = forward.factor(q, 0.1, lp.fem.Moment())
     assert forward.factor(q.copy(), 0.1, lp.fem.Moment()) is kept
     assert forward.factor(2 * q, 0.1, lp.fem.Moment()) is not kept
-    # What is kept never changes the numbers.
+    # Caching never changes the numbers.
     np.testing.assert_array_equal(ForwardStage(model).solve(u, q, 0.1, Moment(0.1)), first)
-    # And it solves the equation.
+    # The result solves the equation.
     start = model.impose(u, Moment(0.1))
     del start
     residual = model.mass @ (first - u) / 0.1 + model.B(first) + model.A(first)(q)
@@ -422,7 +422,7 @@ def test_held_inputs_are_held_exactly():
 
 
 def test_shortcuts_of_affine_models_do_not_change_the_numbers():
-    """The same model, once constant, once made to look time-dependent and nonlinear."""
+    """Compares a constant model with an equal one disguised as time-dependent and nonlinear."""
     mesh = line(8)
     plain = reaction(mesh, ElementLineP1(), B=lambda u, v, x: (u - 1.0) * v)
     timed = reaction(mesh, ElementLineP1(), B=lambda u, v, x: (u - 1.0 + 0 * x.t) * v)
@@ -436,7 +436,7 @@ def test_shortcuts_of_affine_models_do_not_change_the_numbers():
 
 
 def test_tangent_is_the_derivative_of_a_stage():
-    """S du = M dc/h: sensitivities are derivatives of the discrete step, not approximations."""
+    """S du = M dc/h: sensitivities are exact derivatives of the discrete step."""
     model, _ = cubic()
     forward = ForwardStage(model, lp.stepping.Newton(tolerance=1e-13))
     q = np.array([1.5])
@@ -456,7 +456,7 @@ def test_tangent_is_the_derivative_of_a_stage():
         np.testing.assert_allclose(tangent, (ahead - back) / (2 * step), atol=1e-7)
 
 
-def test_a_simulation_that_blows_up_says_so():
+def test_a_simulation_that_blows_up_is_reported():
     model = reaction(line(6), ElementLineP1(), B=lambda u, v, x: -np.exp(u) * v, dirichlet={})
     control = lp.Advance(lp.ImplicitEuler(), halvings=2)
     with pytest.raises(StepFailed) as caught:
@@ -503,10 +503,10 @@ def test_inputs_that_do_not_touch_the_state_keep_the_factor():
     [
         lambda q, u, v, x: (u if x.t > 5 else 0.0) * v,  # a branch that is taken later
         lambda q, u, v, x: x.inputs["Q"] * (lambda: u)() * v,  # in a closure
-        functools.partial(lambda a, q, u, v, x: a * x.t * v, 1.0),  # no plain function
+        functools.partial(lambda a, q, u, v, x: a * x.t * v, 1.0),  # not a plain function
     ],
 )
-def test_terms_that_may_touch_the_state_are_not_kept(term):
+def test_terms_that_may_depend_on_the_state_are_not_cached(term):
     assert not wells([conducts, term]).steady
 
 
@@ -532,8 +532,8 @@ def test_steps_near_the_start_are_graded():
 
 
 @pytest.mark.slow
-def test_a_flux_that_sets_in_is_followed_by_graded_steps():
-    """The state goes with the square root of time: one long step misses it."""
+def test_graded_steps_resolve_a_flux_that_starts():
+    """The state grows as the square root of time, which one long step misses."""
     model = lp.Model(
         lp.Field(lp.interval(0.0, 4.0, 400), ElementLineP1()),
         lp.Normal(1.0, 0.1),

@@ -1,4 +1,4 @@
-"""A run judges itself: what speaks against it is found, named, and said no louder than it is."""
+"""The verdict of a run finds and names faults, and does not overstate them."""
 
 import json
 from dataclasses import replace
@@ -43,7 +43,7 @@ ENDS = {"left": lp.Channel("T_left"), "right": 0.0}
 
 
 def rod(loss: float = 0.0) -> lp.Model:
-    """Return heat conduction between a measured end and one at zero, with an unknown k."""
+    """Return heat conduction with unknown k between a measured end and an end at zero."""
     mesh = lp.interval(0.0, 1.0, 24)
     return lp.Model(
         lp.Field(mesh, lp.linear(mesh), dirichlet=ENDS),
@@ -64,7 +64,7 @@ def shown(
     places: tuple[float, ...] = (0.25, 0.5, 0.75),
     count: int = len(TIMES),
 ) -> Any:
-    """Return what sensors show: method of lines on a finer grid, steps by the matrix exponential.
+    """Simulate sensors by the method of lines on a finer grid with the matrix exponential.
 
     A code of its own: central differences on 160 cells, and the input as a staircase of 20 steps
     for each sample.
@@ -102,7 +102,7 @@ def run(
     validation: Any = None,
     u0: float | None = 0.0,
 ) -> tuple[lp.Identifier, lp.Estimate]:
-    """Return identifier and last estimate of a run with some readings."""
+    """Run an identifier on readings; return it and the last estimate."""
     sensors = lp.Points(places or PLACES, noise=NOISE * stated, unit="degC")
     law = law or lp.SensitivityLaw()
     identifier = lp.Identifier(rod(), sensors, law, u0=u0, validation=validation)
@@ -124,7 +124,7 @@ def samples(z: Any) -> list[lp.Sample]:
 
 
 def named(found: Verdict) -> list[tuple[str, str]]:
-    """Return kinds and subjects of the first two causes."""
+    """Return kind and subject of the first two causes."""
     return [(c.kind, c.subject) for f in found.findings for c in f.causes[:2]]
 
 
@@ -262,7 +262,7 @@ def test_each_share_of_a_shift_is_named_with_its_own_remedy():
 @pytest.mark.slow
 @pytest.mark.parametrize(("offset", "level"), [(0.0, "INFO"), (0.08, "WARNING")])
 def test_a_verdict_is_a_warning_in_the_log_unless_the_run_is_trusted(caplog, offset, level):
-    """A sound run, which is not judged at first, writes nothing to a terminal."""
+    """A correct run, which is not judged at first, logs no warning."""
     caplog.set_level("INFO", "livepde.run")
     z = shown()[:60] + errors()[:60]
     z[:, 1] += offset
@@ -311,7 +311,7 @@ def test_a_kept_verdict_holds_no_responses_of_the_process():
 
 @pytest.mark.slow
 def test_directions_move_the_estimate_by_what_they_say():
-    """For an unknown source model and filter are linear: the shift by an offset is exact."""
+    """With an unknown source, model and filter are linear, so the shift by an offset is exact."""
     mesh = lp.interval(0.0, 1.0, 20)
 
     def estimated(offset: float) -> tuple[lp.Identifier, lp.Estimate]:
@@ -339,7 +339,7 @@ def test_directions_move_the_estimate_by_what_they_say():
 
 
 def fed(inputs: Any, *, between: str = "line") -> lp.Estimate:
-    """Return the last estimate of a run whose channel reads some values."""
+    """Return the last estimate of a run with given values of one channel."""
     identifier = judged(between={"T_left": between})
     z = shown() + errors()
     for k, t in enumerate(TIMES.tolist()):
@@ -357,7 +357,7 @@ def test_readings_that_are_held_as_settings_are_told(between: str):
     assert held.diagnostics.shifts.by("hold")["k"] == pytest.approx(shift, rel=0.3)
     assert found.evidence == pytest.approx(abs(shift) / held.q_std[0], rel=0.4)
     assert "hold" not in straight.diagnostics.shifts.sizes
-    steps = np.repeat(driven(TIMES[::10]), 10)[: len(TIMES)]  # what an actuator does
+    steps = np.repeat(driven(TIMES[::10]), 10)[: len(TIMES)]  # steps like those of an actuator
     assert fed(steps, between=between).diagnostics.shifts.sizes["hold"] == 0.0
 
 
@@ -433,7 +433,7 @@ def test_a_validation_sensor_with_few_values_is_not_judged():
 
 
 def test_sums_of_a_sensor_do_not_depend_on_samples_without_it():
-    """Sums of rows in which each sensor has its own gaps are those of its values alone."""
+    """If sensors have different gaps, the sums of each sensor only use its own values."""
     windows, directions, rows = 2, 3, 12
     start = Ledger.start(2, directions, 0, 0, 0, windows, 1, rows, 1)
     rng = np.random.default_rng(2)
@@ -481,7 +481,7 @@ def test_the_worst_finding_decides_and_none_is_said_twice():
 
 
 def test_what_was_not_judged_is_never_trusted():
-    """Neither with notes nor with a caution, which says more than is known; it may be worse."""
+    """Notes or a caution do not make it trusted; a caution would claim too much."""
     note, caution = Finding("noise", "note", "n"), Finding("flat", "caution", "f")
     grave = Finding("validation", "do not trust", "w")
     for found in ([], [note], [note, caution]):
@@ -501,7 +501,7 @@ def test_a_run_names_the_discretisation_once():
 
 
 def test_a_finding_of_later_data_takes_the_place_of_an_earlier_one():
-    """A page reads the verdict of some samples ago, and the shares that are left now."""
+    """A page shows an earlier verdict with the current shares of the prior."""
     earlier = Verdict.of([flat("a", 0.92), flat("b", 0.95)], [], [])
     found = earlier.with_findings([flat("a", 0.94)])
     assert sorted(one.subject for one in found.findings) == ["a", "b"]
