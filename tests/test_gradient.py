@@ -37,7 +37,7 @@ def identifier(model, law, sensors=None, **options):
 
 
 def energies(model, law, q_true, states, times, **options):
-    """Return ||e||_Q^2/gain + ||r||_X^2 after each sample of exact data on all of the domain."""
+    """Return ||e||_Q^2/gain + ||r||_X^2 after each sample of exact data on the whole domain."""
     ident = identifier(model, law, **options)
     G = ident.observed.G
     found = []
@@ -108,7 +108,7 @@ def test_energy_of_a_diffusivity_with_a_time_dependent_model():
 
 @pytest.mark.slow
 def test_excited_twin_is_identified():
-    """DESIGN.md, fact 5, a short run: q* between 2 and 5 from q0 = 0."""
+    """A short run of fact 5 in DESIGN.md finds q* between 2 and 5 from q0 = 0."""
     model = excited(16)
     times = 0.05 * np.arange(400)
     q_true = model.initial_parameter(excited_q)
@@ -135,7 +135,7 @@ def partly_observed(scheme, steps, h_total=1.0, **options):
     sensors = lp.Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.8))
     law = lp.GradientLaw(
         gain=30.0, damping=lp.laws.ResidualDamping(0.5), nu=0.3, sigma=0.2, newton=EXACT
-    )  # where r passes zero theta jumps, by up to c_1: a larger one hides the orders
+    )  # theta jumps by up to c_1 where r = 0, so a larger c_1 would hide the orders
     ident = identifier(model, law, sensors, q0=1.0, u0=lambda x: x[0] * (1 - x[0]), scheme=scheme)
     nodes = ident.observed.G @ model.state.mesh.p[0]
 
@@ -151,7 +151,7 @@ def partly_observed(scheme, steps, h_total=1.0, **options):
 
 @pytest.fixture(scope="module")
 def resolved():
-    """The end of the same run in steps so small that their error does not count."""
+    """Return the end of the run with such small steps that their error is negligible."""
     return partly_observed(lp.Alexander2(), 1280)
 
 
@@ -172,12 +172,12 @@ def stage_of(model, split, rule, newton=EXACT, nu=0.0, **options):
 
 
 def solved(stage, *args):
-    """Return y of a solved stage."""
+    """Solve a stage, and return y = (u, q)."""
     return stage.solve(*args)[0].y
 
 
 def a_stage(rule, gain=50.0, nu=0.4, sigma=0.3, size=1.0, h=0.3, seed=0, newton=EXACT):
-    """Return a stage with data that miss its start, and the same by dense matrices.
+    """Return a stage whose start does not match its data, and its dense counterpart.
 
     With u in another unit, `size` times as large, the same gain is one over size squared.
     """
@@ -210,16 +210,16 @@ RULES = [
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("nu", [0.0, 0.4])
 def test_stage_solves_its_equations(rule, nu):
-    """The two equations, written out with dense matrices and integrals over omega and the rest."""
+    """Checks both equations with dense matrices and integrals over omega and the rest."""
     stage, problem, dense, given = a_stage(rule, nu=nu)
     y = solved(stage, problem, problem.c.copy)
     assert dense.relative(y, *given) <= 1e-12
-    assert dense.relative(y + 1e-6 * problem.c, *given) > 1e-9  # which would show a wrong solution
+    assert dense.relative(y + 1e-6 * problem.c, *given) > 1e-9  # detects a wrong solution
 
 
 @pytest.mark.parametrize("left", [False, True])
 def test_products_made_ahead_state_the_same_equation(left):
-    """Residual, its size and the Jacobian are those of the forms, at any point."""
+    """Residual, its size and the Jacobian equal those of the forms at any point."""
     stage, problem, *_ = a_stage(lp.laws.ResidualDamping(3.0))
     rng = np.random.default_rng(3)
     y = problem.c + 0.1 * rng.standard_normal(len(problem.c))
@@ -246,7 +246,7 @@ def test_products_made_ahead_state_the_same_equation(left):
     ),
 )
 def test_an_accepted_stage_is_solved_in_every_unit(size, rule, gain):
-    """The residual counts, whatever the size of the state: acceptance has no unit."""
+    """Acceptance depends on the relative residual, not on the unit of the state."""
     newton = lp.stepping.Newton(share=0.0)
     for halvings in range(9):
         h = 0.3 / 2**halvings
@@ -262,7 +262,7 @@ def test_an_accepted_stage_is_solved_in_every_unit(size, rule, gain):
 
 @pytest.mark.parametrize("spoiled", [0.5, 3.0, -1.0, 1e6, 1e-6])
 def test_a_wrong_factor_is_never_accepted(spoiled):
-    """A factor of another point makes updates small; the residual stays."""
+    """A factor of another point makes updates small, but not the residual."""
 
     class Spoiled:
         def __init__(self, inner):
@@ -283,11 +283,11 @@ def test_a_wrong_factor_is_never_accepted(spoiled):
     assert dense.relative(solved.at.y, *given) <= 3 * newton.tolerance
 
 
-def test_a_share_is_one_of_the_residual_that_the_prediction_had():
+def test_a_share_is_relative_to_the_residual_of_the_prediction():
     newton = lp.stepping.Newton(share=0.03)
     stage, problem, dense, given = a_stage(lp.laws.ResidualDamping(1.0), newton=newton)
     exact = solved(stage, problem, problem.c.copy)
-    assert dense.relative(exact, *given) <= 3 * newton.tolerance  # without a prediction: none
+    assert dense.relative(exact, *given) <= 3 * newton.tolerance  # no share without a prediction
     predicted = exact + 1e-4 * np.random.default_rng(1).standard_normal(len(exact))
     predicted[[0, stage.terms.n - 1]] = 0.0
     found = solved(stage, problem, problem.c.copy, predicted)
@@ -313,7 +313,7 @@ def test_without_samples_the_law_is_the_model(scheme):
 
 @pytest.mark.slow
 def test_a_missing_sensor_takes_no_part():
-    """With one sensor missing, the step is that of an observation without it."""
+    """With one missing sensor, the step equals that of an observation without the sensor."""
     model = excited(10)
     omega = lp.Averages({"a": lambda x: x[0] < 0.3, "b": lambda x: x[0] > 0.6})
     alone = lp.Averages({"a": lambda x: x[0] < 0.3})
@@ -335,7 +335,7 @@ def test_stabilising_term_decays_q():
         np.testing.assert_allclose(estimate.q, q0 / (1 + 0.7 * 0.5) ** k, atol=1e-9)
 
 
-def test_stabilising_term_draws_a_logarithm_to_its_prior_in_every_unit():
+def test_stabilising_term_pulls_a_logarithm_to_its_prior_in_every_unit():
     def last(unit):
         mesh = line(6)
         model = lp.Model(
@@ -370,7 +370,7 @@ def test_nu_damps_the_unobserved_part():
 
 
 @pytest.mark.slow
-def test_operators_are_users_choice():
+def test_users_may_choose_the_operators():
     model = excited(8)
     first = lp.GradientLaw(gain=100.0, M_op=lambda u, v, x: u * v)
     same = lp.GradientLaw(gain=100.0, M_op=lambda u, v, x: u * v, N_op=lambda u, v, x: 7 * u * v)
@@ -384,7 +384,7 @@ def test_operators_are_users_choice():
 
 @pytest.mark.slow
 def test_bounds_of_numbers_are_kept():
-    """Data of q = 3 drive q up to its bound, and no further."""
+    """Data of q = 3 drive q to its bound, and not further."""
     model = lp.Model(
         lp.Field(line(10), ElementLineP1(), dirichlet={"boundary": 0.0}),
         lp.Normal(0.5, bounds=(0.0, 1.0)),
@@ -481,7 +481,7 @@ def test_bad_gains():
             lp.GradientLaw(**{name: -0.1})
 
 
-def test_sensors_that_see_the_parameter_are_refused():
+def test_sensors_that_depend_on_the_parameter_are_refused():
     model = lp.Model(lp.Field(line(), ElementLineP1()), lp.Normal(), lambda q, u, v, x: q * u * v)
     sensors = lp.Points({"a": 0.5}, direct={"a": lambda q, x: q})
     with pytest.raises(lp.errors.LawError, match="use SensitivityLaw"):
@@ -489,7 +489,7 @@ def test_sensors_that_see_the_parameter_are_refused():
 
 
 @pytest.mark.slow
-def test_a_step_that_fails_keeps_the_state_and_the_stream_goes_on():
+def test_a_failed_step_keeps_the_state_and_the_stream_continues():
     model = excited(10)
     law = lp.GradientLaw(gain=1e4, newton=lp.stepping.Newton(iterations=0))
     ident = identifier(model, law, q0=1.0, halvings=0)
@@ -510,7 +510,7 @@ def test_a_step_that_fails_keeps_the_state_and_the_stream_goes_on():
 @pytest.mark.long
 @pytest.mark.parametrize("damping", [lp.laws.ResidualDamping(0.0), lp.laws.ConstantDamping(1.0)])
 def test_a_reaction_that_blows_up(damping):
-    """u_t = exp(u) - ... reaches infinity in finite time wherever nothing is observed."""
+    """u_t = exp(u) - ... blows up in finite time where nothing is observed."""
     model = reaction(line(10), ElementLineP1(), B=lambda u, v, x: -10 * np.exp(u) * v, dirichlet={})
     law = lp.GradientLaw(damping=damping)
     ident = identifier(model, law, lp.Subdomain(lambda x: x[0] < 0.25), u0=1.0)
@@ -527,7 +527,7 @@ def test_a_reaction_that_blows_up(damping):
 
 
 @pytest.mark.long
-def test_checked_contract():
+def test_the_law_passes_check_law():
     model = excited(8)
     times = [0.1, 0.2, 0.35, 0.5, 0.55, 0.7]
     rng = np.random.default_rng(0)

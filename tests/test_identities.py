@@ -1,4 +1,4 @@
-"""Identities of estimates that hold whatever the options are, over options drawn at random."""
+"""Identities of estimates that hold for all options, tested with random options."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -28,17 +28,17 @@ MOTIONS = ("stays", "walks", "reverts")
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What is drawn for one run."""
+    """Random options of one run."""
 
     seed: int
-    count: int  # of samples
-    noise: str  # "sensors", "readings": each its own, or "some": where a reading has one
+    count: int  # number of samples
+    noise: str  # "sensors", "readings": one value per reading, or "some": for some readings
     gaps: str  # "none", "readings", "rows"
-    inputs: str  # "all", or "gaps": some are missing and held
+    inputs: str  # "all", or "gaps": missing values are held
     motion: str
     wild: str  # "no", "outlier", "jump"
     calibrated: str  # "no", "offset", "curve"
-    multiplies: bool  # an unknown also multiplies the state: not linear
+    multiplies: bool  # an unknown also multiplies the state, so that the model is nonlinear
     input_noise: bool
     between: tuple[str, str]  # of T_0 and of Q
     dt_max: float
@@ -51,7 +51,7 @@ class Options:
     guards: bool
     shadows: bool
     verdict: bool
-    refit: int  # samples up to which a run is fitted at each doubling; 0: never
+    refit: int  # largest number of samples with a refit; 0: no refits
 
     @property
     def linear(self) -> bool:
@@ -60,7 +60,7 @@ class Options:
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """Units of state and time, and the origin of time: numbers that change nothing."""
+    """Units of state and time, and origin of time, which must not change the results."""
 
     state: float = 1.0
     time: float = 1.0
@@ -101,7 +101,7 @@ def options(**fixed: Any) -> st.SearchStrategy[Options]:
 
 
 def check(strategy: st.SearchStrategy[Any], examples: int, function: Callable[..., None]) -> None:
-    """Check a function for so many drawn options, the same ones in each run."""
+    """Check a function with reproducible random options."""
     quiet = [HealthCheck.too_slow, HealthCheck.filter_too_much]
     using = settings(
         max_examples=examples,
@@ -114,7 +114,7 @@ def check(strategy: st.SearchStrategy[Any], examples: int, function: Callable[..
 
 
 def drawn(few: int) -> Any:
-    """Run a test with some drawn options, and in studies with ten times as many."""
+    """Run a test with random options, and with ten times as many in studies."""
     counts = (
         pytest.param(few, marks=pytest.mark.slow),
         pytest.param(10 * few, marks=pytest.mark.study),
@@ -123,7 +123,7 @@ def drawn(few: int) -> Any:
 
 
 class Bare(lp.SensitivityLaw):
-    """The law with the covariance of the filter itself."""
+    """Law that reports the covariance of the filter without widening."""
 
     def factors(self, work: Any, x: Any) -> Any:
         return x.U, x.C
@@ -229,7 +229,7 @@ def sensors(o: Options) -> np.ndarray:
 
 def times(o: Options, rng: np.random.Generator) -> np.ndarray:
     lengths = rng.uniform(0.08, 0.2, o.count)
-    if o.gaps == "rows":  # which did not come
+    if o.gaps == "rows":  # missing rows
         lengths[rng.random(o.count) < 0.3] *= 3.0
     if not o.late:
         lengths[0] = 0.0
@@ -237,12 +237,12 @@ def times(o: Options, rng: np.random.Generator) -> np.ndarray:
 
 
 def opening(first: kalman.Inputs, t: float) -> kalman.Inputs:
-    """Return the inputs at t0: the boundary has what u0 states, the source what is known first."""
+    """Return the inputs at t0: the boundary value from u0, and the first known source."""
     return replace(first, T_0=0.3) if t > 0.0 else first
 
 
 def shown(o: Options, rng: np.random.Generator) -> list[kalman.Row]:
-    """Return what a rod shows whose unknowns are drawn from the prior; held inputs filled in."""
+    """Return readings of a rod with unknowns drawn from the prior, with held inputs filled in."""
     mean, std = np.array([PRIOR[name] for name in "sco"]).T
     state = np.append(np.full(CELLS + 1, 0.3), mean + std * rng.uniform(-1.5, 1.5, 3))
     found, t0, last = [], 0.0, None
@@ -269,7 +269,7 @@ def shown(o: Options, rng: np.random.Generator) -> list[kalman.Row]:
 
 
 def sample(o: Options, rows: list[kalman.Row], k: int, frame: Frame = PLAIN) -> lp.Sample:
-    """Return a row as a sample: an input that is held is left out."""
+    """Return a row as a sample, without held inputs."""
     row, values = rows[k], {}
     for place, name in enumerate(PLACES):
         z, std = row.z[place] * frame.state, row.std[place] * frame.state
@@ -296,7 +296,7 @@ def numbers(estimate: lp.Estimate) -> list[np.ndarray]:
 
 
 def close(one: lp.Estimate, other: lp.Estimate, size: float = 1.0, rtol: float = 1e-9) -> None:
-    """Compare estimates, those of the second with another unit of the state."""
+    """Assert that estimates are equal; the second may have another unit of the state."""
     scales = (1.0, 1.0, size, size, size)
     assert one.status.code == other.status.code
     for a, b, scale in zip(numbers(one), numbers(other), scales, strict=True):
@@ -362,7 +362,7 @@ def test_the_last_smoothed_estimate_is_the_last_filtered_one(examples):
         np.testing.assert_allclose(data["u"][-1], last.u, rtol=1e-8, atol=1e-8)
         np.testing.assert_allclose(data["u_std"][-1], last.u_std, rtol=1e-8, atol=1e-8)
 
-    # Guards replace an estimate that moves too far by another one: no filter of all samples.
+    # Guards replace an estimate that moves too far, so it is not the filter of all samples.
     check(options(multiplies=False, guards=False), examples, same)
 
 
@@ -371,7 +371,7 @@ def test_the_last_smoothed_estimate_is_the_last_filtered_one(examples):
 def test_a_member_of_a_fleet_is_a_single_identifier(examples):
     def same(o: Options) -> None:
         each = [samples(o, member=k) for k in range(2)]
-        for one in each[1:]:  # a fleet has its times in common
+        for one in each[1:]:  # all members of a fleet have equal times
             for k, item in enumerate(one):
                 one[k] = replace(item, t=each[0][k].t)
         positional, keywords = parts(o)
@@ -389,7 +389,7 @@ def test_a_member_of_a_fleet_is_a_single_identifier(examples):
                 one = each[m][k]
                 close(found.member(m), who.step(one.t, one.z, one.inputs))
 
-    check(options(verdict=False), examples, same)  # a fleet has none
+    check(options(verdict=False), examples, same)  # a fleet has no verdict
 
 
 FRAMES = {
@@ -418,7 +418,7 @@ def test_order_units_and_origin_change_nothing(name, examples):
 LINEAR = {
     "multiplies": False,
     "motion": "stays",
-    "halvings": 0,  # steps are those that are given
+    "halvings": 0,  # steps are not divided
     "gate": np.inf,
     "guards": False,
     "jumps": False,
@@ -428,7 +428,7 @@ LINEAR = {
 
 
 def unread(o: Options, rows: list[kalman.Row]) -> list[kalman.Row]:
-    """Return the rows with the error of a line that is held: twice as long, it might be a sine.
+    """Return the rows with the error of a held line, which may be a sine of twice the length.
 
     It is no larger than inputs so far: half of their steepest change, the deviation of a sine.
     Filters of constant unknowns have none, since their refits have none.
@@ -451,7 +451,7 @@ def unread(o: Options, rows: list[kalman.Row]) -> list[kalman.Row]:
 
 
 def exact(o: Options) -> kalman.Filtered:
-    """Return what the independent filter finds."""
+    """Return the results of the independent filter."""
     rows = shown(o, np.random.default_rng([o.seed, 0]))
     if o.noise != "readings":
         own = o.noise == "some"

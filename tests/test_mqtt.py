@@ -1,4 +1,4 @@
-"""A real broker: rows come, are acknowledged when they are safe, and come again after a crash."""
+"""Runs with a real broker: rows are acknowledged once stored, and sent again after a crash."""
 
 import gc
 import json
@@ -42,7 +42,7 @@ def source(server: Server, topics=None, **options) -> MqttSource:
 
 
 def listen(source, count: int) -> list:
-    """Return so many rows, and what else has come with them."""
+    """Poll until at least `count` rows have arrived, and return all rows."""
     found = []
     until = time.monotonic() + PATIENCE
     while len(found) < count and time.monotonic() < until:
@@ -52,23 +52,23 @@ def listen(source, count: int) -> list:
 
 
 def subscribed(source: MqttSource) -> queue.Queue[int]:
-    """Return where the numbers of subscriptions appear that the broker has answered."""
+    """Return a queue that collects the numbers of answered subscriptions."""
     answered: queue.Queue[int] = queue.Queue()
     source._client.on_subscribe = lambda client, _, number, *__: answered.put(number)
     return answered
 
 
 def acknowledge(source: MqttSource, found: list) -> None:
-    """Acknowledge rows, and wait until the broker knows."""
+    """Acknowledge rows, and wait until the broker has received it."""
     source.acknowledge([row.token for row in found])
-    answered = subscribed(source)  # it answers in order
+    answered = subscribed(source)  # the broker answers in order
     _, number = source._client.subscribe("nothing")
     while answered.get(timeout=PATIENCE) != number:
         pass
 
 
 def polled(source) -> None:
-    """Poll until something is raised."""
+    """Poll until an exception is raised."""
     until = time.monotonic() + PATIENCE
     while time.monotonic() < until:
         source.poll(0.2)
@@ -85,7 +85,7 @@ def publish(server: Server, messages, topic: str = "rod") -> None:
 
 
 def until(run, count: int) -> None:
-    """Run until sinks have heard of so many samples; one more may be taken, if it is at hand."""
+    """Run until sinks got `count` samples; one more may be processed if it is available."""
 
     class Counter:
         def put(self, estimate):
@@ -105,12 +105,12 @@ def until(run, count: int) -> None:
         alarm.cancel()
 
 
-def test_what_was_not_safe_comes_again(server, tmp_path):
+def test_unacknowledged_rows_are_sent_again(server, tmp_path):
     first = source(server)
     publish(server, [*list(rows(30)), "{", '{"t": "x"}'])
     run = live(tmp_path, first)
     until(run, 12)
-    first.close()  # the other messages were received, not acknowledged
+    first.close()  # the other messages were received, but not acknowledged
     run.journal.close()
     server.stop()
     server.start()
@@ -124,7 +124,7 @@ def test_what_was_not_safe_comes_again(server, tmp_path):
     again.feed.close()
 
 
-def test_numbers_with_topics_of_their_own(server):
+def test_numbers_may_have_separate_topics(server):
     heard = source(server, {"plant/a": "a", "plant/+/level": "b"})
     publish(server, ["1.5", '{"value": 2.5, "t": 7}', "warm"], "plant/a")
     publish(server, ["3"], "plant/x/level")
@@ -137,7 +137,7 @@ def test_numbers_with_topics_of_their_own(server):
 
 
 def estimates(tmp_path, count: int) -> list:
-    """Return so many estimates of a run."""
+    """Return `count` estimates of a run."""
 
     class Kept(list):
         put = list.append
@@ -198,12 +198,12 @@ def test_home_assistant_finds_the_numbers_of_a_run(server, tmp_path):
     k = told["homeassistant/sensor/rod_out_k/config"]
     assert k["name"] == "k"
     assert k["device"]["name"] == "The rod"
-    assert "unit_of_measurement" not in k  # the unknown has none
+    assert "unit_of_measurement" not in k  # the unknown has no unit
     verdict = told["homeassistant/sensor/rod_out_verdict/config"]
     assert verdict["device"] == k["device"]
     assert verdict["state_topic"] == "rod/out"
     assert verdict["unique_id"] != k["unique_id"]
-    # The topics that are named have the numbers that the templates read.
+    # The named topics contain the numbers that the templates read.
     value = retained(server, k["state_topic"], 1)[k["state_topic"]]["value"]
     assert k["value_template"] == "{{ value_json.value }}"
     assert value == found[-1].parameters["k"][0]
@@ -211,7 +211,7 @@ def test_home_assistant_finds_the_numbers_of_a_run(server, tmp_path):
     assert (k["availability_topic"], k["payload_available"]) == ("rod/out/status", "running")
 
 
-def test_units_and_names_that_are_no_topics():
+def test_units_and_names_that_are_invalid_in_topics_are_replaced():
     unit = SimpleNamespace(unit="W/(m K)")
     space = SimpleNamespace(unknown_of=lambda label: unit)
     estimate = SimpleNamespace(space=space, parameters={"k #1/2": (1.0, 0.1)})
@@ -221,7 +221,7 @@ def test_units_and_names_that_are_no_topics():
     assert k["state_topic"] == "a/b/unknowns/k _1_2"
 
 
-def test_estimates_wait_for_the_broker_and_the_oldest_give_way(server, tmp_path, caplog):
+def test_estimates_wait_for_the_broker_and_the_oldest_are_dropped(server, tmp_path, caplog):
     found = estimates(tmp_path, 60)
     heard = source(server, {"rod/out": None})
     publisher = sink(server, keep=5)
@@ -260,7 +260,7 @@ sys.stdin.read()
 """
 
 
-def test_the_status_says_whether_the_run_is_there(server):
+def test_the_status_topic_shows_whether_the_run_is_online(server):
     told: queue.Queue[str] = queue.Queue()
     broker = Broker("127.0.0.1", server.port, "watchdog")
     watchdog = broker.client()
@@ -285,13 +285,13 @@ def test_the_status_says_whether_the_run_is_there(server):
     watchdog.loop_stop()
 
 
-def test_a_broker_that_restarts_is_not_seen_in_the_rows(server):
+def test_a_broker_restart_does_not_change_the_rows(server):
     heard = source(server)
     publish(server, [{"t": k} for k in range(30)])
     came = listen(heard, 30)
     heard.acknowledge([row.token for row in came[:5]])
     server.stop()
-    heard.acknowledge([row.token for row in came[5:10]])  # to be said when it is back
+    heard.acknowledge([row.token for row in came[5:10]])  # sent when the broker is back
     server.start()
     publish(server, [{"t": 30}])
     came += listen(heard, 1)
@@ -303,12 +303,12 @@ def test_a_broker_that_restarts_is_not_seen_in_the_rows(server):
     again.close()
 
 
-def test_an_acknowledgement_is_never_that_of_another_message(server):
+def test_an_acknowledgement_never_confirms_another_message(server):
     heard = source(server)
     publish(server, [{"t": 0}, {"t": 1}])
     old = listen(heard, 2)
     server.stop()
-    (server.folder / "mosquitto.db").unlink()  # the broker forgets sessions and counts anew
+    (server.folder / "mosquitto.db").unlink()  # the broker loses sessions and restarts its numbers
     answered = subscribed(heard)
     server.start()
     answered.get(timeout=PATIENCE)
@@ -322,11 +322,11 @@ def test_an_acknowledgement_is_never_that_of_another_message(server):
     again.close()
 
 
-def test_more_messages_than_the_broker_sends_ahead(server, tmp_path, monkeypatch):
+def test_a_backlog_larger_than_the_receive_window_arrives(server, tmp_path, monkeypatch):
     messages = list(rows(60))
     heard = source(server, ahead=5)
     publish(server, messages)
-    run = live(tmp_path, heard)  # samples wait for steps: the broker waits too
+    run = live(tmp_path, heard)  # samples wait for steps, so the broker also waits
     until(run, 60)
     assert len(run.journal) == 60
     assert not run.journal.counts
@@ -338,13 +338,11 @@ def test_more_messages_than_the_broker_sends_ahead(server, tmp_path, monkeypatch
     heard.close()
 
 
-def test_what_the_broker_could_not_be_told_is_known_and_never_used_twice(
-    server, tmp_path, monkeypatch
-):
+def test_unacknowledged_rows_are_never_used_twice(server, tmp_path, monkeypatch):
     heard = source(server)
     publish(server, rows(20))
     run = live(tmp_path, heard)
-    monkeypatch.setattr(heard, "acknowledge", lambda tokens: None)  # killed before each of them
+    monkeypatch.setattr(heard, "acknowledge", lambda tokens: None)  # as if killed before
     until(run, 12)
     taken = run.journal.accepted
     assert taken in (12, 13)
@@ -362,7 +360,7 @@ def test_what_the_broker_could_not_be_told_is_known_and_never_used_twice(
 
 
 def test_a_block_that_a_gateway_sends_again_changes_nothing(server, tmp_path):
-    """Each message of it is new to the broker; a run that is resumed knows it, too."""
+    """The broker sees new messages, but also a resumed run recognises the repeated rows."""
     given = list(rows(60))
     heard = source(server)
     publish(server, [*given[:40], *given[20:40], *given[40:50]])
@@ -394,7 +392,7 @@ def test_long_messages_are_refused_and_the_next_one_arrives(server):
     assert [row.values for row in came[1:]] == [{"t": 1}, {"t": 2}]
 
 
-def test_topics_of_an_earlier_case_are_not_listened_to(server):
+def test_topics_of_an_earlier_case_are_unsubscribed(server):
     source(server, {"old": None}).close()
     heard = source(server, {"rod": None})
     publish(server, [{"t": 1}], "old")
@@ -404,9 +402,9 @@ def test_topics_of_an_earlier_case_are_not_listened_to(server):
     heard.close()
 
 
-def test_two_runs_need_two_names(server, caplog):
+def test_two_runs_need_two_client_names(server, caplog):
     first = source(server)
-    second = source(server)  # some brokers hang up without a word
+    second = source(server)  # some brokers disconnect without a reason
     publish(server, [{"t": 1}])
     until = time.monotonic() + PATIENCE
     while "another client the same client_id" not in caplog.text and time.monotonic() < until:
@@ -417,13 +415,13 @@ def test_two_runs_need_two_names(server, caplog):
     from paho.mqtt.reasoncodes import ReasonCode
 
     reason = ReasonCode(PacketTypes.DISCONNECT, "Session taken over")
-    first._client.on_disconnect(first._client, None, None, reason, None)  # others say it
+    first._client.on_disconnect(first._client, None, None, reason, None)  # others send one
     with pytest.raises(lp.errors.DataError, match="another client uses the session 'livepde'"):
         polled(first)
     first.close()
 
 
-def test_a_broker_that_refuses_later_is_heard_of(server, caplog):
+def test_a_broker_that_refuses_later_is_reported(server, caplog):
     caplog.set_level(logging.INFO, "livepde.mqtt")
     heard = source(server)
     server.stop()
@@ -491,7 +489,7 @@ def test_topics_that_bring_a_message_twice(one, other, overlap):
 
 # paho-mqtt leaves the socket of a failed handshake to the garbage collector.
 @pytest.mark.filterwarnings("ignore:.*ssl.SSLSocket:pytest.PytestUnraisableExceptionWarning")
-def test_a_connection_is_encrypted_with_a_certificate_of_ones_own(server, tmp_path):
+def test_a_connection_is_encrypted_with_a_custom_certificate(server, tmp_path):
     signed, key = certificate(server.folder, "localhost")
     server.stop()
     text = server.config.read_text()
@@ -508,18 +506,18 @@ def test_a_connection_is_encrypted_with_a_certificate_of_ones_own(server, tmp_pa
     client.loop_stop()
     with pytest.raises(
         lp.errors.DataError, match="certificate verify failed"
-    ):  # the system's do not know
+    ):  # system certificates do not include it
         MqttSource(Broker("localhost", server.port, tls=True), {"rod": None}, "t")
-    gc.collect()  # here, and not in another test
+    gc.collect()  # in this test, not in a later one
 
 
 @pytest.mark.parametrize("topic", ["", "a/#/b", "a+/b", "a/b#"])
-def test_topics_that_no_broker_takes(topic):
+def test_invalid_topics_are_refused(topic):
     with pytest.raises(lp.errors.DataError, match="got the topic"):
         MqttSource(Broker(), {topic: None}, "t")
 
 
-def test_what_cannot_be_reached_is_one_sentence(server, tmp_path):
+def test_invalid_settings_of_a_broker_are_refused(server, tmp_path):
     with pytest.raises(lp.errors.DataError, match=r"ca_file .*none.pem cannot be used"):
         source(server, ca_file=str(tmp_path / "none.pem"))
     with pytest.raises(lp.errors.DataError, match="topic 'a/\\+' to publish to"):
@@ -529,6 +527,6 @@ def test_what_cannot_be_reached_is_one_sentence(server, tmp_path):
     assert "secret" not in repr(Broker(username="u", password="secret"))
 
 
-def test_a_broker_that_is_not_there_is_one_sentence():
+def test_a_missing_broker_is_reported_in_one_sentence():
     with pytest.raises(lp.errors.DataError, match="no broker at 127"):
         MqttSource(Broker("127.0.0.1", 1), {"x": None}, "t")

@@ -72,7 +72,7 @@ ELSEWHERE = {
     "test_dashboard.py::test_a_solid_is_drawn_and_a_token_is_asked_for": [
         "LIVEPDE_TOKEN=... livepde watch"
     ],
-    "test_service.py::test_it_follows_a_file_stops_gracefully_and_goes_on": [
+    "test_service.py::test_a_run_follows_a_file_stops_gracefully_and_resumes": [
         "livepde run case.toml"
     ],
     "test_end_to_end.py::test_soil_from_a_broker_to_a_browser": [

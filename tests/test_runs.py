@@ -1,4 +1,4 @@
-"""The loop of a run, its directory, and what it says in numbers."""
+"""The loop of a run, its directory, and its measures and reports."""
 
 import json
 import math
@@ -58,7 +58,7 @@ def written(path, driven, **options):
 # --- outcome ---------------------------------------------------------------------------------
 
 
-def test_checks():
+def test_checks_compare_values_with_bounds():
     assert Check("a", 1.0, 1.0, "<=").ok
     assert Check("a", 1.0, 1.0, ">=").ok
     assert Check("a", 1.0, (0.0, 1.0), "in").ok
@@ -78,7 +78,7 @@ def test_checks():
 
 
 @pytest.mark.slow
-def test_drive_keeps_what_it_has_when_a_sample_is_bad():
+def test_drive_keeps_earlier_results_when_a_sample_is_invalid():
     stream = [*samples(), lp.Sample(2.0, {"T0": 1.0, "a": 0.0})]
     driven = drive(identifier(), stream, progress=True)
     assert driven.status == "failed"
@@ -88,7 +88,7 @@ def test_drive_keeps_what_it_has_when_a_sample_is_bad():
 
 @pytest.mark.slow
 def test_interrupt_ends_between_samples():
-    """Ctrl-C within a step ends the run behind that step, Ctrl-C while waiting at once."""
+    """Ctrl-C within a step ends the run after that step, Ctrl-C while waiting immediately."""
 
     class Slow(lp.Identifier):
         def step(self, t, z, inputs=None):
@@ -126,7 +126,7 @@ def test_drive_outside_of_the_main_thread():
 
 
 @pytest.mark.slow
-def test_a_run_comes_back_as_it_was(tmp_path, driven):
+def test_a_run_is_read_back_unchanged(tmp_path, driven):
     data = written(tmp_path / "run", driven, case="title = 'x'\n")
     run = runs.open(tmp_path / "run")
     assert run.status == "finished"
@@ -172,7 +172,7 @@ def test_a_run_without_samples(tmp_path):
 
 
 @pytest.mark.slow
-def test_nothing_is_written_over(tmp_path, driven):
+def test_an_existing_run_is_not_overwritten(tmp_path, driven):
     written(tmp_path / "run", driven)
     before = (tmp_path / "run" / "run.json").read_text()
     with pytest.raises(lp.errors.RunError, match="already contains a run"):
@@ -199,7 +199,7 @@ def test_free_path(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_folder_that_vanishes(tmp_path, driven):
+def test_a_deleted_run_directory_is_reported(tmp_path, driven):
     writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="")
     (tmp_path / "run" / "run.json").unlink()
     (tmp_path / "run").rmdir()
@@ -311,7 +311,7 @@ def test_markdown_and_plain():
     json.dumps(plain({"x": np.float32(0.5)}), allow_nan=False)
 
 
-# --- what is read back is as it was written ------------------------------------------------------
+# --- results are read back unchanged -------------------------------------------------------------
 
 
 def flipped(content: bytes, bit: int) -> bytes:
@@ -344,7 +344,7 @@ def test_each_bit_of_the_estimates_counts(tmp_path, driven):
 
 @pytest.mark.slow
 def test_each_bit_of_the_record_counts(tmp_path, driven):
-    """No other record is read: a change is refused, unless it is in the layout of the text."""
+    """Any changed bit is refused, unless it only changes the layout of the text."""
     written(tmp_path / "run", driven)
     path, rng = tmp_path / "run" / "run.json", np.random.default_rng(0)
     whole, record = path.read_bytes(), runs.open(tmp_path / "run").record
@@ -363,7 +363,7 @@ def test_each_bit_of_the_record_counts(tmp_path, driven):
 def test_a_kill_while_estimates_are_replaced_leaves_a_whole_run(
     tmp_path, driven, monkeypatch, when
 ):
-    """Of the file that was there before, or of the new one."""
+    """The run has either the previous or the new file."""
     written(tmp_path / "run", driven)
     data = driven.result.to_xarray().isel(time=slice(3))
     replace = Path.replace
@@ -402,7 +402,7 @@ def test_a_copy_of_a_case_that_was_changed_is_not_run(tmp_path):
         ("[intake\n", [], False),
     ],
 )
-def test_a_run_goes_on_with_another_correction_of_its_clock(tmp_path, text, settings, same):
+def test_a_run_resumes_with_a_new_correction_of_its_clock(tmp_path, text, settings, same):
     folder, case = tmp_path / "run", "[intake]\nwait = 1\n"
     RunWriter.create(folder, version="1", command=[], title="", case=case)
     (folder / "journal.sqlite").write_bytes(b"")
@@ -434,7 +434,7 @@ def test_a_figure_that_cannot_be_drawn_is_a_note(tmp_path, driven):
     writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="A run")
     data = driven.result.to_xarray()
     writer.finish(status="finished", dataset=data, notes=["mine"], figures={"overview": order})
-    assert seen == [["estimates.nc", "report.md", "run.json"]]  # all else is written before
+    assert seen == [["estimates.nc", "report.md", "run.json"]]  # everything else is written before
     run = runs.open(tmp_path / "run")
     assert run.status == "finished"
     assert run.notes[0] == "mine"
@@ -445,7 +445,7 @@ def test_a_figure_that_cannot_be_drawn_is_a_note(tmp_path, driven):
     assert "![" not in report
 
 
-def test_what_cannot_be_written_is_no_failed_diagnostic():
+def test_a_write_error_is_not_a_failed_diagnostic():
     def full():
         raise OSError("no room")
 
@@ -477,8 +477,8 @@ def test_numbers_of_any_size_have_digits(value, std, shown):
 
 
 @pytest.mark.slow
-def test_a_report_of_numbers_that_overflow(tmp_path, driven):
-    """Tables, figures and the page of what no axis can hold: notes in their place, no crash."""
+def test_a_report_with_numbers_that_overflow_is_written(tmp_path, driven):
+    """Notes replace tables, figures and page parts that no axis can show, without a crash."""
     data = driven.result.to_xarray().copy(deep=True)
     label = data.attrs["scalars"].split("\n")[0]
     for k, value in ((2, 1e308), (3, -1e308), (-1, 1e300)):
@@ -490,7 +490,7 @@ def test_a_report_of_numbers_that_overflow(tmp_path, driven):
         status="finished", dataset=data
     )
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # NumPy and Matplotlib say that they overflow
+        warnings.simplefilter("ignore")  # NumPy and Matplotlib warn about overflows
         code, output = call("report", folder)
     assert code == 0
     assert "A run" in output
@@ -498,7 +498,7 @@ def test_a_report_of_numbers_that_overflow(tmp_path, driven):
 
 @pytest.mark.slow
 def test_the_last_fields_that_cannot_be_computed_are_an_event(tmp_path, monkeypatch):
-    """The run ends with its data, its checkpoint and its status."""
+    """The run still ends with its data, checkpoint and status."""
 
     usual = Result._snapshot
 
@@ -516,7 +516,7 @@ def test_the_last_fields_that_cannot_be_computed_are_an_event(tmp_path, monkeypa
     assert "SVD did not converge" in event.message
 
 
-def test_a_report_holds_no_html_of_titles_and_notes():
+def test_a_report_escapes_html_in_titles_and_notes():
     text = markdown(
         "<script>alert(1)</script>",
         [Table("<b>T</b>", ("a<br>",), [("<img src=x>", 1.0)])],

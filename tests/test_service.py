@@ -1,4 +1,4 @@
-"""`livepde run` beside a process, as a service would start and stop it."""
+"""Live runs of `livepde run`, started and stopped as a service would."""
 
 import json
 import math
@@ -80,7 +80,7 @@ def case(data='file = "rows.csv"\nfollow = true', intake="", habit="") -> str:
     return "case.toml"
 
 
-def test_it_follows_a_file_stops_gracefully_and_goes_on(here):
+def test_a_run_follows_a_file_stops_gracefully_and_resumes(here):
     whole = [row(k) for k in range(60)]
     Path("rows.csv").write_text(HEADER + table(*whole))
     code, _ = call("run", case('file = "rows.csv"'), "--out", "batch")
@@ -103,13 +103,13 @@ def test_it_follows_a_file_stops_gracefully_and_goes_on(here):
     found = runs.open("live").dataset
     assert np.array_equal(found["time"], expected["time"])
     for name in ("alpha", "alpha_std", "innovation"):
-        # The last estimate is that of the fit at the end, which a signal leaves a second.
+        # The last estimate is from the final fit, which has one second after a signal.
         assert np.array_equal(found[name][:-1], expected[name][:-1])
     assert found.attrs["origin"] == "2026-11-21 00:00:00"
     assert len(runs.open("live").record["resumed"]) == 1
 
 
-def test_another_file_is_followed_as_the_one_it_stands_for(here):
+def test_a_file_given_by_data_is_followed_instead_of_the_case_file(here):
     process = start(case(), "--data", "other.csv", "--out", "live")
     Path("other.csv").write_text(HEADER + table(*(row(k) for k in range(3))))
     until(lambda: estimates("live") == 3, process)
@@ -124,12 +124,12 @@ def test_another_file_is_followed_as_the_one_it_stands_for(here):
 
 
 @pytest.mark.parametrize("name", [None, "other.csv"])
-def test_a_file_that_is_not_there_yet_is_named(here, caplog, name):
+def test_a_missing_followed_file_is_named(here, caplog, name):
     source_of(cases.load(case()), name, "").close()
     assert f"there is no file '{name or 'rows.csv'}' yet: waiting for it" in caplog.text
 
 
-def test_what_a_process_sends_does_not_end_a_run(here):
+def test_malformed_input_does_not_end_a_run(here):
     rows = [json.dumps(row(k)) for k in range(12)]
     rows[4:4] = ["{", '{"time": "soon"}', '{"time": "2026-11-21 00:02", "T_3": 21.5}', "[1]"]
     rows[9] = json.dumps({**row(5), "T_3": 85.0})
@@ -151,7 +151,7 @@ def test_what_a_process_sends_does_not_end_a_run(here):
         assert "85 is not between -20 and 60" in [event.message for event in journal.events]
 
 
-def test_what_is_sent_again_to_standard_input_is_used_once(here):
+def test_rows_repeated_on_standard_input_are_used_once(here):
     lines = [json.dumps(row(k)) + "\n" for k in range(12)]
     options = ("--realtime", "--data", "-", "--estimates", "--resume", "--out")
     assert call("run", case(), *options, "whole", stdin="".join(lines))[0] == 0
@@ -169,9 +169,9 @@ def test_what_is_sent_again_to_standard_input_is_used_once(here):
 
 
 @pytest.mark.parametrize("source", ["file", pytest.param("lines", marks=pytest.mark.long)])
-def test_a_block_that_comes_again_changes_nothing(here, source):
-    """More rows than one commit has; rows 80 to 139 come again after row 159, and are counted."""
-    alone = ("--set", "law.refit=false")  # a fit beside the run is taken in when it is done
+def test_a_repeated_block_of_rows_changes_nothing(here, source):
+    """Rows 80 to 139, more than one commit, are sent again after row 159, and are counted."""
+    alone = ("--set", "law.refit=false")  # a background fit is used when it is done
     whole = [row(k) for k in range(220)]
     again = [*whole[:160], *whole[80:140], *whole[160:]]
     found = {}
@@ -192,8 +192,8 @@ def test_a_block_that_comes_again_changes_nothing(here, source):
         assert np.array_equal(found["again"][variable], expected, equal_nan=True)
 
 
-def test_a_run_goes_on_with_a_stated_shift(here):
-    """A clock goes back by twenty minutes: rows are late, then corrected by what the user says."""
+def test_a_run_resumes_with_a_stated_clock_shift(here):
+    """A clock is set back by twenty minutes; rows are late until the user states the shift."""
     back = [{**row(k), "time": row(k - 20)["time"]} for k in range(20, 40)]
     Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(20)), *back[:10]))
     command = ("run", case('file = "rows.csv"'), "--realtime", "--speed", "inf")
@@ -213,7 +213,7 @@ def test_a_run_goes_on_with_a_stated_shift(here):
         call(*command, "--set", "intake.shift=20 K")
 
 
-def test_what_is_not_valid_is_counted_in_files_too(here):
+def test_invalid_values_are_also_counted_in_files(here):
     rows = [row(k) for k in range(12)]
     rows[4]["T_3"], rows[7]["left"] = 85.0, ""
     Path("rows.csv").write_text(HEADER + table(*rows))
@@ -230,7 +230,7 @@ def test_what_is_not_valid_is_counted_in_files_too(here):
     assert np.array_equal(runs.open("run0").dataset["alpha"], runs.open("run3").dataset["alpha"])
 
 
-def test_parquet_files_are_read_as_others(here):
+def test_parquet_files_are_read_like_csv_files(here):
     import pandas as pd
 
     rows = [row(k) for k in range(12)]
@@ -244,7 +244,7 @@ def test_parquet_files_are_read_as_others(here):
         assert found.attrs["origin"] == "2026-11-21 00:00:00"
 
 
-def test_it_begins_with_the_first_sample_that_has_what_is_needed(here):
+def test_a_run_begins_with_the_first_complete_sample(here):
     lines = [json.dumps({"time": "2026-11-20 23:00", "T_3": 20.0, "left": None, "T_6": None})]
     lines += [json.dumps(row(k)) for k in range(5)]
     code, _ = call(
@@ -282,7 +282,7 @@ def test_estimates_as_lines_of_json(here):
         ),
     ],
 )
-def test_a_speed_of_nothing_is_refused(here, arguments, told):
+def test_a_speed_of_zero_is_refused(here, arguments, told):
     Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(4))))
     with pytest.raises(lp.errors.ConfigurationError, match=told):
         call("run", case('file = "rows.csv"'), "--out", "run", *arguments)
@@ -305,7 +305,7 @@ def test_a_finished_file_is_replayed_at_its_pace():
     assert max(slept) <= 0.5
 
 
-def test_from_a_broker_and_back(here, server):
+def test_a_run_reads_from_and_publishes_to_a_broker(here, server):
     from paho.mqtt.client import Client
     from paho.mqtt.enums import CallbackAPIVersion
 
@@ -338,7 +338,7 @@ def test_from_a_broker_and_back(here, server):
     assert np.isfinite(found["innovation"].sel(sensor="T_6")[1:]).all()
 
 
-def test_a_source_of_ones_own(here):
+def test_a_custom_source_is_used(here):
     with LiveCase(
         cases.load(case()), Rows(row(k) for k in range(7)), path=here / "j.sqlite"
     ) as mine:
@@ -424,7 +424,7 @@ def test_a_signal_before_the_first_step_ends_the_run(here, monkeypatch, moment):
         ('file = "rows.csv"', "", ', missing = "guess"', "expected one of interpolate, hold, skip"),
     ],
 )
-def test_a_wiring_that_makes_no_sense_says_so(here, data, intake, habit, text):
+def test_invalid_combinations_of_sources_and_sinks_are_refused(here, data, intake, habit, text):
     Path("rows.csv").write_text(HEADER + table(row(0)))
     message = bad("run", case(data, intake, habit), "--realtime", "--out", "run")
     assert text in message
@@ -432,7 +432,7 @@ def test_a_wiring_that_makes_no_sense_says_so(here, data, intake, habit, text):
 
 
 @pytest.mark.parametrize("option", [("--listen", "9100"), ("--watch", "8050"), ("--estimates",)])
-def test_what_belongs_to_a_live_run(here, option):
+def test_options_of_live_runs_require_realtime(here, option):
     Path("rows.csv").write_text(HEADER + table(row(0)))
     assert "requires --realtime" in bad("run", case('file = "rows.csv"'), *option)
 
@@ -443,7 +443,7 @@ def test_a_password_comes_from_the_environment(here, monkeypatch):
     assert "the environment variable LIVEPDE_ROD is not set" in bad("run", text)
 
 
-def test_what_keeps_a_run_from_its_first_sample_is_told(here, caplog):
+def test_the_reason_for_a_missing_first_sample_is_reported(here, caplog):
     wrong = [{"when": k, "left": 20.0, "T_3": 20.0, "T_6": 20.0} for k in range(3)]
     loaded = cases.load(case())
     with (
