@@ -1,4 +1,4 @@
-"""Accepted stages are solved: the run with a constant mu against strict solves, in every unit."""
+"""Accepted stages are solved: a run with constant mu agrees with strict solves in every unit."""
 
 from dataclasses import replace
 from functools import cache

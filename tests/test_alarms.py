@@ -1,4 +1,4 @@
-"""Jumps from the case file to the report, what the data have told, and the benchmark of alarms."""
+"""Jumps from the case file to the report, identifiability, and the benchmark of alarms."""
 
 import json
 from functools import cache

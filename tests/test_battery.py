@@ -1,4 +1,4 @@
-"""The battery particle: against the sphere with a constant flux, balances, and twins."""
+"""The battery particle agrees with a sphere under constant flux, with balances and with twins."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""`python -m benchmarks auto`: promises of the law that tunes itself, on the smallest square."""
+"""`python -m benchmarks auto` checks the self-tuning law, here on the smallest square."""
 
 import numpy as np
 import pytest

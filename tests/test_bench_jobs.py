@@ -1,4 +1,4 @@
-"""Fits that a user would write find the truths of other codes: what livepde is timed against."""
+"""The reference fits that livepde is timed against find the truths of independent codes."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The suite that asv runs: it finds the numbers of `python -m benchmarks`, here at quick sizes."""
+"""The asv suite gives the numbers of `python -m benchmarks`, here at small sizes."""
 
 import importlib
 import json

@@ -1,4 +1,4 @@
-"""Large coupled stages by blocks: the same results as by one factor, in few iterations."""
+"""Solving large coupled stages by blocks gives the results of one factor in few iterations."""
 
 import tracemalloc
 

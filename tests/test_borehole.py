@@ -1,4 +1,4 @@
-"""The grouted borehole: against steady states, balances, the line source, and a twin."""
+"""The grouted borehole agrees with steady states, balances, the line source and a twin."""
 
 from pathlib import Path
 from typing import Any

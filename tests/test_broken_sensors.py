@@ -1,4 +1,4 @@
-"""Sensors that break, and processes that are disturbed: what was learned before stays."""
+"""Broken sensors and disturbed processes do not spoil what was estimated before."""
 
 from functools import cache
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A checkpoint continues the problem that it was saved by, and no other."""
+"""A checkpoint is only accepted by the problem that saved it."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The command line as users meet it: output, files, exit codes."""
+"""The command line: output, files and exit codes."""
 
 import errno
 import json

@@ -1,7 +1,7 @@
-"""Clocks that leap, go back, or show an hour twice: times are never changed, and each is reported.
+"""Clocks that jump, go back or repeat an hour: times are never changed, faults are reported.
 
-The right samples of each run follow from a definition: of the rows that come, those whose times are
-later than all used ones are used, each at the time that it states, and once.
+The correct samples follow from a definition: an arriving row is used once, at its stated time, if
+this time is later than the times of all used rows.
 """
 
 import math

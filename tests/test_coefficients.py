@@ -1,4 +1,4 @@
-"""Numbers computed from the unknowns, in which a form is linear: the numbers of the plain form."""
+"""Forms that are linear in coefficients computed from the unknowns equal their plain forms."""
 
 import pickle
 

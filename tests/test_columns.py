@@ -1,4 +1,4 @@
-"""One wrong column of the data, late, scaled, off, in another unit or exchanged, is named first."""
+"""A column that is late, scaled, shifted, exchanged or in another unit is named first."""
 
 import shutil
 from functools import cache

@@ -1,6 +1,6 @@
-"""A contact resistance between two layers, as a case has it: a thin layer of its own.
+"""A contact resistance between two layers, modelled in a case as a separate thin layer.
 
-The truth is a code of its own: finite volumes with a resistance between two cells, no layer.
+The data come from independent finite volumes with a resistance between two cells instead.
 """
 
 from pathlib import Path

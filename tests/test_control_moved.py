@@ -1,4 +1,4 @@
-"""Loops whose reduced model follows the estimate: unknown fields, models that are not linear."""
+"""Loops whose reduced model follows the estimate: unknown fields and nonlinear models."""
 
 from dataclasses import replace
 from importlib.util import find_spec

@@ -1,4 +1,4 @@
-"""The robust covariance: exact where nothing is wrong, and never wider than the prior."""
+"""The robust covariance is exact for a correct model, and never wider than the prior."""
 
 import numpy as np
 import pytest

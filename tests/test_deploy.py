@@ -1,4 +1,4 @@
-"""The examples of a service: what they call exists, and does what it should."""
+"""The deployment examples call existing commands, which work as expected."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The shipped checks pass on good objects and name what is wrong with bad ones."""
+"""The shipped checks pass for correct objects, and name the faults of incorrect ones."""
 
 from dataclasses import dataclass
 

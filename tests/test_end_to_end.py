@@ -1,4 +1,4 @@
-"""From a broker to a browser: real soil temperatures, replayed through all of it."""
+"""From a broker to a browser: measured soil temperatures pass through the whole program."""
 
 import json
 import queue

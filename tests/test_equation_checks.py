@@ -1,4 +1,4 @@
-"""Every ready-made equation and every kind of unknown passes the shipped checks: random draws."""
+"""Every ready-made equation and kind of unknown passes the shipped checks for random draws."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

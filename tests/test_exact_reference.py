@@ -1,6 +1,6 @@
 """The law beside the independent implementation of the paper's method: the study `exact`.
 
-A part of the settings, meshes and rules of the experiment, with the bounds of all of it.
+Runs a part of the settings, meshes and rules of the study, with the bounds of the full study.
 """
 
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Every example runs and finds what it says; every equation has its page."""
+"""Every example runs and finds its truth; every equation has a section in the docs."""
 
 import importlib
 import importlib.util

@@ -1,4 +1,4 @@
-"""A factor that is kept from step to step."""
+"""Reuse of a factorised matrix over several steps."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Numbers that no step can take: the step fails, the estimate of before stays, the next goes on."""
+"""If a step fails, the previous estimate is kept, and the next sample continues."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""A form that is not linear in a few numbers is fixed once for each value of them."""
+"""A form that is nonlinear in a few numbers is assembled once for each value of the numbers."""
 
 from typing import Any
 

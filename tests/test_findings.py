@@ -1,4 +1,4 @@
-"""Every finding that the program can issue appears in a run that deserves it, and in no sound one.
+"""Every finding appears in a run with its fault, and not in a correct run.
 
 The list of findings is read from the source: a new one without its two runs fails here.
 """

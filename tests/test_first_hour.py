@@ -1,4 +1,4 @@
-"""The walks of docs/first-hour.md: what the page shows is what runs, and it finds the truth.
+"""The examples of docs/first-hour.md run as shown, and find the truth.
 
 The page itself is run by tests/test_pages.py, word for word.
 """

@@ -1,4 +1,4 @@
-"""Heat-flux plates as sensors, an unknown heat capacity with them, and R and U of a wall."""
+"""Heat-flux plates as sensors, unknown heat capacities, and R and U values of a wall."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Files that grow while they are rotated, cut, copied, written again, or end in NUL bytes."""
+"""Followed files that are rotated, truncated, copied, rewritten, or end in NUL bytes."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""What sensors will show, without anything being learned; copies; a controller in the loop."""
+"""Forecasts of sensors leave the estimate unchanged; copies; a controller in the loop."""
 
 import copy
 

@@ -1,4 +1,4 @@
-"""A factor of the forward model that is kept while the parameter moves."""
+"""Reuse of a factor of the forward model while the parameter changes."""
 
 from dataclasses import replace
 

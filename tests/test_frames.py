@@ -1,6 +1,6 @@
-"""A body in other axes, from the other side, or at another time: verdict and intervals agree.
+"""Verdict and intervals do not depend on axes, direction or time origin of a body.
 
-Data are those of a line; a sheet has them, too, as its sides are closed.
+The data are from a line; a sheet with insulated sides has the same data.
 """
 
 from dataclasses import dataclass, replace

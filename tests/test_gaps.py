@@ -1,4 +1,4 @@
-"""Gaps and spikes of input and boundary channels: interpolated, refused, counted and told."""
+"""Gaps and spikes of input and boundary channels are interpolated or refused, and reported."""
 
 import math
 from contextlib import ExitStack

@@ -1,4 +1,4 @@
-"""The gate of the sensitivity law: on by default, harmless where nothing is wrong."""
+"""The gate of the sensitivity law is on by default, and harmless for correct runs."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""Groundwater and soil columns against formulas and published tests."""
+"""Groundwater and soil columns agree with formulas and published tests."""
 
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Guards: trouble without them, none with them, and nothing at all where all is well."""
+"""Guards prevent failures, and change nothing in runs that need no guard."""
 
 from itertools import pairwise
 from typing import Any

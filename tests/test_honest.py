@@ -1,4 +1,4 @@
-"""Honest twins: their truths against closed forms and against livepde refined, and their scores."""
+"""Honest twins agree with closed forms and refined runs of livepde; their scores are correct."""
 
 import numpy as np
 import pytest

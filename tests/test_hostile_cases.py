@@ -1,4 +1,4 @@
-"""Cases that ask for too much: one sentence, before anything is spent."""
+"""Excessive cases are refused with one sentence before they use time or memory."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""What a belief says to be pinned, flat, traded off, at a bound."""
+"""Which unknowns a belief reports as well determined, not identifiable, correlated or bounded."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,4 +1,4 @@
-"""The identifier: bad input, inputs that are held, checkpoints, and what a result holds."""
+"""The identifier: invalid input, held inputs, checkpoints and results."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Validation sensors count against a run; those that are ignored do not."""
+"""Validation sensors affect the verdict of a run; ignored sensors do not."""
 
 import pandas as pd
 import pytest

@@ -1,4 +1,4 @@
-"""GradientLaw(gain="auto"): the law tunes itself."""
+"""The self-tuning law, `GradientLaw(gain="auto")`."""
 
 from collections.abc import Callable
 from dataclasses import replace

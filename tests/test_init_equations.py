@@ -1,4 +1,4 @@
-"""`livepde init --equation X` for every equation: filled in, the case runs as written."""
+"""The case that `livepde init --equation X` writes runs for every equation once completed."""
 
 import json
 import math

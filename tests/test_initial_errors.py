@@ -1,4 +1,4 @@
-"""An initial state with errors of its own: random fields, and what the laws learn of them."""
+"""Errors of the initial state as random fields, and how the laws estimate them."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""A u0 that is made of readings is as uncertain as they are, also where their noise is found."""
+"""A u0 made from readings has their uncertainty, also if their noise is estimated."""
 
 from typing import Any
 

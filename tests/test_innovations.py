@@ -1,4 +1,4 @@
-"""The factor on deviations: one for white innovations, by theory for those that are not."""
+"""The factor on standard deviations is 1 for white innovations, else the theoretical value."""
 
 import numpy as np
 import pytest

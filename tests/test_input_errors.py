@@ -1,4 +1,4 @@
-"""The mistakes that a newcomer makes most: one sentence each, and nothing is written."""
+"""Common mistakes of new users give one sentence each, and no files are written."""
 
 import re
 import sys

@@ -1,4 +1,4 @@
-"""Noise of input channels, and of readings that an initial state is made of, in the intervals."""
+"""Intervals include the noise of inputs and of readings that define the initial state."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The benchmark that counts how often the truth lies in the interval."""
+"""The benchmark of interval coverage."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Intervals of unknowns: quantiles that go through a transform and stay within bounds."""
+"""Intervals of unknowns are transformed quantiles within the bounds."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,4 +1,4 @@
-"""The iterated start: exact for linear problems, and what it mends for others."""
+"""The iterated start is exact for linear problems, and improves nonlinear ones."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The JSON schema of case files: it accepts what the program accepts, and says what keys mean."""
+"""The JSON schema accepts the case files that the program accepts, and documents their keys."""
 
 import json
 import tomllib

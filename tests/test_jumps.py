@@ -1,4 +1,4 @@
-"""Sudden changes are flagged soon, hardly ever without cause, and learned without a restart."""
+"""Sudden changes are detected early with few false alarms, and estimated without a restart."""
 
 from dataclasses import replace
 from itertools import islice

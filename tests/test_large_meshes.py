@@ -1,4 +1,4 @@
-"""Forms on large meshes, piece by piece and element by element: the numbers of small ones."""
+"""Forms assembled by pieces or by elements on large meshes equal forms assembled at once."""
 
 import factories
 import numpy as np

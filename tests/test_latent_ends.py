@@ -1,4 +1,4 @@
-"""Latent values stay within a stated number of prior deviations; the filter stays linear."""
+"""Latent values stay within a number of prior standard deviations; the filter stays linear."""
 
 from pathlib import Path
 from typing import Any

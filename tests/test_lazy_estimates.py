@@ -1,4 +1,4 @@
-"""Estimates that are read later, and results that keep numbers instead of objects."""
+"""Estimates that are computed when read, and results that store numbers instead of objects."""
 
 import copy
 import math

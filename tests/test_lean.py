@@ -1,4 +1,4 @@
-"""The lean reference and the filters as arrays, against our law and against naive loops."""
+"""The lean reference and array filters agree with the law of livepde and with naive loops."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""`Result.log_evidence`: the same readings count whatever the gate refuses."""
+"""`Result.log_evidence` counts a refused reading as one at the limit of the gate."""
 
 import math
 

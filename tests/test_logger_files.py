@@ -1,4 +1,4 @@
-"""Tables as loggers write them: hours that clocks show twice, titles and units around a header."""
+"""Tables written by loggers: repeated hours, titles and units around a header."""
 
 import json
 import math

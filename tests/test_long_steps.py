@@ -1,4 +1,4 @@
-"""Pauses of more substeps than a step may have, long steps, and samples that are taken again."""
+"""Pauses longer than the allowed substeps, long steps, and samples that are processed again."""
 
 import threading
 from dataclasses import replace

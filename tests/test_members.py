@@ -1,4 +1,4 @@
-"""Stages and states of several members: the numbers of one after the other."""
+"""Stages and states of several members equal those of single members."""
 
 from dataclasses import replace
 from typing import Any

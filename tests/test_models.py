@@ -1,4 +1,4 @@
-"""Ready-made equations against formulas: heat, columns, waves, populations."""
+"""Ready-made equations agree with formulas: heat, columns, waves, populations."""
 
 import numpy as np
 import pytest

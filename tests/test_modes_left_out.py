@@ -1,4 +1,4 @@
-"""How much of the interval of a field is that of modes that the law leaves out."""
+"""Contribution of omitted modes to the interval of a field."""
 
 import numpy as np
 import pytest

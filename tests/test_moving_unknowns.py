@@ -1,4 +1,4 @@
-"""Moving and transformed unknowns: the Kalman filter, refits, checkpoints, the theory."""
+"""Time-varying and transformed unknowns: Kalman filter, refits, checkpoints and theory."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Names that would stand for two things in a run's dataset are refused before the run."""
+"""Names that would be ambiguous in the dataset of a run are refused before the run."""
 
 from pathlib import Path
 from typing import Any

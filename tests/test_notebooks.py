@@ -1,4 +1,4 @@
-"""Notebooks run from their folder, and agree with the tool that the field uses."""
+"""Notebooks run from their folder, and agree with the established tool of the field."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A real OPC UA server: changes come as rows, also after it was away."""
+"""Changes on a real OPC UA server arrive as rows, also after the server was unavailable."""
 
 import asyncio
 import logging

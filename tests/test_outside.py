@@ -1,4 +1,4 @@
-"""The study of what laws find outside the observed part: its data fit its sensors, all laws run."""
+"""The study outside the observed part: data match the sensors, and all laws run."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What a release is made of: one version everywhere, the changelog, how to cite, completion."""
+"""Contents of a release: version, changelog, citation and shell completion."""
 
 import datetime as dt
 import re

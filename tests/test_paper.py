@@ -1,4 +1,4 @@
-"""The paper: its settings, and the table of what is where."""
+"""Settings of the paper, and the table that locates its equations in the code."""
 
 import importlib
 import re

@@ -1,4 +1,4 @@
-"""A field outside of the part that is observed: found as far as the dynamics carry, else honest."""
+"""An unobserved part of a field is estimated if the dynamics allow, else its interval is wide."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -1,4 +1,4 @@
-"""Pauses of a logger, clocks that leap and units of time that change: named, and outlived."""
+"""Logger pauses, jumping clocks and changing time units are reported, and do not end a run."""
 
 from functools import cache
 from pathlib import Path

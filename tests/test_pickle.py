@@ -1,4 +1,4 @@
-"""Estimates and results are pickled with their values, models with what they were made of."""
+"""Estimates and results are pickled with their values, models with their arguments."""
 
 import copy
 import pickle

@@ -1,4 +1,4 @@
-"""Advice on one more sensor: what it promises is what the sensor does."""
+"""The predicted benefit of an additional sensor is correct."""
 
 from pathlib import Path
 from typing import Any

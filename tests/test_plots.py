@@ -1,4 +1,4 @@
-"""Figures: what is drawn, and what is said where nothing can be."""
+"""Contents of figures, and messages if nothing can be drawn."""
 
 import subprocess
 import sys

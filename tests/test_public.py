@@ -1,4 +1,4 @@
-"""The public face: what is exported, what is imported, what is drawn."""
+"""The public interface: exports, imports and representations."""
 
 import ast
 import importlib

@@ -1,4 +1,4 @@
-"""G_alpha: what it minimises, how alpha is chosen, and what the gradient law does with it."""
+"""G_alpha: its objective, the choice of alpha, and its use in the gradient law."""
 
 import json
 

@@ -1,6 +1,6 @@
 """The reference implementation: its elements, equations and solver, and the numbers it gives.
 
-livepde itself is not used here: what is tested is what livepde is compared with.
+These tests do not use livepde itself, which is compared with this reference elsewhere.
 """
 
 import ast

@@ -1,4 +1,4 @@
-"""The refit: the best fit of stored samples, against SciPy on a forward model of its own."""
+"""The refit agrees with a SciPy fit of the stored samples on an independent forward model."""
 
 import copy
 import math

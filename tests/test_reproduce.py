@@ -1,4 +1,4 @@
-"""The published and stated experiments show the numbers they must."""
+"""The reproduced experiments give the published and stated numbers."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""What a run says against its own estimates."""
+"""Warnings of a run about its own estimates."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The sensitivity law: against closed forms, through refits, bounds, drift and modes."""
+"""The sensitivity law agrees with closed forms, with refits, bounds, drift and modes."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What may be wrong with a sensor that is set aside, and the variants that test it."""
+"""Possible causes of a rejected sensor, and the variants that test them."""
 
 import shutil
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What step, mesh and input lines have shifted an estimate by: predicted against actual shifts."""
+"""Predicted shifts of estimates by step, mesh and input lines agree with actual shifts."""
 
 from functools import cache
 from typing import Any

@@ -1,4 +1,4 @@
-"""A shard: the numbers of separate identifiers, from a stream with an offset."""
+"""A shard gives the numbers of separate identifiers from a stream with offsets."""
 
 import os
 import runpy

@@ -1,4 +1,4 @@
-"""Where estimates and logs go, what happens when they cannot, and what reaches standard error."""
+"""Destinations of estimates and logs, failures of sinks, and output on standard error."""
 
 import io
 import json

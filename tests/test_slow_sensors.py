@@ -1,4 +1,4 @@
-"""Sensors that respond slowly: against finite differences and closed forms of our own."""
+"""Slow sensors agree with independent finite differences and closed forms."""
 
 import math
 from copy import deepcopy

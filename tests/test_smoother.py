@@ -1,4 +1,4 @@
-"""The smoother against dense least squares over all times, and what it leaves as it was."""
+"""The smoother agrees with dense least squares over all times, and has no side effects."""
 
 from itertools import pairwise
 from pathlib import Path

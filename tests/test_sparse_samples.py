@@ -1,4 +1,4 @@
-"""Unknowns that move between sparse samples, against the exact filter and smoother."""
+"""Time-varying unknowns between sparse samples agree with the exact filter and smoother."""
 
 from typing import Any
 

@@ -1,7 +1,7 @@
-"""Substeps are divided where the error of the time step is large against the noise.
+"""Substeps are divided if the error of the time step is large relative to the noise.
 
-Truths come from `benchmarks.first_hour.moved`, cells that move with the water: it shares neither
-scheme nor mesh with the package.
+The data come from `benchmarks.first_hour.moved`, with cells that move with the water; it shares
+neither scheme nor mesh with the package.
 """
 
 from functools import cache

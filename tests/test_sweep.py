@@ -1,4 +1,4 @@
-"""Passes over stored samples by products with small matrices: those of the stages one by one."""
+"""Passes over stored samples by small matrix products equal passes by single stages."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Identifiers in threads of their own: the numbers are those of one after the other, to the bit.
+"""Identifiers in separate threads give the bits of identifiers that run one after another.
 
 Threads take turns as often as the interpreter lets them, and each sleeps now and then where the
 package calls a function or one of its own returns: so it is between any two of them that another

@@ -1,4 +1,4 @@
-"""Twin experiments: truth apart from the estimator, noise as stated, errors against the truth."""
+"""Twin experiments: truth separate from the estimator, stated noise, errors against the truth."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""An unknown number anywhere in the process or in a sensor is found, with an honest deviation."""
+"""A number anywhere in process or sensor can be estimated, with a realistic uncertainty."""
 
 from itertools import pairwise
 from typing import Any

@@ -1,4 +1,4 @@
-"""Unknowns that are positive, bounded, named, moving, nonlinear, or make the initial state."""
+"""Unknowns that are positive, bounded, named, time-varying, nonlinear or initial values."""
 
 import itertools
 from typing import Any

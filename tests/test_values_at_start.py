@@ -1,4 +1,4 @@
-"""Values of inputs at the initial time where no sample gives them: what u0 states, and what not."""
+"""Input values at the initial time without a sample, which u0 may or may not provide."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""A law without a covariance, and one reading of 9999."""
+"""A single reading of 9999 in a law without a covariance."""
 
 import math
 from pathlib import Path

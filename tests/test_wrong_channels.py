@@ -1,4 +1,4 @@
-"""`python -m benchmarks first-hour --wrong`: tables with one wrong channel, and what names it."""
+"""`python -m benchmarks first-hour --wrong`: each table with a wrong channel has it named."""
 
 import tomllib
 
