@@ -62,7 +62,7 @@ def alone(out: str, *options: str) -> pd.Series:
 
 
 @pytest.mark.long
-def test_each_row_is_a_run_of_its_own(here):
+def test_each_row_is_a_separate_run(here):
     code, output = call("fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods")
     assert code == 1  # two of them cannot run
     assert "wrong:" in output
@@ -85,8 +85,8 @@ def test_each_row_is_a_run_of_its_own(here):
 
 
 @pytest.mark.long
-def test_steps_that_failed_are_told(here):
-    """Also of members that are stepped together: nothing else would show it."""
+def test_failed_steps_are_reported(here):
+    """Failed steps are also reported for members that step together."""
     table = pd.read_csv("rod/rod.csv")
     table.loc[20:, "T_left"] = 1e300
     table.to_csv("rod/hot.csv", index=False)
@@ -101,7 +101,7 @@ def test_steps_that_failed_are_told(here):
     assert not any("plain: " in note and "steps failed" in note for note in notes)
 
 
-def test_goes_on_with_what_is_there(here):
+def test_a_fleet_resumes_from_existing_runs(here):
     Path("rods.csv").write_text("name,data\nplain,\n")
     arguments = ["fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods", "--json"]
     _, first = call(*arguments)
@@ -116,7 +116,7 @@ def test_goes_on_with_what_is_there(here):
 
 @pytest.mark.process
 @pytest.mark.usefixtures("processes")
-def test_in_several_processes(here):
+def test_a_fleet_in_several_processes_gives_equal_runs(here):
     call("fleet", "rod/case.toml", "--members", "rods.csv", "--out", "one")
     call("fleet", "rod/case.toml", "--members", "rods.csv", "--out", "two", "--jobs", "2")
     one, two = (pd.read_csv(f"{folder}/fleet.csv") for folder in ("one", "two"))
@@ -136,14 +136,14 @@ def test_in_several_processes(here):
         ("", "Cannot read the members"),
     ],
 )
-def test_bad_tables(here, table, match):
+def test_invalid_member_tables_are_refused(here, table, match):
     Path("rods.csv").write_text(table)
     with pytest.raises(DataError, match=match):
         call("fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods")
     assert not Path("rods").exists()
 
 
-def test_bad_options(here):
+def test_invalid_options_are_refused(here):
     arguments = ["fleet", "rod/case.toml", "--members", "rods.csv"]
     with pytest.raises(ConfigurationError, match="--resume requires --out"):
         call(*arguments, "--resume")
@@ -151,7 +151,7 @@ def test_bad_options(here):
         call(*arguments, "--jobs", "0")
 
 
-def test_an_interruption_ends_all(here, monkeypatch):
+def test_an_interruption_ends_all_members(here, monkeypatch):
     """Members after the interrupted one do not begin."""
     begun = []
 
@@ -243,7 +243,7 @@ def _attrs(data: xr.Dataset) -> dict:
 
 
 @pytest.mark.long
-def test_members_that_are_alike_step_together(alike):
+def test_similar_members_step_together(alike):
     """The results of each member equal those of a separate run."""
     code, output = call(*FIRST, "rods", "--json")
     assert code == 1  # too few samples for the expectations of the case
@@ -295,7 +295,7 @@ def longer(alike):
 @pytest.mark.process
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="workers are found in /proc")
 @pytest.mark.usefixtures("longer")
-def test_a_killed_worker_is_replaced_and_told():
+def test_a_killed_worker_is_replaced_and_reported():
     """All members finish with the numbers of undisturbed runs."""
     pytest.importorskip("joblib", reason="'fleet' is not installed")
     with threadpool_limits(1):  # as in the program, because last digits depend on BLAS threads
@@ -318,7 +318,7 @@ def test_a_killed_worker_is_replaced_and_told():
 
 @pytest.mark.process
 @pytest.mark.usefixtures("processes")
-def test_workers_that_die_again_and_again_end_the_command(here, monkeypatch):
+def test_workers_that_crash_repeatedly_end_the_command(here, monkeypatch):
     """It reports each member and a summary, and no run appears to continue."""
     Path("rods.csv").write_text("name,data\nplain,\nwarm,rod/warm.csv\n")
     call("fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods")
@@ -344,7 +344,7 @@ def test_workers_that_die_again_and_again_end_the_command(here, monkeypatch):
     assert runs.open(Path("rods/plain")).status == "finished"
 
 
-def test_the_summary_is_written_also_if_the_command_fails(here, monkeypatch):
+def test_the_summary_is_also_written_if_the_command_fails(here, monkeypatch):
     Path("rods.csv").write_text("name,data\nplain,\nwarm,rod/warm.csv\n")
 
     def defect(self, member, prepared):
@@ -421,7 +421,7 @@ def test_a_worker_of_another_engine_is_killed(backend):
 
 
 @pytest.mark.long
-def test_what_it_leaves_serves_other_commands(alike):
+def test_other_commands_accept_the_runs_of_a_fleet(alike):
     call(*FIRST, "rods")
     call("report", "rods/b")
     call("export", "rods/b", "b.csv", "b.html")
@@ -440,7 +440,7 @@ def test_what_it_leaves_serves_other_commands(alike):
     ("waiting", "how"),
     [(250, "3 separately: resumed runs (3)."), (10**9, "3 were stepped together.")],
 )
-def test_goes_on_after_a_kill(alike, monkeypatch, waiting, how):
+def test_a_killed_fleet_resumes(alike, monkeypatch, waiting, how):
     """Members with results resume separately, members without begin together."""
     call(*FIRST, "rods")
     monkeypatch.setattr(member_blocks, "WAITING", waiting)
@@ -495,7 +495,7 @@ def test_a_signal_ends_all_members_where_they_are(alike, monkeypatch):
     assert (len(table), table["samples"].unique().tolist()) == (6, [39])
 
 
-def test_what_is_another_run_is_refused_alone(alike):
+def test_a_member_with_a_different_run_is_refused_alone(alike):
     """The other members continue."""
     call(*FIRST, "rods")
     for name in "abc":
@@ -508,7 +508,7 @@ def test_what_is_another_run_is_refused_alone(alike):
     assert pd.read_csv("rods/fleet.csv")["status"].tolist() == ["finished", "failed", "finished"]
 
 
-def test_what_is_finished_is_not_run_again(alike, monkeypatch):
+def test_finished_members_are_not_run_again(alike, monkeypatch):
     call(*FIRST, "rods")
     table = pd.read_csv("rods/fleet.csv")
     monkeypatch.setattr(cases.Prepared, "identifier", None)  # no identifier is created
@@ -519,7 +519,7 @@ def test_what_is_finished_is_not_run_again(alike, monkeypatch):
 
 
 @pytest.mark.parametrize(("key", "value"), [("late", "20 s"), ("noise_column", "T_right")])
-def test_members_whose_tables_have_other_channels_step_apart(here, key, value):
+def test_members_with_different_channels_step_separately(here, key, value):
     """Their columns were once read in the order of the first member."""
     case, names = Path("rod/case.toml"), ("T_10", "T_30")
     settings = [{f"channels.{name}.{key}": value} for name in names]
@@ -531,7 +531,7 @@ def test_members_whose_tables_have_other_channels_step_apart(here, key, value):
 
 
 @pytest.mark.long
-def test_says_why_members_are_run_separately(alike):
+def test_the_reason_for_separate_members_is_reported(alike):
     Path("rods.csv").write_text(
         "name,data,initial,law.noise,law.refit\n"
         "a,,,,\nb,rod/other.csv,,,\nshort,rod/warm.csv,,,\nnoisy,,,0.2 K,\n"
@@ -552,7 +552,7 @@ def test_says_why_members_are_run_separately(alike):
 
 
 @pytest.mark.long
-def test_a_step_that_fails_is_told_of_that_member_alone(alike):
+def test_a_failed_step_is_reported_for_its_member_only(alike):
     """An event in its journal, a status in its dataset."""
     rows = Path("rod/other.csv").read_text().splitlines()
     time, _, *others = rows[12].split(",")
@@ -570,7 +570,7 @@ def test_a_step_that_fails_is_told_of_that_member_alone(alike):
 
 
 @pytest.mark.long
-def test_a_pause_of_decades_ends_none(alike):
+def test_a_pause_of_decades_ends_no_member(alike):
     """The pause exceeds the number of substeps; fleets and single runs finish equally."""
     for name in ("rod", "other", "third"):
         path = Path(f"rod/{name}.csv")

@@ -32,15 +32,15 @@ def closed():
 
 
 class AtOnce(Rows):
-    """Brings many rows in one poll, as a file does: they wait in the queue of the run."""
+    """Source of many rows in one poll, as a file, so that rows wait in the queue of the run."""
 
     def poll(self, wait):
         return [row for _ in range(100) for row in super(AtOnce, self).poll(wait)]
 
 
 def run_of(folder, given, policy=None, source=Rows) -> Live:
-    """Return a run of rows."""
-    run = live(folder, source(given), verdict=False)  # of rows that are no rod's
+    """Run the given rows, and return the run."""
+    run = live(folder, source(given), verdict=False)  # the rows are not those of a rod
     run.feed.intake.policy = policy or Policy(leap=30 * DAY)
     return run
 
@@ -77,7 +77,7 @@ def numbers(run: Live) -> list[np.ndarray]:
 
 
 def same_run(run: Live, given, folder) -> None:
-    """Assert that a run is that of some rows alone, to the bit."""
+    """Assert that a run equals the run of the given rows alone, to the bit."""
     folder.mkdir()
     alone = run_of(folder, given)
     alone.run()
@@ -86,13 +86,13 @@ def same_run(run: Live, given, folder) -> None:
     assert run.identifier.dump() == alone.identifier.dump()
 
 
-# --- rows that come again ------------------------------------------------------------------------
+# --- repeated rows -------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("source", [Rows, AtOnce])
-def test_a_block_that_comes_again_is_used_once(tmp_path, source):
-    """Whether it is in the journal already, or waits in the queue of the run."""
+def test_a_repeated_block_is_used_once(tmp_path, source):
+    """The block may be in the journal already, or wait in the queue of the run."""
     given = right(200)
     run = run_of(tmp_path, [*given[:100], *given[60:100], *given[100:]], source=source)
     run.run()
@@ -103,8 +103,8 @@ def test_a_block_that_comes_again_is_used_once(tmp_path, source):
 
 
 @pytest.mark.slow
-def test_a_block_that_comes_again_with_new_rows(tmp_path):
-    """New rows at its end are used; one amid it, of a time that is over, is late."""
+def test_a_repeated_block_with_new_rows(tmp_path):
+    """New rows at its end are used; a new row within it is late."""
     given = right(120)
     lost = {**given[70], "t": given[70]["t"] + 0.05}
     block = [*given[60:71], lost, *given[71:110]]
@@ -127,7 +127,7 @@ def test_other_values_for_a_known_time_are_a_conflict_and_the_first_stay(tmp_pat
 
 @pytest.mark.slow
 def test_a_block_comes_twice_after_a_resume(tmp_path):
-    """What was accepted before the run ended is known after it."""
+    """Rows accepted before the run ended are recognised after the resume."""
     given = right(120)
     first = run_of(tmp_path, given[:80])
     first.run()
@@ -140,8 +140,8 @@ def test_a_block_comes_twice_after_a_resume(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_the_journal_has_is_no_longer_remembered(tmp_path, monkeypatch):
-    """The memory of the intake is bounded, and old rows are found in the journal."""
+def test_rows_in_the_journal_are_not_kept_in_memory(tmp_path, monkeypatch):
+    """The memory of the intake is bounded; older rows are looked up in the journal."""
     monkeypatch.setattr("livepde.streams.intake.REMEMBERED", 10)
     given = right(150)
     run = run_of(tmp_path, [*given[:100], *given[:100], *given[100:]])
@@ -150,8 +150,8 @@ def test_what_the_journal_has_is_no_longer_remembered(tmp_path, monkeypatch):
     assert run.journal.counts == {("repeated", ""): 100}
 
 
-def test_a_spike_that_was_bridged_comes_again():
-    """The sample has another value than its row then; the row is known by the others."""
+def test_a_repeated_row_with_a_bridged_spike_is_recognised():
+    """The sample then differs from its row, which is recognised by its other values."""
     policy = Policy(wait=2.5, channels={"left": Habit(interpolated=True, screened=True)})
     intake = Intake(COLUMNS, Clock("t"), policy, last=-1.0)
     given = [{"t": float(k), "a": 0.1 * k, "b": 0.0, "left": math.sin(0.1 * k)} for k in range(40)]
@@ -163,7 +163,7 @@ def test_a_spike_that_was_bridged_comes_again():
 
 
 def test_another_value_of_a_bridged_channel_is_a_conflict():
-    """What came is remembered as it came, also of channels whose gaps and spikes are bridged."""
+    """Rows are remembered as received, also for channels with bridged gaps and spikes."""
     habit = Habit(interpolated=True, screened=True)
     intake = Intake(COLUMNS, Clock("t"), Policy(channels={"left": habit}), last=-1.0)
     row = {"a": 0.1, "b": 0.0, "left": 1.0}
@@ -188,7 +188,7 @@ def test_a_clock_that_was_set_back_makes_rows_late_until_they_are_new(tmp_path, 
     counts = run.journal.counts
     assert counts["clock", ""] == 1
     assert sum(number for (_, name), number in counts.items() if name == "a") == late
-    # False while rows are late, with the reason and the remedy; true when they are new again.
+    # Health is false while rows are late, with reason and remedy, and true when rows are new again.
     assert run.health["ok"] == (by < 1000.0)
     assert by < 1000.0 or "intake.shift" in run.health["why"]
     assert told(run).count("unwell") == 1
@@ -197,7 +197,7 @@ def test_a_clock_that_was_set_back_makes_rows_late_until_they_are_new(tmp_path, 
 
 @pytest.mark.slow
 def test_a_clock_that_goes_back_again_and_again(tmp_path):
-    """By 3.5 steps every 30 rows."""
+    """The clock goes back by 3.5 steps every 30 rows."""
     given = [{**row, "t": row["t"] - 0.35 * (k // 30)} for k, row in enumerate(right(300))]
     run = run_of(tmp_path, given, source=AtOnce)
     run.run()
@@ -213,7 +213,7 @@ def test_a_clock_that_goes_back_again_and_again(tmp_path):
 
 @pytest.mark.slow
 def test_a_clock_that_is_wrong_for_some_rows_again_and_again(tmp_path):
-    """Later intervals are right; health is false until it is steady for a while."""
+    """Later intervals are correct; health is false until the clock is steady for a while."""
     given = [
         {**row, "t": row["t"] - 0.35 * (k % 30 < 3 and 30 <= k < 160)}
         for k, row in enumerate(right(250))
@@ -255,7 +255,7 @@ def test_a_shift_of_dates_moves_start_and_t0():
 
 @pytest.mark.slow
 def test_one_channel_whose_clock_went_back_is_named(tmp_path):
-    """Rows of one channel each, of two loggers."""
+    """Two loggers send rows with one channel each."""
     given = [
         {"t": row["t"] - (5.0 if name == "b" and k >= 40 else 0.0), name: row[name]}
         for k, row in enumerate(right(60))
@@ -270,7 +270,7 @@ def test_one_channel_whose_clock_went_back_is_named(tmp_path):
 
 @pytest.mark.slow
 def test_the_backlog_of_a_logger_is_late(tmp_path):
-    """Rows of a time in which none has been taken, between rows of now."""
+    """Current rows are mixed with rows from a time without samples."""
     given = right(200)
     live_rows, backlog = given[29:], given[20:29]
     mixed = [row for pair in zip(live_rows[:9], backlog, strict=True) for row in pair]
@@ -283,7 +283,7 @@ def test_the_backlog_of_a_logger_is_late(tmp_path):
 
 @pytest.mark.slow
 def test_a_clock_that_went_back_survives_restarts(tmp_path):
-    """A file that grows: what is used does not depend on where the run ended."""
+    """With a growing file, the used rows do not depend on where the run ended."""
     path = tmp_path / "data.csv"
     given = right(200)
     given[100:] = moved(given[100:], -5.0)
@@ -312,7 +312,7 @@ def test_a_clock_that_went_back_survives_restarts(tmp_path):
     [(0, 1, 60.0), (0, 1, 1e9), (3, 8, 1e9), (30, 2, 3600.0), (30, 8, 29 * DAY)],
 )
 def test_rows_far_ahead_cost_nothing(tmp_path, at, wrong, ahead):
-    """Also the first row, and as many as eight: as if they had never come, to the bit."""
+    """Up to eight such rows, also the first row, change no bit of the results."""
     given = right(60)
     mixed = [*given[:at], *moved(given[at : at + wrong], ahead), *given[at:]]
     run = run_of(tmp_path, mixed)
@@ -324,7 +324,7 @@ def test_rows_far_ahead_cost_nothing(tmp_path, at, wrong, ahead):
 
 @pytest.mark.slow
 def test_one_reading_of_one_channel_far_ahead(tmp_path):
-    """One channel a row: the others lose nothing."""
+    """With one channel per row, other channels lose nothing."""
     given = [
         {"t": row["t"] + 0.001 * n, name: row[name]}
         for k, row in enumerate(right(60))
@@ -342,7 +342,7 @@ def test_one_reading_of_one_channel_far_ahead(tmp_path):
 @pytest.mark.parametrize("pause", [2.0, 5000.0])
 @pytest.mark.parametrize("rest", [1, 2, 40])
 def test_a_pause_loses_nothing(tmp_path, pause, rest):
-    """Rows after it wait for a while, and are used when they agree or the source ends."""
+    """Rows after a pause wait for a while, and are used when they agree or the source ends."""
     given = [*right(40), *moved(right(40 + rest, 40), pause)]
     run = run_of(tmp_path, given)
     run.run()
@@ -351,8 +351,8 @@ def test_a_pause_loses_nothing(tmp_path, pause, rest):
     assert run.journal.counts == ({("leap", ""): 1} if lost else {})
 
 
-def test_a_pause_that_has_passed_is_no_leap():
-    """A row may be ahead by the time that passed on this machine since the row before it."""
+def test_a_pause_that_has_passed_is_not_a_jump():
+    """A row may be ahead by the time that passed on this machine since the previous row."""
     intake = Intake(COLUMNS, Clock("t"), last=-1.0)
     row = {"a": 0.0, "b": 0.0, "left": 0.0}
     for k in range(20):
@@ -366,7 +366,7 @@ def test_a_pause_that_has_passed_is_no_leap():
 
 
 def test_a_row_after_a_pause_confirms_those_that_wait():
-    """The pause has passed on this machine for it, and not for the first rows after it."""
+    """The pause has passed on this machine for this row, but not for the rows before."""
     intake = Intake(COLUMNS, Clock("t"), last=-1.0)
     row = {"a": 0.0, "b": 0.0, "left": 0.0}
     for k in range(20):
@@ -379,7 +379,7 @@ def test_a_row_after_a_pause_confirms_those_that_wait():
 
 @pytest.mark.slow
 def test_a_clock_that_was_ahead_for_long_comes_back(tmp_path):
-    """Nobody can know which time is right: rows are late until they are new."""
+    """The correct time is unknown, so rows are late until they are new."""
     given = right(160)
     wrong = [*given[:20], *moved(given[20:50], 4.0), *given[50:]]
     run = run_of(tmp_path, wrong)
@@ -389,12 +389,12 @@ def test_a_clock_that_was_ahead_for_long_comes_back(tmp_path):
     assert run.health["ok"]
 
 
-# --- hours that are shown twice ------------------------------------------------------------------
+# --- repeated hours ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("again", [(), range(100, 110), range(70, 120), range(130, 200)])
 def test_the_hour_that_clocks_show_twice(again):
-    """Local times without a zone of their own, in the zone of the case; also with rows again."""
+    """Local times without a zone use the zone of the case; also with repeated rows."""
     texts = local(1, 240)
     assert len(set(texts)) == 180
     given = [{**row, "t": text} for text, row in zip(texts, rows(240), strict=True)]
@@ -411,7 +411,7 @@ def test_the_hour_that_clocks_show_twice(again):
 
 
 def test_a_reading_that_is_the_same_an_hour_later_is_no_repeated_row(tmp_path):
-    """A table of one reading an hour was refused: the second 02:00 had the value of the first."""
+    """An hourly table was once refused because both rows at 02:00 had equal values."""
     hours = ["00:00", "01:00", "02:00", "02:00", "03:00", "04:00"]
     rows = "".join(f"2024-10-27 {hour},7.53\n" for hour in hours)
     (tmp_path / "t.csv").write_text(f"t,a\n{rows}")
@@ -420,8 +420,8 @@ def test_a_reading_that_is_the_same_an_hour_later_is_no_repeated_row(tmp_path):
     assert np.diff(found.t).tolist() == [3600.0] * 5
 
 
-def test_a_burst_of_rows_a_minute_is_no_leap():
-    """Twenty channels a moment apart: the pace is that of each channel, not of the rows."""
+def test_a_burst_of_rows_each_minute_is_not_a_jump():
+    """Twenty channels arrive shortly after each other; the pace is per channel, not per row."""
     from livepde.streams.table import Column
 
     names = [f"T_{k}" for k in range(20)]

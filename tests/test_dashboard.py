@@ -113,7 +113,7 @@ def test_a_run_of_one_sample_and_one_without_covariance():
 
 
 @pytest.mark.slow
-def test_looking_back_shows_the_fields_of_then():
+def test_an_earlier_sample_shows_its_fields():
     data = dataset(count=9)
 
     def profile(at):
@@ -143,7 +143,7 @@ def test_unknowns_are_drawn_with_their_intervals():
 
 
 @pytest.mark.slow
-def test_dates_where_the_run_has_an_origin():
+def test_runs_with_an_origin_show_dates():
     data = dataset()
     assert canvas.when_axis(data).text(0.6) == "0.6 s"
     data.attrs["origin"] = "2025-04-01 00:00:00"
@@ -181,7 +181,7 @@ def test_names_from_files_are_text_in_figures():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["triangle", "quad"])
-def test_a_map_is_exact_for_what_is_linear(kind):
+def test_a_map_is_exact_for_linear_fields(kind):
     data = dataset(kind, count=1)
     found = field_views.plane_map(data)
     values = found.of(2.0 * data["x"].values - 3.0 * data["y"].values)
@@ -237,7 +237,7 @@ def test_cuts_of_a_cube_are_whole_and_exact(kind, share):
 # --- view ----------------------------------------------------------------------------------------
 
 
-def test_what_is_kept_is_spread_evenly():
+def test_thinned_samples_are_evenly_spread():
     spread = Spread(50)
     for number in range(1, 100_001):
         spread.add(number, -number)
@@ -332,7 +332,7 @@ def test_a_finished_run_without_a_journal(tmp_path):
     assert "No problems detected" not in str(cards.verdict(alone))
 
 
-def test_a_damaged_run_is_a_sentence(tmp_path, monkeypatch):
+def test_a_damaged_run_is_reported_in_one_sentence(tmp_path, monkeypatch):
     monkeypatch.setattr(views, "OFTEN", 0.0)
     with begun(tmp_path, identifier()):
         pass
@@ -347,7 +347,7 @@ def test_a_damaged_run_is_a_sentence(tmp_path, monkeypatch):
 # --- serving -------------------------------------------------------------------------------------
 
 
-def test_watch_needs_a_run(tmp_path):
+def test_watch_requires_a_run(tmp_path):
     result = CliRunner().invoke(cli.app, ["watch", str(tmp_path / "none")])
     assert isinstance(result.exception, lp.errors.RunError)
     assert "contains no run" in str(result.exception)
@@ -548,7 +548,7 @@ def test_a_solid_is_drawn_and_a_token_is_asked_for(tmp_path):
 
 
 @pytest.mark.slow
-def test_every_visitor_has_a_page_that_needs_nothing_from_elsewhere(tmp_path):
+def test_the_page_loads_nothing_from_other_servers(tmp_path):
     """Checks addresses in the page's text, in addition to its requests."""
     begun(tmp_path, identifier()).close()
     with served(tmp_path) as url, urllib.request.urlopen(url, timeout=PATIENCE) as answer:
@@ -606,7 +606,7 @@ def test_each_run_has_its_page_behind_the_table(several):
 
 
 @pytest.mark.browser
-def test_a_visitor_goes_from_the_table_to_a_run(several):
+def test_a_link_leads_from_the_table_to_a_run(several):
     with served(several) as url, chromium() as page:
         page.get(url)
         wait(page, lambda p: "±" in text(p, "#runs"))

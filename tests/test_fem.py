@@ -171,7 +171,7 @@ def test_a_factor_of_volume_in_the_terms_is_found(power, found):
     assert lp.diagnostics.check_model(material).ok
 
 
-def test_a_volume_element_that_makes_no_sense():
+def test_an_invalid_volume_element_is_refused():
     mesh = MeshTri().refined(2).with_defaults()
     with pytest.raises(ModelError, match="must have one weight in common"):
         around_an_axis(
@@ -186,7 +186,7 @@ def test_a_volume_element_that_makes_no_sense():
 
 
 def test_spaces_of_equal_size_are_not_confused():
-    """Fact 9: Hermite has 2 (n + 1) unknowns, and so has a product of two P1 fields."""
+    """Hermite elements and a product of two P1 fields both have 2 (n + 1) unknowns (fact 9)."""
     mesh = line(12)
     nodes, hermite = ElementLineP1(), ElementLineHermite()
     model = lp.Model(
@@ -208,7 +208,7 @@ def test_spaces_of_equal_size_are_not_confused():
     )
     np.testing.assert_allclose(model.A(u)(q), expected, atol=1e-9)
     swapped = model.form_A.vector("v", q=u, u=q)
-    assert abs(swapped - expected).max() > abs(expected).max()  # the trap is a real one
+    assert abs(swapped - expected).max() > abs(expected).max()  # swapping would be noticed
 
 
 @pytest.mark.parametrize("span", [(0.0, 1.0, 30), (0.0, 1.0, 1000), (100.0, 101.0, 30)])
@@ -295,12 +295,12 @@ def test_derivatives_of_a_trilinear_form(name):
     assert form_A.matrix("q", "u", v=r) @ u @ q == pytest.approx(value)
     slope = form_A.matrix("q", "u", u=u, v=r) @ du @ dq
     assert slope == pytest.approx(model.A(du)(dq) @ r)
-    # With a tensor, or by quadrature where it would be too large: the same numbers.
+    # A tensor and, if it would be too large, quadrature give equal numbers.
     plain = form_A._quadrature("v", "q", START, {"u": u})
     np.testing.assert_allclose(form_A.data("v", "q", u=u), plain, atol=1e-10 * abs(plain).max())
 
 
-def test_affine_and_constant_are_found_out():
+def test_affine_and_constant_forms_are_detected():
     mesh, element = line(6), ElementLineP1()
     cases = {
         "linear": (lambda u, v, x: u * v, True, True),
@@ -338,7 +338,7 @@ def broken(u, v, x):
         (MissingInputError, "Input channel 'Q' has", {"B": lambda u, v, x: x.inputs["Q"] * u * v}),
     ],
 )
-def test_failing_forms_speak(error, message, forms):
+def test_a_failing_form_is_reported(error, message, forms):
     with pytest.raises(error, match=message):
         reaction(line(), ElementLineP1(), **forms)
 

@@ -72,8 +72,8 @@ Reader = Callable[[Path, list[dict]], list[float]]
 
 @pytest.mark.parametrize("read", [*BATCH, live])
 @pytest.mark.parametrize("minutes", [1, 10, 60])
-def test_the_hour_that_clocks_show_twice(tmp_path: Path, read: Reader, minutes: int) -> None:
-    """Of local times each reader makes those that went by, an hourly log among them."""
+def test_a_repeated_hour_is_read_as_two_hours(tmp_path: Path, read: Reader, minutes: int) -> None:
+    """Every reader converts local times to elapsed times, also for an hourly log."""
     count = 240 // minutes
     texts = local(minutes, count)
     assert len(set(texts)) == 180 // minutes
@@ -83,7 +83,7 @@ def test_the_hour_that_clocks_show_twice(tmp_path: Path, read: Reader, minutes: 
 
 @pytest.mark.parametrize("read", BATCH)
 @pytest.mark.parametrize("again", [70, 75])
-def test_a_repeated_row_is_no_second_pass(tmp_path: Path, read: Reader, again: int) -> None:
+def test_a_repeated_row_is_not_a_repeated_hour(tmp_path: Path, read: Reader, again: int) -> None:
     rows = [{"t": text, "a": float(k)} for k, text in enumerate(local(1, 100))]
     with pytest.raises(TimeOrderError, match="if clocks were set back, write dates with an offset"):
         read(tmp_path, [*rows[:80], rows[again], *rows[80:]])
@@ -91,7 +91,7 @@ def test_a_repeated_row_is_no_second_pass(tmp_path: Path, read: Reader, again: i
 
 @pytest.mark.parametrize("minutes", [10, 60])
 def test_a_case_for_local_times_needs_their_zone(tmp_path: Path, minutes: int) -> None:
-    """'Sort the rows' and 'drop repeated rows' would mix or lose an hour."""
+    """Sorting rows or dropping repeated rows would mix or lose an hour."""
     path, count = tmp_path / "wall.csv", 240 // minutes
     rows = [f"{text},{20.0 + 0.1 * k:.1f}" for k, text in enumerate(local(minutes, count))]
     path.write_text("\n".join(["t,a", *rows]))
@@ -152,7 +152,7 @@ def test_a_complete_file_of_a_logger(tmp_path: Path, head: str) -> None:
 
 @pytest.mark.parametrize("head", HEADS)
 def test_a_file_of_a_logger_that_grows(tmp_path: Path, head: str) -> None:
-    """The rows of a file that grows by single characters are those of the complete one."""
+    """A file that grows by single characters has the rows of the complete file."""
     path = tmp_path / "log.dat"
     source, found = Follow(path, follow=True), []
     text = HEADS[head] + "".join(VALUES)
@@ -186,14 +186,14 @@ def test_a_file_of_a_logger_is_continued_anywhere(tmp_path: Path, head: str) -> 
         assert [row.values["RECORD"] for row in rows] == ["0", "1", "2"]
 
 
-def test_words_amid_the_values_are_no_labels(tmp_path: Path) -> None:
+def test_text_among_the_values_is_not_a_label(tmp_path: Path) -> None:
     path = tmp_path / "log.dat"
     path.write_text(NAMES + VALUES[0] + UNITS + "".join(VALUES[1:]))
     with pytest.raises(DataError, match="row 3, column 'TIMESTAMP': got 'TS'"):
         table(path)
     source = Follow(path)
     rows = source.poll(0.0)
-    assert len(rows) == 4  # the intake counts it as malformed
+    assert len(rows) == 4  # the intake counts the text row as malformed
     source.close()
 
 
@@ -201,7 +201,7 @@ def test_words_amid_the_values_are_no_labels(tmp_path: Path) -> None:
 
 
 def run_in(folder: Path, unit: str, origin: str | None) -> xr.Dataset:
-    """Write and return the estimates of a run with snapshots at other times than samples."""
+    """Write and return the estimates of a run whose snapshots differ from its samples."""
     attrs = {"origin": origin} if origin else {}
     data = xr.Dataset(
         {"k": ("time", [1.0, 2.0, 3.0]), "T": (("snapshot", "vertex"), [[0.0, 1.0]])},
@@ -235,7 +235,7 @@ def test_times_without_a_date_stay_numbers(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("character", ["\x0c", "\x1c", "\x85", "\u2028"])
-def test_a_line_ends_at_its_end_and_nowhere_else(tmp_path, character):
+def test_only_a_line_end_ends_a_line(tmp_path, character):
     path = tmp_path / "log.csv"
     path.write_text(f"time_s,T{character}5\r\n0,20.5\r\n60,21.0\r\n", encoding="utf-8", newline="")
     written = how_written(path)
@@ -323,7 +323,7 @@ def test_two_parts_of_an_elapsed_time_are_not_guessed(tmp_path):
     assert "from 0 to 4210" in said
 
 
-def test_times_of_day_that_begin_again_are_no_elapsed_times(tmp_path):
+def test_repeating_times_of_day_are_not_elapsed_times(tmp_path):
     said, _ = init_of(tmp_path, ["22:00:00", "23:00:00", "0:00:00"], "clock")
     assert "'clock' has times of day: add a column of days" in said
 
@@ -370,7 +370,7 @@ def test_times_in_the_convention_of_cf_are_dates(tmp_path, date, first):
     said, line = init_of(tmp_path, [repr(10 + k / 4) for k in range(5)], f"time [{stated}]")
     assert f"5 rows from {first}" in said
     assert f'time_unit = "{stated}"' in line
-    # A case that leaves the unit out does not read hours as seconds.
+    # A case without the unit does not read hours as seconds.
     assert other_time_unit(f"time [{stated}]", "s") == stated
 
 
@@ -383,7 +383,7 @@ def test_a_stated_unit_is_not_replaced_by_a_date(tmp_path):
     assert "got 'since noon'; expected a date, as in 'd since 1899-12-30'" in said
 
 
-def test_day_numbers_of_local_clocks_that_are_set_back_are_told_apart():
+def test_day_numbers_of_a_repeated_hour_are_distinguished():
     noon = datetime(1899, 12, 30)
     clock = Clock("t", 86400.0, zone=BERLIN, since=noon)
     days = [(datetime.fromisoformat(text) - noon) / timedelta(days=1) for text in local(30, 12)]
@@ -426,7 +426,7 @@ def test_the_only_column_in_the_unit_of_a_missing_input_is_this_input(tmp_path):
     assert "unit" not in case["channels"]["T"]  # °C is the unit of the model
 
 
-def test_of_two_columns_in_its_unit_none_is_guessed(tmp_path):
+def test_two_columns_in_the_unit_of_an_input_are_not_guessed(tmp_path):
     case = channels_of(tmp_path, "borehole", "T [C]", "P1 [kW]", "P2 [kW]")
     assert case["inputs"]["Q"] == "? W"
     assert case["channels"]["P1"]["unit"] == "? kW"

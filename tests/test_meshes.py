@@ -96,7 +96,7 @@ $EndElements
 
 
 def named(tmp_path, suffix, **options):
-    """Write two squares with groups in another format than Gmsh's."""
+    """Write two squares with groups in a format other than Gmsh's."""
     points = np.array([[0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1]], dtype=float)
     cells = [("line", [[0, 3], [2, 5]]), ("triangle", [[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4]])]
     mesh = meshio.Mesh(points, cells, **options)
@@ -127,7 +127,7 @@ def test_groups_of_a_gmsh_file_are_kept(gmsh, capsys):
     assert isinstance(mesh, MeshTri)
     assert set(mesh.boundaries) == {"inlet", "wall"}
     assert set(mesh.subdomains) == {"sand", "clay"}
-    assert mesh.p.max() == 2.0  # the node of no cell is gone
+    assert mesh.p.max() == 2.0  # nodes without a cell are removed
     assert [area(mesh, name) for name in (None, "sand", "inlet")] == pytest.approx([2.0, 1.0, 1.0])
     assert np.allclose(mesh.p[0, mesh.facets[:, mesh.boundaries["inlet"]]], 0.0)
     assert np.allclose(mesh.p[0, mesh.facets[:, mesh.boundaries["wall"]]], 2.0)
@@ -181,7 +181,7 @@ def test_meshes_that_are_refused(tmp_path, points, cells, message):
         lp.read_mesh(tmp_path / "mesh.vtk")
 
 
-def test_clear_errors(tmp_path, gmsh, monkeypatch):
+def test_mesh_errors_state_a_remedy(tmp_path, gmsh, monkeypatch):
     with pytest.raises(SpaceError, match="there is no file"):
         lp.read_mesh(tmp_path / "nothing.msh")
     with pytest.raises(SpaceError, match="scale must be a positive number; got -1"):
@@ -206,7 +206,7 @@ def test_regions():
 
 
 def test_the_size_of_cells():
-    """x.h on cells, on a subdomain, and on a boundary the size of the cell behind it."""
+    """x.h is the cell size on cells and subdomains, and of the adjacent cell on a boundary."""
     mesh = lp.interval(1.0, 16.0, 4, geometric=True, regions={"far": lambda x: x[0] > 8.0})
     field = lp.Field(mesh, ElementLineP1())
     for where, expected in ((None, 1 + 4 + 16 + 64), ("far", 64), ("left", 1.0), ("right", 8.0)):
@@ -243,7 +243,7 @@ def test_sides_are_the_same_wherever_the_mesh_is_and_however_large(start: float,
 
 @pytest.mark.slow
 def test_a_penalty_imposes_an_unknown_boundary_value():
-    """Weakly: beta (u - q) v with beta = 100 k/h, identified from one sensor inside."""
+    """The penalty beta (u - q) v with beta = 100 k/h is identified from one inner sensor."""
     mesh = lp.interval(0.0, 1.0, 20)
     model = lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"right": 0.0}),
@@ -304,7 +304,7 @@ def advection(field, speed=1.0):
     ],
     ids=lambda value: str(value) if isinstance(value, int) else "",
 )
-def test_both_sides_are_one(field, size):
+def test_both_sides_share_their_unknowns(field, size):
     space = FunctionSpace.of(field, "u")
     block, _ = space.component()
     assert block.size == size == block.doflocs.shape[1]
@@ -320,7 +320,7 @@ def test_both_sides_are_one(field, size):
 
 @pytest.mark.parametrize("element", LINES)
 def test_translation_by_a_cell_commutes_with_the_operators(element):
-    """A shifted function has the shifted image: the seam is like every other vertex."""
+    """Operators map shifted functions to shifted images, so the seam is like any other vertex."""
     model = lp.Model(
         ring(element()),
         lp.Normal(1.0),
@@ -454,7 +454,7 @@ def test_channels_of_components_are_inputs_of_the_model():
 
 @pytest.mark.parametrize("element", ELEMENTS)
 def test_a_linear_displacement_is_exact(element: str):
-    """It is in equilibrium and in the space: what the boundary says holds inside, too."""
+    """It is in equilibrium and in the space, so the boundary values determine the interior."""
 
     def exact(x: Any, t: float) -> Any:
         return 0.3 * x[0] - 0.1 * x[1], 0.2 * x[0] + 0.4 * x[1]
@@ -475,12 +475,12 @@ def test_a_linear_displacement_is_exact(element: str):
         (lambda x, t: (1.0, 2.0, 3.0), r"'left': g\(x, t\) has 3 components; expected 2"),
     ],
 )
-def test_a_wrong_number_of_components_is_one_sentence(value: Any, message: str):
+def test_a_wrong_number_of_components_is_refused(value: Any, message: str):
     with pytest.raises(SpaceError, match=message):
         imposed({"left": value})
 
 
-def test_fields_without_components_say_so():
+def test_fields_without_components_are_reported():
     scalar = lp.Field(MESH, ElementQuad1(), dirichlet={"left": (1.0, 2.0)})
     with pytest.raises(SpaceError, match=r"a value for each component, .* not a vector"):
         lp.Model(scalar, lp.Normal(), lambda q, u, v, x: q * u * v)

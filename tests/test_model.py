@@ -134,14 +134,14 @@ def test_a_source_is_evaluated_again_only_where_it_may_have_changed():
     second = Inputs({"Q": 4.0})
     np.testing.assert_allclose((model.F(Moment(1.0, second)) - found[0]).sum(), 1.0)
     assert counts["evaluated"] == 2
-    changing = {"Q": 3.0}  # a dictionary may change behind its back
+    changing = {"Q": 3.0}  # a dictionary may change without notice
     np.testing.assert_array_equal(model.F(Moment(1.0, changing)), found[0])
     changing["Q"] = 4.0
     np.testing.assert_allclose((model.F(Moment(1.0, changing)) - found[0]).sum(), 1.0)
 
 
 def behind(x):
-    """Read the time in a helper, on a branch that is not probed."""
+    """Read the time in a helper function, on a branch that is not probed."""
     return x.t if x.inputs["Q"] > 2.0 else 0.0
 
 
@@ -150,7 +150,7 @@ def behind(x):
     [
         lambda x, t: t * x[0],
         lambda x, t: x.t * x[0],
-        lambda x, t: x.t if x.inputs["Q"] > 2.0 else 0.0,  # not on the branch that is probed
+        lambda x, t: x.t if x.inputs["Q"] > 2.0 else 0.0,  # on the branch that is not probed
         lambda x, *rest: rest[0] * x[0],
         lambda x, t: behind(x),
         lambda x, t: sum(x.t * k for k in (1.0, 2.0)) if x.inputs["Q"] > 2.0 else 0.0,
@@ -172,7 +172,7 @@ def diffusion(u, v):
 
 
 def exchange(mesh, parameter=None, **options):
-    """A solute that moves in water (c) and sits on the grains (s), exchanged at an unknown rate."""
+    """Return a solute in water (c) and on grains (s), exchanged at an unknown rate."""
     return lp.Model(
         state={
             "c": lp.Field(
@@ -315,7 +315,7 @@ def test_truth_on_another_mesh_and_by_formula(mesh):
     assert twin.exact_data[1] == pytest.approx(0.06)
 
 
-def test_nonlinear_reaction_system_conserves_what_it_turns_over(mesh):
+def test_a_nonlinear_reaction_system_conserves_mass(mesh):
     model = lp.Model(
         {"a": lp.Field(mesh, ElementLineP1()), "b": lp.Field(mesh, ElementLineP1())},
         {"k": lp.Normal(1.0)},
@@ -407,7 +407,7 @@ D, SIGMA = 0.2, 0.7
 
 
 def electrolyte(held: bool = True, mass: Any = None) -> lp.Model:
-    """A concentration that diffuses, and the quasi-static potential that its charge makes."""
+    """Return a diffusing concentration and the quasi-static potential of its charge."""
     inflow = {"left": lambda x, t: np.sin(t) + 0.0 * x[0]}
     state = {
         "c": lp.Field(MESH, ElementLineP1(), dirichlet=inflow),
@@ -449,13 +449,13 @@ def test_a_model_with_an_algebraic_component_passes_its_check():
         ({"mass": lambda u, v, x: -u.c * v.c}, ["M positive definite (failures)"]),
     ],
 )
-def test_what_does_not_determine_the_state_fails(options: Any, failed: list[str]):
+def test_a_model_that_does_not_determine_the_state_fails(options: Any, failed: list[str]):
     report = lp.diagnostics.check_model(electrolyte(**options), u=0.5)
     assert [line.name for line in report.failed] == failed
 
 
 def test_the_potential_is_that_of_the_concentration_at_every_moment():
-    """Of -sigma phi'' = c with phi(1) = 0 and no flux at 0: phi(0) is that of (1 - x) c / sigma."""
+    """For -sigma phi'' = c, phi(1) = 0, phi'(0) = 0: phi(0) is the integral of (1 - x) c / sigma."""
     model = electrolyte()
     forward, u = ForwardStage(model), model.initial(0.0)
     space = model.state_space
@@ -474,7 +474,7 @@ def samples(sensors: lp.observation.Observation, noise: float) -> list[tuple[flo
     observed = observe(model, sensors)
     forward, u, found = ForwardStage(model), model.initial(0.0), []
     for k in range(60):
-        for j in range(10):  # the truth takes ten steps for each of the filter's
+        for j in range(10):  # the truth has ten steps per step of the filter
             moment = lp.fem.Moment(0.1 * k + 0.01 * (j + 1))
             u = forward.solve(u, np.log([D, SIGMA]), 0.01, moment)
         z = observed.G @ u

@@ -27,7 +27,7 @@ TIMES = np.arange(1.5, 66.1, 1.5)
 
 
 def breakthrough(v: float, d: float, times: Any = TIMES) -> np.ndarray:
-    """Concentration behind a front that washes a column out, from 1 to 0 (Ogata and Banks)."""
+    """Return the concentration of a column washed out from 1 to 0 (Ogata and Banks)."""
     t, spread = np.asarray(times), 2.0 * np.sqrt(d * np.asarray(times))
     ahead, behind = (AT - v * t) / spread, (AT + v * t) / spread
     # exp(v x/D) erfc(behind) without overflow: the squares differ by v x/D.
@@ -41,7 +41,7 @@ def measured(seed: int = 0) -> tuple[float, ...]:
 
 
 def column(prior: tuple[float, float, float, float], **options: Any) -> lp.Identifier:
-    """Return an identifier of the column with priors v, its deviation, D, its deviation."""
+    """Return an identifier of the column with prior means and standard deviations of v and D."""
     v, v_std, d, d_std = prior
     mesh = lp.interval(0.0, 16.0, 40)
     model = lp.Model(
@@ -89,14 +89,14 @@ def test_the_column_is_found_from_each_prior(name: str):
     assert fit.converged
     assert fit.samples == len(TIMES)
     assert result.last.parameters["v"][0] == pytest.approx(v, rel=2e-3)
-    assert result.last.parameters["D"][0] == pytest.approx(d, rel=3e-2)  # that of the mesh
+    assert result.last.parameters["D"][0] == pytest.approx(d, rel=3e-2)  # error of the mesh
     assert fit.cost == pytest.approx(cost, abs=1.5)
     assert fit.passes < 20
 
 
 @pytest.mark.slow
 def test_beyond_a_bound_the_other_unknowns_are_those_of_the_best_fit_within():
-    """At v = 0.28 the best D is not that which goes with the unbounded best v, 0.258."""
+    """At v = 0.28 the best D differs from the D of the unbounded best v, 0.258."""
     low, middle, width = 0.28, math.log(0.05), 1.0
     v = lp.Scalar(lp.Normal(0.35, std=0.1, bounds=(low, 1.0)))
     z = measured()
@@ -129,7 +129,7 @@ def fitted(identifier: lp.Identifier) -> tuple[StoredSamples, Any]:
 
 
 def test_the_filter_goes_on_from_the_fit():
-    """One update by all samples is that of the filter sample by sample, about one trajectory."""
+    """About one trajectory, one update by all samples equals the filter sample by sample."""
     who = column(PRIORS["near"])
     for t, z in stream():
         who.step(t, z)
@@ -166,14 +166,14 @@ def test_outliers_are_left_out():
 
 
 def test_wild_readings_in_a_row_are_told_from_those_beside_them():
-    """The median of the neighbours of one is wild itself, at both ends of the row."""
+    """At both ends of the sequence, the median of the neighbours is itself an outlier."""
     rng = np.random.default_rng(3)
     values = rng.standard_normal((40, 1))
     values[6:10, 0] += [-17.0, -98.0, -73.0, -22.0]
     wild = np.zeros((40, 1), dtype=bool)
     wild[6:10] = True
     assert (near_neighbours(values, 4.0) == ~wild).all()
-    # A step that stays is no row of wild readings.
+    # A lasting step is not a sequence of outliers.
     values = rng.standard_normal((40, 1))
     values[20:] += 50.0
     assert near_neighbours(values, 4.0)[[*range(17), *range(23, 40)]].all()
@@ -244,7 +244,7 @@ def test_a_reading_whose_place_is_missing_is_not_fitted():
 
 @pytest.mark.slow
 def test_a_fit_that_leaves_out_many_readings_says_so():
-    """Also where its filter, which has taken the others one by one, has refused none of them."""
+    """It also reports them if its filter refused none of them."""
     z, wild = np.array(measured()), np.arange(len(TIMES)) % 6 == 3
     who = column((0.3, 0.1, 0.05, 0.03))
     last = who.run(stream((z + np.where(wild, 0.3, 0.0)).tolist())).last
@@ -256,11 +256,11 @@ def test_a_fit_that_leaves_out_many_readings_says_so():
     assert not [one for one in clean.verdict.findings if one.what == "fit"]
 
 
-# --- apart from the samples ---------------------------------------------------------------------
+# --- refits in a separate thread ----------------------------------------------------------------
 
 
 def rod_samples(seed: int = 0, count: int = 160) -> list[tuple[float, dict[str, float]]]:
-    """Readings of a rod with insulated ends, from the series of its exact solution."""
+    """Return readings of a rod with insulated ends, from the series of its exact solution."""
     rng, times = np.random.default_rng(seed), np.linspace(0.02, 4.0, count)
     exact = {name: np.cos(np.pi * x) * np.exp(-0.23 * np.pi**2 * times) for name, x in PLACES}
     noisy = {name: 20.0 * u + 0.05 * rng.standard_normal(count) for name, u in exact.items()}
@@ -287,7 +287,7 @@ def numbers_of(identifier: lp.Identifier, items: Any) -> np.ndarray:
 
 @cache
 def undisturbed() -> tuple[lp.Identifier, np.ndarray]:
-    """Return an identifier that fits apart after all samples, and its numbers."""
+    """Return an identifier after all samples with background refits, and its numbers."""
     apart = insulated(apart=True)
     return apart, numbers_of(apart, rod_samples())
 

@@ -91,7 +91,7 @@ def test_a_checkpoint_is_not_unpickled(tmp_path):
         "nothing",
     ],
 )
-def test_a_checkpoint_that_says_it_is_larger_or_other_is_refused(described):
+def test_a_checkpoint_with_a_false_size_or_type_is_refused(described):
     with pytest.raises(lp.errors.RunError, match="not a checkpoint"):
         checkpoint.unpacked(forged(described, bytes(16)), "it")
 
@@ -113,7 +113,7 @@ def test_an_array_keeps_type_and_shape_in_a_checkpoint():
         found[name][...] = array  # it is writable
 
 
-def test_a_damaged_checkpoint_is_one_sentence():
+def test_a_damaged_checkpoint_is_refused_with_one_sentence():
     whole = bytearray(identifier().dump())
     rng = np.random.default_rng(0)
     who, refused = identifier(), 0
@@ -171,7 +171,7 @@ def call(*arguments: str) -> tuple[int, str]:
 
 
 @pytest.mark.slow
-def test_a_run_of_somebody_else_runs_nothing(hostile):
+def test_a_foreign_run_directory_executes_no_code(hostile):
     trace = Path("trace")
     assert call("report", str(hostile))[0] == 0
     code, text = call("report", str(hostile), "--theory")
@@ -211,7 +211,7 @@ def test_a_case_cannot_allow_its_own_code(hostile):
 # --- excessive input -----------------------------------------------------------------------------
 
 
-def test_a_case_is_short(tmp_path):
+def test_a_long_case_is_refused(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text("#" * 1_000_001)
     with pytest.raises(lp.errors.CaseError, match="longer than 1000000 bytes"):
@@ -221,7 +221,7 @@ def test_a_case_is_short(tmp_path):
         cases.load(path)
 
 
-def test_a_record_is_short(tmp_path):
+def test_a_long_record_is_refused(tmp_path):
     path = tmp_path / "run.json"
     path.write_text('{"format": 1, "title": "' + "x" * 10_000_000 + '"}')
     with pytest.raises(lp.errors.RunError, match="longer than"):
@@ -260,7 +260,7 @@ def test_long_lines_are_refused_and_the_next_one_is_read(tmp_path):
 
 
 @pytest.mark.long
-def test_an_event_repeats_no_long_text(tmp_path):
+def test_an_event_truncates_long_text(tmp_path):
     row = {"t": "x" * 500_000, "a": 1.0}
     run = live(tmp_path, Rows([row, *rows(2)]))
     run.run()
@@ -271,7 +271,7 @@ def test_an_event_repeats_no_long_text(tmp_path):
 
 
 @pytest.mark.parametrize("value", [10**400, "9" * 5000, [1], {}, True, "2026-01-01T00:00:00+99:99"])
-def test_values_that_are_none(value):
+def test_invalid_values_are_refused(value):
     intake = Intake({"a": Column(("a",))}, Clock("t"))
     assert {r.kind for r in intake.take({"t": value, "a": 1.0}).remarks} == {"malformed"}
     if not isinstance(value, str):
@@ -313,7 +313,7 @@ def ask(server, path="/", **headers) -> tuple[int, str, http.client.HTTPMessage]
 
 
 @pytest.mark.slow
-def test_on_this_machine_only_its_own_names_are_answered(serving):
+def test_a_local_server_only_answers_requests_to_its_own_names(serving):
     server = serving()
     for host in ("localhost", "127.0.0.1", f"127.0.0.1:{server.port}", "[::1]", "127.9.9.9"):
         assert ask(server, Host=host)[0] == 200
@@ -322,7 +322,7 @@ def test_on_this_machine_only_its_own_names_are_answered(serving):
 
 
 @pytest.mark.slow
-def test_a_token_opens_once_and_a_cookie_from_then_on(serving):
+def test_a_token_opens_once_and_sets_a_cookie(serving):
     server = serving(token=TOKEN)
     code, text, headers = ask(server)
     assert code == 403
@@ -345,7 +345,7 @@ def test_a_token_opens_once_and_a_cookie_from_then_on(serving):
 
 
 @pytest.mark.slow
-def test_elsewhere_a_token_is_made(serving):
+def test_a_server_for_other_machines_creates_a_token(serving):
     one, other = Address("0.0.0.0"), Address("0.0.0.0")
     assert len(one.token) >= 32
     assert one.token != other.token
@@ -363,7 +363,7 @@ def test_elsewhere_a_token_is_made(serving):
     ("host", "token"),
     [("0.0.0.0", "short"), ("127.0.0.1", "a b"), ("127.0.0.1", "a;b"), ("127.0.0.1", "a\nb: c")],
 )
-def test_tokens_that_are_none(host, token):
+def test_invalid_tokens_are_refused(host, token):
     with pytest.raises(lp.errors.RunError, match="token"):
         Address(host, token=token)
 
@@ -405,7 +405,7 @@ def test_requests_that_are_too_long_are_refused(serving):
 
 
 @pytest.mark.slow
-def test_no_thread_that_serves_keeps_a_program_from_its_end(serving):
+def test_serving_threads_do_not_keep_a_program_alive(serving):
     before = {*threading.enumerate()}
     server = serving()
     assert ask(server)[0] == 200
@@ -416,7 +416,7 @@ def test_no_thread_that_serves_keeps_a_program_from_its_end(serving):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("token", ["", TOKEN])
-def test_slow_visitors_do_not_keep_others_out(serving, monkeypatch, token):
+def test_slow_clients_do_not_block_others(serving, monkeypatch, token):
     """Many more slow clients than threads do not block a thread."""
     monkeypatch.setattr(visitors, "DEADLINE", 2)
     server = serving(token=token)
@@ -461,7 +461,7 @@ def test_a_server_closes_while_an_answer_wakes_it(monkeypatch):
 
 
 @pytest.mark.slow
-def test_who_may_not_ask_is_answered_whatever_is_sent_along(serving):
+def test_an_unauthorised_client_gets_an_answer_for_any_body(serving):
     server = serving(token=TOKEN)
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
     connection.putrequest("POST", "/")
@@ -475,7 +475,7 @@ def test_who_may_not_ask_is_answered_whatever_is_sent_along(serving):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("chunked", [False, True])
-def test_bodies_of_who_may_not_ask_are_not_kept(serving, monkeypatch, chunked):
+def test_bodies_of_unauthorised_clients_are_not_stored(serving, monkeypatch, chunked):
     """Bodies of many unauthorised clients would fill memory and disk."""
     kept: list[int] = []
 
@@ -516,7 +516,7 @@ def test_bodies_reach_the_page():
 
 
 @pytest.mark.slow
-def test_who_sends_a_long_body_a_byte_at_a_time_is_sent_away(serving, monkeypatch):
+def test_a_client_that_sends_a_long_body_slowly_is_disconnected(serving, monkeypatch):
     monkeypatch.setattr(visitors, "DEADLINE", 2)
     server = serving()
     one = socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE)
@@ -532,7 +532,7 @@ def test_who_sends_a_long_body_a_byte_at_a_time_is_sent_away(serving, monkeypatc
 
 
 @pytest.mark.slow
-def test_who_takes_a_long_answer_too_slowly_is_sent_away(monkeypatch):
+def test_a_client_that_reads_a_long_answer_slowly_is_disconnected(monkeypatch):
     """A slow reader blocks a thread if the answer exceeds the server's buffer."""
     monkeypatch.setattr(visitors, "LONGEST", 1)
     ended, piece = threading.Event(), b"a" * 1_000_000
@@ -563,7 +563,7 @@ def test_who_takes_a_long_answer_too_slowly_is_sent_away(monkeypatch):
 
 
 @pytest.mark.slow
-def test_more_visitors_than_there_is_room_for(serving, monkeypatch):
+def test_clients_beyond_the_limit_are_refused(serving, monkeypatch):
     monkeypatch.setattr(visitors, "ROOM", 5)
     server = serving()
     waiting = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(20)]
@@ -575,7 +575,7 @@ def test_more_visitors_than_there_is_room_for(serving, monkeypatch):
 
 
 @pytest.mark.slow
-def test_health_and_metrics_ask_for_the_token_too():
+def test_health_and_metrics_also_require_the_token():
     monitor = Monitor(Address(token=TOKEN), lambda: {"ok": True}, Metrics(["a"]))
     for path in ("/health", "/metrics", "/none"):
         assert ask(monitor, path)[0] == 403
@@ -584,7 +584,7 @@ def test_health_and_metrics_ask_for_the_token_too():
     monitor.close()
 
 
-def test_nothing_is_written_through_links_of_a_strangers_directory(tmp_path):
+def test_nothing_is_written_through_links_in_a_foreign_directory(tmp_path):
     """Links with the names of temporary files are not followed; a run with links is refused."""
     run, victim = tmp_path / "run", tmp_path / "victim"
     victim.write_text("mine")
@@ -605,7 +605,7 @@ def test_nothing_is_written_through_links_of_a_strangers_directory(tmp_path):
         RunWriter.reopen(run, command=["x"], settings=(), **options)
 
 
-def test_a_file_in_the_making_is_made_by_nobody_else(tmp_path, monkeypatch):
+def test_a_temporary_file_cannot_be_preempted(tmp_path, monkeypatch):
     monkeypatch.setattr("livepde.atomic_write.secrets.token_hex", lambda size: "0")
     victim = tmp_path / "victim"
     victim.write_text("mine")

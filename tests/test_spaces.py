@@ -62,7 +62,7 @@ def test_std_divides_the_inner_product(inner):
     np.testing.assert_allclose(9 * wide.Q.gram.toarray(), unit.Q.gram.toarray(), rtol=1e-9)
 
 
-def test_singular_inner_product_is_one_sentence():
+def test_a_singular_inner_product_is_refused_with_one_sentence():
     model = reaction(line(), ElementLineP1(), inner=laplace)
     with pytest.raises(SpaceError, match="Gram matrix of Q is singular") as caught:
         _ = model.Q.factor
@@ -116,7 +116,7 @@ def test_norms_and_duals():
 
 @pytest.mark.parametrize("name", ["line Hermite", "triangles P1", "quads Q1"])
 def test_modes(name):
-    """G-orthonormal, descending, and all of them sum to the inverse Gram matrix."""
+    """Modes are G-orthonormal and descending, and all modes sum to the inverse Gram matrix."""
     model = CASES[name].model(q_dirichlet={"boundary": 0.0})
     Q, mass = model.Q, model.parameter_mass
     count = int(Q.free.sum())
@@ -192,7 +192,7 @@ NOT_FINITE = [[1.0, np.nan], [np.nan, 1.0]]
         ),
     ],
 )
-def test_what_is_no_space_or_prior_is_refused(message, make):
+def test_invalid_spaces_and_priors_are_refused(message, make):
     with pytest.raises(SpaceError, match=message):
         make()
 
@@ -360,7 +360,7 @@ def test_names_of_orders():
 
 
 def test_products_with_other_unknowns():
-    """A field in H^1.5 beside a number and a field in H^1: blocks keep their own inner product."""
+    """In a product of H^1.5, a number and H^1, each block keeps its inner product."""
     mesh, element = line(), ElementLineP1()
     parts = {
         "a": lp.Field(mesh, element, inner=lp.Sobolev(1.5, LENGTH), dirichlet={"left": 0.0}),
@@ -391,7 +391,7 @@ def test_products_with_other_unknowns():
 
 @pytest.mark.long
 def test_modes_of_a_large_space_are_powers_of_those_of_H1(monkeypatch):
-    """H^s has the modes of H^1, with their variance to the power s; nothing is written out."""
+    """H^s has the modes of H^1 with variances to the power s, without assembling matrices."""
     monkeypatch.setattr(spaces, "LARGEST_EXPLICIT", 1000)
     mesh, element = MeshTri().refined(5), ElementTriP1()
     one, two = (

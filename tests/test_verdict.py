@@ -130,7 +130,7 @@ def named(found: Verdict) -> list[tuple[str, str]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("stated", "seed"), [(1.0, 1), (3.0, 2), (1 / 3, 1)])
-def test_a_right_model_is_trusted_whatever_noise_is_stated(stated: float, seed: int):
+def test_a_correct_model_is_trusted_for_any_stated_noise(stated: float, seed: int):
     _, estimate = run(shown() + errors(seed), stated=stated)
     assert estimate.verdict.level == "trusted"
     said = [finding.what for finding in estimate.verdict.findings]
@@ -138,7 +138,7 @@ def test_a_right_model_is_trusted_whatever_noise_is_stated(stated: float, seed: 
 
 
 @pytest.mark.slow
-def test_the_filter_gives_the_same_numbers_however_it_is_judged():
+def test_the_filter_gives_equal_numbers_for_any_verdict_option():
     z = shown() + errors()
     _, judged = run(z)
     _, cheap = run(z, law=lp.SensitivityLaw(verdict="cheap"))
@@ -189,7 +189,7 @@ def test_a_lag_is_named_with_its_size_and_what_it_does_to_the_estimate():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", ["none", "lag", "late offset"])
-def test_a_start_that_is_off_hides_no_other_fault(fault: str):
+def test_a_wrong_initial_state_hides_no_other_fault(fault: str):
     z = shown().copy()
     if fault == "lag":
         z[:, 2] = np.interp(TIMES - 4 * (TIMES[1] - TIMES[0]), TIMES, z[:, 2])
@@ -207,13 +207,13 @@ def test_a_start_that_is_off_hides_no_other_fault(fault: str):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("level", [0.0, 20.0])
-def test_a_start_that_nobody_stated_is_a_suspect(level: float):
+def test_a_default_initial_state_is_a_possible_cause(level: float):
     _, estimate = run(level + shown() + errors(), u0=None)
     remedies = [one.remedy for one in estimate.verdict.findings if one.what == "start"]
     assert any("Give `u0`" in remedy for remedy in remedies) == (level > 0.0)
 
 
-def test_a_sensor_elsewhere_is_named():
+def test_a_displaced_sensor_is_named():
     found = run(shown() + errors(), places={**PLACES, "B": 0.56})[1].verdict
     assert ("position", "B") in named(found)
     assert "B may be" in found.findings[0].sentence
@@ -227,7 +227,7 @@ def test_a_missing_loss_is_named():
 
 
 @pytest.mark.slow
-def test_a_jump_is_named_and_turns_the_verdict_soon():
+def test_a_jump_is_named_and_changes_the_verdict_early():
     half = len(TIMES) // 2
     z = np.concatenate([shown()[:half], shown(k=0.2)[half:]]) + errors()
     identifier = judged()
@@ -274,7 +274,7 @@ def test_a_verdict_is_a_warning_in_the_log_unless_the_run_is_trusted(caplog, off
 
 
 @pytest.mark.slow
-def test_errors_that_follow_each_other_are_no_cause():
+def test_correlated_errors_have_no_named_cause():
     rng = np.random.default_rng(3)
     e = rng.standard_normal((len(TIMES), 3))
     for k in range(1, len(e)):
@@ -288,7 +288,7 @@ def test_errors_that_follow_each_other_are_no_cause():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("sensors", "kinds"), [(40, ["gain", "drift"]), (120, ["offset", "lag"])])
-def test_where_sensors_are_many_kinds_of_causes_are_left_out(sensors: int, kinds: list[str]):
+def test_with_many_sensors_some_kinds_of_causes_are_omitted(sensors: int, kinds: list[str]):
     places = {f"s{k}": (k + 0.5) / sensors for k in range(sensors)}
     points = lp.Points(places, noise=NOISE)
     identifier = lp.Identifier(rod(), points, lp.SensitivityLaw(), u0=0.0)
@@ -300,7 +300,7 @@ def test_where_sensors_are_many_kinds_of_causes_are_left_out(sensors: int, kinds
 
 
 @pytest.mark.slow
-def test_a_kept_verdict_holds_no_responses_of_the_process():
+def test_a_stored_verdict_has_no_responses_of_the_process():
     identifier, _ = run(shown() + errors())
     cells = identifier.law.deferred(identifier._work, identifier._state).verdict.__closure__ or ()
     (x,) = (cell.cell_contents for cell in cells if hasattr(cell.cell_contents, "ledger"))
@@ -310,7 +310,7 @@ def test_a_kept_verdict_holds_no_responses_of_the_process():
 
 
 @pytest.mark.slow
-def test_directions_move_the_estimate_by_what_they_say():
+def test_directions_predict_the_shift_of_the_estimate():
     """With an unknown source, model and filter are linear, so the shift by an offset is exact."""
     mesh = lp.interval(0.0, 1.0, 20)
 
@@ -349,7 +349,7 @@ def fed(inputs: Any, *, between: str = "line") -> lp.Estimate:
 
 @pytest.mark.long
 @pytest.mark.parametrize("between", ["hold", "next"])
-def test_readings_that_are_held_as_settings_are_told(between: str):
+def test_smooth_readings_held_as_settings_are_reported(between: str):
     straight, held = fed(driven(TIMES)), fed(driven(TIMES), between=between)
     (found,) = [f for f in held.verdict.findings if f.what == "hold"]
     assert found.severity == "caution"
@@ -362,7 +362,7 @@ def test_readings_that_are_held_as_settings_are_told(between: str):
 
 
 @pytest.mark.long
-def test_gaps_of_a_channel_are_told_and_in_the_interval():
+def test_gaps_of_a_channel_are_reported_and_widen_the_interval():
     whole, off, shifts = fed(driven(TIMES)), [], []
     for seed in range(5, 9):
         values = driven(TIMES)
@@ -379,7 +379,7 @@ def test_gaps_of_a_channel_are_told_and_in_the_interval():
 
 
 @pytest.mark.slow
-def test_what_was_not_judged_is_judged_from_where_it_is_taken_up():
+def test_a_resumed_run_is_judged_from_its_resume():
     one, z = judged(lp.SensitivityLaw(verdict=False)), shown() + errors()
     for k, t in enumerate(TIMES[:60].tolist()):
         before = one.step(t, z[k], {"T_left": driven(t)})
@@ -395,7 +395,7 @@ def test_what_was_not_judged_is_judged_from_where_it_is_taken_up():
 
 
 @pytest.mark.slow
-def test_a_census_knows_what_the_unknowns_take_up():
+def test_a_census_accounts_for_effects_absorbed_by_unknowns():
     from benchmarks.census import FAULTS
     from benchmarks.census.run import scene_of
     from benchmarks.census.trace import VISIBLE, trace
@@ -411,7 +411,7 @@ def test_a_census_knows_what_the_unknowns_take_up():
 
 
 @pytest.mark.slow
-def test_validation_sensors_are_judged_against_what_is_predicted():
+def test_validation_sensors_are_compared_with_predictions():
     clean = shown(places=(0.25, 0.75, 0.5)) + errors()
     z = {"A": clean[:, 0], "C": clean[:, 1], "W": clean[:, 2]}
     places = {"A": 0.25, "C": 0.75}
@@ -454,21 +454,21 @@ def test_sums_of_a_sensor_do_not_depend_on_samples_without_it():
 
 
 @pytest.mark.slow
-def test_sensors_that_read_in_turn_show_the_noise_of_their_readings():
+def test_sensors_with_alternating_readings_show_their_noise():
     z, turn = shown() + errors(), np.arange(len(TIMES))[:, None] % 3
     verdict = run(np.where(turn == np.arange(3), z, np.nan))[1].verdict
     assert verdict.level == "trusted"
     assert verdict.findings == ()  # none that the residuals scatter more than stated
 
 
-def test_few_samples_are_too_few():
+def test_a_run_with_few_samples_is_not_judged():
     identifier = judged()
     estimate = identifier.step(0.1, np.zeros(3), {"T_left": 0.0})
     assert estimate.verdict.level == "not judged"
     assert "1 samples, at least 20 required" in estimate.verdict.sentences[0]
 
 
-def test_the_worst_finding_decides_and_none_is_said_twice():
+def test_the_worst_finding_decides_and_none_is_repeated():
     notes = [Finding("noise", "note", f"n{k}") for k in range(6)]
     grave = Finding("misfit", "do not trust", "grave")
     found = Verdict.of([*notes, grave, grave])
@@ -480,7 +480,7 @@ def test_the_worst_finding_decides_and_none_is_said_twice():
     assert found.with_findings([grave]).findings == found.findings
 
 
-def test_what_was_not_judged_is_never_trusted():
+def test_a_run_that_was_not_judged_is_never_trusted():
     """Notes or a caution do not make it trusted; a caution would claim too much."""
     note, caution = Finding("noise", "note", "n"), Finding("flat", "caution", "f")
     grave = Finding("validation", "do not trust", "w")
@@ -500,7 +500,7 @@ def test_a_run_names_the_discretisation_once():
     assert Verdict.of([old]).with_findings([new]).findings == (new,)
 
 
-def test_a_finding_of_later_data_takes_the_place_of_an_earlier_one():
+def test_a_later_finding_replaces_an_earlier_one():
     """A page shows an earlier verdict with the current shares of the prior."""
     earlier = Verdict.of([flat("a", 0.92), flat("b", 0.95)], [], [])
     found = earlier.with_findings([flat("a", 0.94)])
@@ -574,7 +574,7 @@ def test_a_sensor_averages_over_a_length_inside_the_body():
 
 
 @pytest.mark.parametrize(("converged", "kept"), [(True, 1), (False, 2)])
-def test_refusals_count_no_longer_once_a_fit_of_all_readings_has_converged(converged, kept):
+def test_refusals_do_not_count_after_a_converged_fit_of_all_readings(converged, kept):
     fit = Fit(samples=50, cost=1.0, passes=2.0, readings=100, refused=0, converged=converged)
     other = Finding("stuck", "do not trust", "It is stuck.")
     verdict = Verdict.of([Finding("refused", "caution", "Many were refused."), other])
