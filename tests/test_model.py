@@ -455,7 +455,7 @@ def test_a_model_that_does_not_determine_the_state_fails(options: Any, failed: l
 
 
 def test_the_potential_is_that_of_the_concentration_at_every_moment():
-    """For -sigma phi'' = c, phi(1) = 0, phi'(0) = 0: phi(0) is the integral of (1 - x) c / sigma."""
+    """For -sigma phi'' = c, phi(1) = 0, phi'(0) = 0: phi(0) = integral of (1 - x) c / sigma."""
     model = electrolyte()
     forward, u = ForwardStage(model), model.initial(0.0)
     space = model.state_space
