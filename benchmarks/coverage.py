@@ -1,12 +1,12 @@
 """Coverage of intervals in twin experiments with true values drawn from the prior.
 
-Each twin draws its unknowns from the prior, simulates data with the estimator's own scheme, adds
-noise, and tests whether the truth lies in the 68 % and 95 % intervals. If prior, model and noise
-are right, the coverage equals the level and the normalised innovations are white. Then 95 of 100
-twins have a mean square within 1.96 standard errors of 1, and a lag-one correlation within 1.96
-standard errors of 0. In the last problems the model is wrong: it lacks a heat loss or a second
-layer of random size. Then the interval must still contain the truth, or the run must report that
-the model does not explain the data.
+Each twin draws its unknowns from the prior, and simulates noisy data with the estimator's own
+scheme. If prior, model and noise are right, the 68 % and 95 % intervals contain the truth with
+these probabilities, and the normalised innovations are white. Then 95 of 100 twins have a mean
+square within 1.96 standard errors of 1, and a lag-one correlation within 1.96 standard errors of 0.
+In the last problems the model is wrong: it lacks a heat loss or a second layer of random size. Then
+the interval must still contain the truth, or the run must report that the model does not explain
+the data.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """Measure the forward step of an earlier version: python -m benchmarks.earlier [COMMIT].
 
 Two processes step the same model in turns: one with the sources of the commit, in a temporary git
-worktree, and one with the current sources. The table shows the forward step of the commit and the
-current one, both in forward steps of the lean reference (`benchmarks.rods.lean_forward`), and the
-ratio of current to commit. Values are medians over the turns, of processor times. The column of
-the commit defines `benchmarks.rods.EARLIER`.
+worktree, and one with the current sources. The table shows both forward steps relative to the lean
+reference (`benchmarks.rods.lean_forward`), and the ratio of current to commit. Values are medians
+over the turns, of processor times. The column of the commit defines `benchmarks.rods.EARLIER`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Coverage of the walks of docs/first-hour.md for other truths.
 
-Truths come from independent codes: finite volumes with matrix exponentials in time for the walls,
-the ground and the aquifer, finite differences with small steps for the plate, the solution of Ogata
-and Banks (1961) for the column, and cells that move with the water for the pipe. They share only
-the priors with livepde. `write` writes the tables of examples/first_hour.
+Truths come from independent codes, which share only the priors with livepde. Walls, ground and
+aquifer use finite volumes with matrix exponentials in time, the plate finite differences with small
+steps. The column uses the solution of Ogata and Banks (1961), and the pipe cells that move with the
+water. `write` writes the tables of examples/first_hour.
 """
 
 from __future__ import annotations

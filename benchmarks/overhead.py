@@ -2,11 +2,10 @@
 
 The rod has 31 nodes, two unknowns, five sensors, and both ends as channels of the stream. Times to
 first estimates are processor times of new processes of `livepde run`, including the start of the
-interpreter; bytecode exists, as after an installation by pip. Per sample, `livepde run` (reading
-rows, journal, result, checkpoints) is timed in turns with a loop of `Identifier.step` over the same
-samples, so that other load on the machine affects both. Estimates are evaluated lazily. Therefore a
-second loop reads from each the values that a run writes: parameters with standard deviations, and
-diagnostics.
+interpreter; bytecode exists, as after an installation by pip. Per sample, `livepde run` (rows,
+journal, result, checkpoints) alternates with a loop of `Identifier.step` over the same samples.
+Other load on the machine therefore affects both. Estimates are evaluated lazily. A second loop also
+reads the values that a run writes: parameters with standard deviations, and diagnostics.
 """
 
 from __future__ import annotations

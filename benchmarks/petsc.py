@@ -1,7 +1,7 @@
 """Both laws on PETSc vectors: cost relative to a forward step, memory of a rank, weak scaling.
 
-The models are a heated plate in DOLFINx, with a filter for three constants from three points, and
-a reaction q(x) with u observed everywhere and the paper's law. Each law alternates with
+The models in DOLFINx are a heated plate and a reaction q(x). The filter estimates three constants
+of the plate from three points, and the paper's law q(x) from u everywhere. Each law alternates with
 `ImplicitStep`, which receives the true q. Each number of ranks is a separate program. Ranks wait
 for each other, which amplifies other load on the machine. Therefore the shortest sample counts.
 """

@@ -39,9 +39,9 @@ class Setting:
     samples
         Length of the window.
     state, unknowns
-        Weights of the arrival cost: distance of the initial state of the window from the last
-        solution, in standard deviations of the steady-state filter, and distance of the unknowns
-        from their last estimate, in prior standard deviations.
+        Weights of the arrival cost. `state` weights the distance of the window's initial state from
+        the last solution, in standard deviations of the steady-state filter. `unknowns` weights
+        the distance from the last estimate, in prior standard deviations.
     full
         True: estimate all finite element coefficients, as in a direct implementation with do-mpc.
         False: estimate the coordinates of our reduced model.
