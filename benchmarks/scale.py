@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import ROOT
+from benchmarks.processes import peak_memory
 from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import ConfigurationError
 from livepde.fem import Field, Moment, box, dot, grad, linear, rectangle
@@ -201,7 +202,7 @@ def identify(size: int, gain: float, path: str) -> Need:
     identifier = _identifier(model, gain)
     for k, z in enumerate(np.load(path, mmap_mode="r")):
         _check(identifier.step(WIDTH * k, np.array(z)))
-    return Need(_error(model, identifier), _peak() / model.X.dim)
+    return Need(_error(model, identifier), peak_memory() / 1e3 / model.X.dim)
 
 
 def _identifier(model: Model, gain: float) -> Identifier:
@@ -223,14 +224,6 @@ def _timed(run: Callable[[], Any]) -> tuple[float, Any]:
     start = process_time()
     result = run()
     return process_time() - start, result
-
-
-def _peak() -> float:
-    """Return the peak memory of this process, in kB."""
-    import resource
-
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most / 1e3 if sys.platform == "darwin" else most * 1.024
 
 
 def scale(

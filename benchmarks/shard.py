@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import resource
 import tempfile
 from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
@@ -15,6 +14,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from benchmarks.fleet import NODES, NOISE, SENSORS, STEP
+from benchmarks.processes import peak_memory
 from livepde.atomic_write import write_bytes
 from livepde.diagnostics.check_report import Check, Table
 from livepde.fem import Channel, LogNormal, interval
@@ -129,7 +129,7 @@ def _cost(members: int, law: str) -> Cost:
     for offset, batch in _batches(model, WARM, counts[0]):
         first.step(offset, batch)
     first.load(first.dump())
-    peak, times = _peak(), []
+    peak, times = peak_memory(), []
     shards = [first, *(_shard(model, count, law) for count in counts[1:])]
     for one in shards[1:]:
         for offset, batch in _batches(model, WARM, len(one)):
@@ -148,15 +148,10 @@ def _cost(members: int, law: str) -> Cost:
     begun = process_time()
     first.load(last)
     load = (process_time() - begun) / len(first)
-    each = (_peak() - peak) / max(members - counts[0], 1)
+    each = (peak_memory() - peak) / max(members - counts[0], 1)
     base = peak - each * counts[0]
     step = float(np.median(times))
     return Cost(base, each, sum(contents) / members, step, dump, load)
-
-
-def _peak() -> float:
-    """Return the peak memory of this process, in bytes."""
-    return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def _started(members: int, law: str) -> float:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from multiprocessing import get_context
-from pathlib import Path
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from benchmarks.peers.network import network
 from benchmarks.problems import PROBLEMS as ALL
 from benchmarks.problems import Data, Problem
 from benchmarks.problems.rod import ROD, ROD_SOURCE
+from benchmarks.processes import peak_memory
 from benchmarks.scoring import Contender, Results, Score, scored
 from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import LivepdeError
@@ -117,17 +117,6 @@ def _quiet() -> Iterator[None]:
         yield
 
 
-def _peak(reset: bool = False) -> float:
-    """Return the peak memory of this process in MB, since the last reset; NaN if unknown."""
-    try:
-        if reset:
-            Path("/proc/self/clear_refs").write_text("5")
-        lines = Path("/proc/self/status").read_text().splitlines()
-    except OSError:
-        return math.nan
-    return next((int(row.split()[1]) / 1024 for row in lines if row.startswith("VmHWM")), math.nan)
-
-
 def run_row(problem: Problem, level: float | None, seed: int, row: str) -> Score | None:
     """Run one row on one data set in this process."""
     peer = PEERS.get(row)
@@ -138,9 +127,9 @@ def run_row(problem: Problem, level: float | None, seed: int, row: str) -> Score
     with _quiet():
         for package in peer.packages if peer is not None else ():
             __import__(package)
-        before = _peak(reset=True)
+        before = peak_memory(reset=True)
         score = scored(accuracy.ROWS[row] if peer is None else peer.run, data)
-    return None if score is None else replace(score, megabytes=_peak() - before)
+    return None if score is None else replace(score, megabytes=(peak_memory() - before) / 2**20)
 
 
 def _job(name: str, level: float | None, seed: int, row: str) -> Score | None:

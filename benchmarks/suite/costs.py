@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 from benchmarks import ROOT
 from benchmarks.fleet import fleet
+from benchmarks.processes import peak_memory
 from benchmarks.step import problem, step
 from livepde import GradientLaw, Identifier, SensitivityLaw
 from livepde.laws import ResidualDamping
@@ -72,15 +72,9 @@ class Fleet:
         return values[2]
 
 
-def _peak() -> float:
-    """Return the peak memory of this process, in bytes (Linux)."""
-    rows = Path("/proc/self/status").read_text().splitlines()
-    return next(1024.0 * int(row.split()[1]) for row in rows if row.startswith("VmHWM"))
-
-
 def _spent(nodes: int, law: str) -> float:
     """Return the memory of the model and five steps of a law, in kB per state unknown."""
-    before, given = _peak(), problem(nodes)
+    before, given = peak_memory(), problem(nodes)
     gradient = law == "gradient"
     rule = GradientLaw(1e4, ResidualDamping(1.0)) if gradient else SensitivityLaw(MODES, 1e-3)
     sensors = given.omega if gradient else given.points
@@ -91,7 +85,7 @@ def _spent(nodes: int, law: str) -> float:
             identifier.step(t, matrix @ u)
         if k == 5:
             break
-    return (_peak() - before) / given.model.X.dim / 1000.0
+    return (peak_memory() - before) / given.model.X.dim / 1000.0
 
 
 if __name__ == "__main__":
