@@ -698,7 +698,7 @@ def test_estimates_with_their_band():
     assert len(ax.collections) == 1
     with pytest.raises(lp.errors.ConfigurationError, match=r"name one of .* \['k', 'r'\]"):
         two().plot.estimates()
-    with pytest.raises(lp.errors.ConfigurationError, match="no number 's'"):
+    with pytest.raises(lp.errors.ConfigurationError, match="no unknown number 's'"):
         two().plot.estimates("s")
     assert "r" in two().plot.estimates("r").get_ylabel()
 
@@ -722,7 +722,7 @@ def test_corner():
     assert np.array_equal(axes[1, 0].lines[0].get_xydata().T, [drawn["k"], drawn["r"]])
     assert two().plot.corner(["r"], axes=axes[:1, :1]).shape == (1, 1)
     assert found().plot.corner(n=9)[0, 0].get_xlabel() == "alpha [m²/s]"
-    with pytest.raises(lp.errors.ConfigurationError, match="no number 's'"):
+    with pytest.raises(lp.errors.ConfigurationError, match="no unknown number 's'"):
         two().plot.corner(["s"])
 
 
@@ -935,3 +935,16 @@ def test_data_of_a_vector_field():
     assert np.allclose(lp.Full().sample(flow, model.state_space), expected)
     with pytest.raises(lp.errors.ObservationError, match="a row for each of 2 components"):
         lp.Full().sample(lambda x: x[0], model.state_space)
+
+
+def test_a_text_as_a_boundary_value_is_refused_with_the_channel_to_write():
+    with pytest.raises(lp.errors.SpaceError, match=r"give Channel\('T_left'\)"):
+        heat(lp.interval(0.0, 1.0, 4), lp.Normal(0.1), {"left": "T_left"})
+
+
+def test_a_guessed_attribute_of_a_result_gets_the_place_of_the_estimates():
+    with pytest.raises(AttributeError, match=r"last\['alpha'\] and to_dataframe\(\).*forecasts"):
+        known().forecast  # noqa: B018
+    shown = repr(known().last["u"].at([0.2, 0.4]))
+    assert shown.startswith("Marginal(median=array([")
+    assert len(shown) < 120

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -89,8 +89,8 @@ class Marginal:
 
     median: Any
     deviation: Any
-    unknown: Any
-    _read: Callable[[ArrayLike], Marginal] | None = None
+    unknown: Any = field(repr=False)
+    _read: Callable[[ArrayLike], Marginal] | None = field(default=None, repr=False)
 
     def at(self, points: ArrayLike) -> Marginal:
         """Return the marginals of the values of a field at points.

@@ -403,7 +403,10 @@ class Result(Shown):
                 "this result was pickled, without its model: it has its estimates, datasets and "
                 "tables. To add samples or to smooth, run an identifier again."
             )
-        raise AttributeError(f"a Result has no attribute '{name}'.")
+        raise AttributeError(
+            f"a Result has no attribute '{name}': estimates are in last['alpha'] and "
+            "to_dataframe(), figures in plot. An Identifier forecasts, saves and loads."
+        )
 
     def smoothed(self) -> xr.Dataset:
         """Return a dataset of smoothed unknowns and states, given all samples of the run.

@@ -374,6 +374,12 @@ class Field(_Declared):
                     f"dirichlet: the value on '{name}' is unknown; let it enter weakly, by a "
                     f"penalty: On('{name}', lambda q, u, v, x: 100 * D / x.h * (u - q.value) * v)."
                 )
+            for item in _each_value(value):
+                if isinstance(item, str):
+                    raise SpaceError(
+                        f"dirichlet: the value on '{name}' is the text {item!r}; for a channel of "
+                        f"the stream, give Channel({item!r})."
+                    )
 
     def _check_periodic(self, known: set[str]) -> None:
         for name in chain.from_iterable(self.periodic):

@@ -196,8 +196,8 @@ def estimates(data: xr.Dataset, name: str | None = None, *, ax: Axes | None = No
     if name is None and len(known) == 1:
         (name,) = known
     if name is None or name not in known:
-        what = "name one of the unknown numbers" if name is None else f"there is no number '{name}'"
-        raise ConfigurationError(f"plots: {what}: {list(known)}.")
+        wrong = "" if name is None else f"there is no unknown number '{name}'; "
+        raise ConfigurationError(f"plots: {wrong}name one of the numbers {list(known)}.")
     return _scalar_panel(data, name, known[name], panel(ax))
 
 
@@ -267,7 +267,7 @@ def corner(draws: xr.Dataset, names: Sequence[str] | None = None, *, axes: Any =
         The matrix of axes; axes above the diagonal are hidden.
     """
     numbers = [str(name) for name in draws.data_vars if draws[name].dims == ("draw",)]
-    shown = _chosen(names, numbers, "plots: there is no number")
+    shown = _chosen(names, numbers, "plots: there is no unknown number")
     if not shown:
         raise ConfigurationError("plots: there is no unknown number to draw.")
     size = len(shown)
