@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from factories import excited, line, observe, reaction
-from skfem import ElementLineHermite, ElementLineP1
+from skfem import ElementLineHermite, ElementLineP1, ElementTriP2, MeshTri
 
 import livepde as lp
 from livepde.diagnostics import (
@@ -17,6 +17,7 @@ from livepde.diagnostics import (
     check_observation,
     check_space,
 )
+from livepde.fem import START
 from livepde.stepping import ForwardStage
 
 
@@ -126,6 +127,41 @@ def test_a_projection_that_is_none_is_found():
     assert "R R = R" in failed(check_observation(observed))
 
 
+def test_a_sensor_that_sees_nothing_is_found():
+    blind = lp.observation.Matrix([[0.0] * 6 + [1.0], [0.0] * 7])
+    report = check_observation(blind, reaction(line(6), ElementLineP1()))
+    assert failed(report) == ["sensors that depend on nothing"]
+    assert "['z1'] depend" in report.failed[0].remedy
+
+
+def test_a_function_without_complex_values_needs_a_derivative():
+    def table(y):
+        return np.interp(y, [0.0, 2.0], [0.0, 4.0])
+
+    with pytest.raises(lp.errors.ModelError, match=r"Form B has no derivative .*dB="):
+        check_model(reaction(line(6), ElementLineP1(), B=lambda u, v, x: table(u) * v))
+    sensors = lp.observation.Transformed(lp.Points([0.5]), table)
+    with pytest.raises(lp.errors.ModelError, match=r"Transformed: .*derivative="):
+        check_observation(sensors, reaction(line(6), ElementLineP1()))
+
+
+def test_a_line_inside_the_mesh_has_a_normal_only_with_an_orientation():
+    mesh = MeshTri.init_sqsymmetric().refined(2).with_subdomains({"west": lambda x: x[0] < 0.5})
+    cut = mesh.facets_satisfying(lambda x: np.isclose(x[0], 0.5))
+    mesh = mesh.with_boundaries({"cut": cut, "around": mesh.facets_around("west")})
+    model = reaction(mesh, ElementTriP2())
+
+    def outflow(name):
+        flux = lp.observation.Functionals({"J": lp.On(name, lambda q, u, x: u * x.normal[0])})
+        observed = flux.bind(model.state_space, model.X, model.parameter_space)
+        u = model.state_space.interpolate(lambda x: x[0])
+        return observed.predict(u, np.zeros(model.Q.dim), START)
+
+    with pytest.raises(lp.errors.ObservationError, match="it has no side: write the direction"):
+        outflow("cut")
+    assert outflow("around") == pytest.approx([0.5])
+
+
 def test_spaces():
     check_space(excited(6).Q).raise_if_failed()
     check_space(excited(6).X).raise_if_failed()
@@ -183,6 +219,31 @@ class Fragile(OpenLoop):
         return State(new.u, new.q + 0.0 * interval.z1.sum()), report
 
 
+class Informed(OpenLoop):
+    """Knows the truth."""
+
+    def step(self, work, state, interval):
+        new, report = super().step(work, state, interval)
+        return State(new.u, new.q + 0.1 * (2.0 - new.q)), report
+
+
+class Flattering(OpenLoop):
+    """Reports the readings as its predictions."""
+
+    def step(self, work, state, interval):
+        new, report = super().step(work, state, interval)
+        predicted = np.where(interval.present, interval.z1, report.predicted)
+        return new, lp.laws.Report(report.status, predicted, steps=1)
+
+
+class Misshapen(OpenLoop):
+    """Reports a covariance of q where its square root is expected."""
+
+    def belief(self, work, state):
+        n, m = len(state.u), len(state.q)
+        return lp.laws.Belief(state.q, state.u, np.eye(m), np.ones((n, m + 1)))
+
+
 def build(law):
     model = reaction(line(6), ElementLineP1())
     return lp.Identifier(model, lp.Points([0.3, 0.6], noise=0.1), law, u0=lambda x: x[0])
@@ -198,7 +259,15 @@ def test_a_good_law_passes():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("law", "words"), [(Dice(), "two runs"), (Scribbler(), "value"), (Fragile(), "missing")]
+    ("law", "words"),
+    [
+        (Dice(), "two runs"),
+        (Scribbler(), "value"),
+        (Fragile(), "missing"),
+        (Informed(), "no readings at all"),
+        (Flattering(), "innovations follow"),
+        (Misshapen(), "wrong shapes"),
+    ],
 )
 def test_bad_laws_are_found(law, words):
     report = check_law(law, build, SAMPLES)

@@ -300,7 +300,7 @@ def sensors_of_any_kind(draw):
         lp.observation.Functionals(
             {
                 "f": lambda q, u, x: c * q.gain**2 * u**power * x[0] + q.R / q.gain * x.inputs["x"],
-                "g": lp.On("right", lambda q, u, x: -q.R * lp.dot(lp.grad(u), x.normal) * x.t),
+                "g": lp.On("left", lambda q, u, x: -q.R * lp.dot(lp.grad(u), x.normal) * x.t),
             },
             inputs=("x",),
         ),
@@ -308,7 +308,7 @@ def sensors_of_any_kind(draw):
         lp.observation.Slow(lp.Points([a]), 0.1 * power),
         lp.observation.Moving({"m": "x", "n": "missing"}),
         lp.observation.Transformed(
-            lp.Points({"t": a}, {"t": lambda q, x: 0.1 * q.gain}), lambda y: np.exp(c * y / 2)
+            lp.Points({"t": a}, {"t": lambda q, x: 0.1 * q.gain}), lambda y: y + np.exp(c * y / 2)
         ),
         lp.Full(),
         lp.Subdomain(lambda x: x[0] > 0.8 * a),

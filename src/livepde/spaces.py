@@ -84,8 +84,8 @@ class HilbertSpace:
             raise SpaceError(f"Gram matrix of {self.name}: holds values that are not finite.")
         if self.gram.nnz and abs(self.gram - self.gram.T).max() > 1e-10 * scale:
             raise SpaceError(
-                f"Gram matrix of {self.name} is not symmetric: write the inner product as a form "
-                "that does not change when its two arguments are exchanged."
+                f"Gram matrix of {self.name} is not symmetric: write the inner product (of X, the "
+                "form M) as a form that does not change when its two arguments are exchanged."
             )
 
     @property
@@ -148,7 +148,7 @@ class HilbertSpace:
         if not (solver.definite or positive_definite(self.tangent_gram)):
             raise SpaceError(
                 f"The Gram matrix of {self.name} is not positive definite: check the sign of the "
-                "terms of its inner product."
+                "terms of its inner product (of X, the form M)."
             )
         return factor
 

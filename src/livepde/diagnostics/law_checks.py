@@ -45,7 +45,8 @@ def check_observation(
 ) -> CheckReport:
     """Check the derivatives of the readings, and for linear sensors the projections R and P.
 
-    For every sensor: `jacobian` is compared with differences of `predict` in u and in q.
+    For every sensor: `jacobian` is compared with differences of `predict` in u and in q, and it
+    must not be zero in both.
 
     For linear sensors, with R = G^+ G and P = I - R: R and P are idempotent, R P = 0, P maps into
     the null space of G, G G^+ G = G, R is self-adjoint in the inner product in which G^+ is taken,
@@ -128,12 +129,14 @@ def _taylor(observed: Observed, at: float, moment: Moment, rng: np.random.Genera
     a = np.clip(latent.prior + 0.1 * spread, *latent.bounds)
     q = latent.value(a)
     seen = observed.available(moment)
-    H_u, H_q = observed.jacobian(u, q, moment)
+    H_u, in_q = observed.jacobian(u, q, moment)
+    H_q = np.zeros((observed.size, len(q))) if in_q is None else in_q
     du = size * rng.standard_normal(n)
     along = latent.deviations * rng.standard_normal(latent.dim)
     dq = latent.tangent(a, along[:, None])[:, 0]
-    nothing = np.zeros(observed.size)
     z = observed.predict(u, q, moment)[seen]
+    reacts = np.asarray(abs(H_u).sum(axis=1)).ravel() + abs(H_q).sum(axis=1) > 0.0
+    blind = np.logical_and(seen, ~reacts)
     text = (
         "derivative= must be that of function=; without it, function must be analytic, and "
         "defined near the state at= of the check."
@@ -156,8 +159,16 @@ def _taylor(observed: Observed, at: float, moment: Moment, rng: np.random.Genera
             0.0,
             "give inputs= at which at least one sensor has a reading (a position in the mesh).",
         ),
+        Check.at_most(
+            "sensors that depend on nothing",
+            float(blind.sum()),
+            0.0,
+            f"{[name for name, one in zip(observed.names, blind, strict=True) if one]} depend "
+            "neither on the state nor on the unknowns: check their rows of the matrix, or give at= "
+            "a state to which they react.",
+        ),
         line("G'(u) by differences", (du, 0.0 * dq), H_u @ du),
-        line("G'(q) by differences", (0.0 * du, dq), nothing if H_q is None else H_q @ dq),
+        line("G'(q) by differences", (0.0 * du, dq), H_q @ dq),
     ]
 
 
@@ -209,7 +220,9 @@ def check_law(
 
     The law must be deterministic; its state must be a value of arrays and numbers that no step
     changes in place; a run continued from a saved state must give bit-identical numbers; estimates
-    must be finite and within their bounds; missing samples must not be errors; a failed step must
+    must be finite and within their bounds; factors of the covariance must have matching shapes;
+    innovations must change with the readings, and constant unknowns must not change without them
+    (so a `GradientLaw` with sigma fails); missing samples must not be errors; a failed step must
     keep the state and leave the stream usable. Print the report, or call `raise_if_failed`, which
     raises `LawError`.
 
@@ -247,6 +260,7 @@ def check_law(
         return [_step(identifier, item) for item in items]
 
     middle, names = len(items) // 2, build(law).observed.names
+    two, every = (middle, middle + 1), range(len(items))
     lines = [
         _count(
             "two runs agree (numbers that differ)",
@@ -277,13 +291,31 @@ def check_law(
             "clip q to problem.model.latent.bounds.",
         ),
         _count(
+            "factors of the covariance (wrong shapes)",
+            lambda: sum(map(_misshapen, run(items))),
+            "q_factor and u_factor of the belief must have shapes (m, k) and (n, k): "
+            "q_factor @ q_factor.T is the covariance of q.",
+        ),
+        _count(
+            "innovations follow the readings (sensors that do not)",
+            lambda: _unmoved(run, items, middle, names),
+            "`predicted` of the report must be what the model predicts, not the readings.",
+        ),
+        _count(
+            "no readings at all (constant unknowns that change)",
+            lambda: _changed(build(law), run(_without(items, every, names, names))),
+            "without readings, a law must keep the constant unknowns: it may learn from "
+            "interval.z1 where interval.present is True, and from nothing else, such as a known "
+            "truth or a missing reading set to zero.",
+        ),
+        _count(
             "all sensors missing (failures)",
-            lambda: sum(map(_unusable, run(_without(items, middle, names, names)))),
+            lambda: sum(map(_unusable, run(_without(items, two, names, names)))),
             "with no sensor present a step must predict and not update.",
         ),
         _count(
             "one sensor missing (failures)",
-            lambda: sum(map(_unusable, run(_without(items, middle, names, names[:1])))),
+            lambda: sum(map(_unusable, run(_without(items, two, names, names[:1])))),
             "use the sensors of interval.present alone: z is NaN elsewhere.",
         ),
         _count(
@@ -344,19 +376,58 @@ def _restarted(
     return [_step(second, item) for item in items[middle:]]
 
 
+def _misshapen(estimate: Estimate) -> int:
+    belief = estimate.belief
+    pairs = ((belief.q_factor, belief.q), (belief.u_factor, belief.u))
+    shapes = [(factor.shape, len(x)) for factor, x in pairs if factor is not None]
+    return sum(len(s) != 2 or s[0] != size or s[1] != shapes[0][0][-1] for s, size in shapes)
+
+
+def _unmoved(
+    run: Callable[[list[Sample]], list[Estimate]],
+    items: list[Sample],
+    at: int,
+    names: tuple[str, ...],
+) -> int:
+    """Count sensors whose innovation is the same after their reading has changed."""
+    shifted = _with(items, (at,), names, names, lambda z: z + 1.0 + np.abs(z))
+    before, after = (run(some[: at + 1])[at].innovation for some in (items, shifted))
+    return int((before == after).sum())
+
+
+def _changed(identifier: Identifier, estimates: list[Estimate]) -> int:
+    """Count the coefficients of constant unknowns that differ between estimates."""
+    space = identifier.model.parameter_space
+    q = np.array([estimate.q for estimate in estimates])
+    moved = np.ptp(q, axis=0) > 1e-9 * (1e-300 + np.abs(q).max(axis=0))
+    constant = (n for n, unknown in space.unknowns.items() if not unknown.evolution.moves)
+    return sum(int(moved[space.part(name)].sum()) for name in constant)
+
+
 def _without(
-    items: list[Sample], at: int, names: tuple[str, ...], gone: tuple[str, ...]
+    items: list[Sample], rows: Iterable[int], names: tuple[str, ...], gone: tuple[str, ...]
 ) -> list[Sample]:
-    """Return the samples without the readings of sensors `gone` in samples `at` and `at` + 1."""
+    """Return the samples without the readings of the first sensors, `gone`, in given samples."""
+    return _with(items, rows, names, gone, lambda z: z * np.nan)
+
+
+def _with(
+    items: list[Sample],
+    rows: Iterable[int],
+    names: tuple[str, ...],
+    some: tuple[str, ...],
+    change: Callable[[Any], Any],
+) -> list[Sample]:
+    """Return the samples with changed readings of the first sensors, `some`, in given samples."""
     changed = list(items)
-    for k in (at, at + 1):
+    for k in rows:
         z = items[k].z
         if isinstance(z, Mapping):
-            lost: Any = {**z, **{name: np.nan for name in gone if name in z}}
+            new: Any = {**z, **{name: change(np.asarray(z[name])) for name in some if name in z}}
         else:
-            lost = np.array(z, dtype=float).reshape(len(names))
-            lost[: len(gone)] = np.nan
-        changed[k] = replace(items[k], z=lost)
+            new = np.array(z, dtype=float).reshape(len(names))
+            new[: len(some)] = change(new[: len(some)])
+        changed[k] = replace(items[k], z=new)
     return changed
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from skfem import Mesh, MeshLine
 from skfem.element import Element
 
-from livepde.errors import SpaceError
+from livepde.errors import ModelError, SpaceError
 from livepde.fem.measure import Measure, unweighted
 from livepde.fem.priors import CONSTANT, Evolution, Normal, Prior, RandomWalk
 from livepde.fem.sobolev import Sobolev
@@ -30,6 +30,8 @@ from livepde.showing import expression
 # Gaussian value exceeds it is 2e-23.
 WITHIN = 10.0
 STANDARD = Normal()
+# Complex step: its square is below the rounding error of any value, and no digits are cancelled.
+STEP = 1e-30
 RADIAL = 2  # degree of the volume element in spherical coordinates, x[0]**2
 
 Integrand: TypeAlias = Callable[..., Any]
@@ -40,6 +42,24 @@ Source: TypeAlias = float | Callable[[Any, float], Any] | Mapping[str, Any]
 
 Predicate: TypeAlias = Callable[[Array], Any]
 """A subset of the domain: x of shape (d, ...) -> booleans of shape (...)."""
+
+
+def stepped_by(value: Callable[[], Any], name: str) -> Array:
+    """Return the derivative from the value of a function at arguments with a complex step.
+
+    Raises
+    ------
+    ModelError
+        The function does not accept complex numbers.
+    """
+    try:
+        return np.asarray(np.imag(np.asarray(value()))) / STEP
+    except TypeError as error:
+        raise ModelError(
+            f"{name} has no derivative by a complex step: {error}. Use functions that accept "
+            "complex arrays, which np.interp and math.exp do not, or give the derivative (dA=, dB= "
+            "of a model, derivative= of sensors)."
+        ) from error
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -30,15 +30,13 @@ import scipy.sparse as sp
 
 from livepde.errors import LivepdeError, ModelError
 from livepde.fem.elementwise import ElementTensor, Scatter, TensorTerm, scatter
-from livepde.fem.fields import Integrand, On, ignores, placed
+from livepde.fem.fields import STEP, Integrand, On, ignores, placed, stepped_by
 from livepde.fem.measure import START, Inputs, Measure, Moment, Place
 from livepde.fem.space import FunctionSpace, LocalSpace, volume_element
 from livepde.linalg import Array, IntArray, Pattern
 
 Tensor: TypeAlias = sp.csr_array | ElementTensor
 
-# Complex step: its square is below the rounding error of any value, and no digits are cancelled.
-STEP = 1e-30
 # Magnitude below which a value is not the scale of a difference, relative to the largest value or
 # the prior standard deviation of its component.
 SMALL = 1e-3
@@ -241,7 +239,7 @@ class Form(FormMatrices):
         except Exception as error:
             raise ModelError(
                 f"Form {self.name}({', '.join(self.spaces)}, x) failed at its first "
-                f"evaluation: {type(error).__name__}: {error}"
+                f"evaluation, for arrays (elements, points): {type(error).__name__}: {error}"
             ) from error
         if shape != term.measure.shape:
             raise ModelError(
@@ -544,8 +542,12 @@ class Form(FormMatrices):
                 jets.append(local.jets(value))
                 if derivative is not None and key == self.nonlinear:
                     jets.append(local.unit_jets(axes[0], 2))
-            density = (term.integrand if derivative is None else derivative)(*jets, place)
-            return np.asarray(density) if stepped is None else np.imag(density) / STEP
+            density = partial(term.integrand if derivative is None else derivative, *jets, place)
+            return (
+                np.asarray(density())
+                if stepped is None
+                else stepped_by(density, f"Form {self.name}")
+            )
 
         if shifted is None:
             return evaluate(0.0)

@@ -15,8 +15,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import SpaceError
-from livepde.fem.fields import Declaration, Integrand, On, Scalars, declared, placed
-from livepde.fem.forms import STEP, Form, FormMatrices
+from livepde.fem.fields import STEP, Declaration, Integrand, On, Scalars, declared, placed
+from livepde.fem.forms import Form, FormMatrices
 from livepde.fem.measure import START, Moment
 from livepde.fem.priors import Evolution, Identity, Normal, Transform
 from livepde.fem.space import FunctionSpace, Named

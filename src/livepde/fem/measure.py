@@ -67,9 +67,10 @@ class Place:
     """The argument `x` of a weak form.
 
     `x[0], x[1], ...` are coordinates of the quadrature points, `x.t` is the time, and
-    `x.inputs["Q"]` the value of an input channel. `x.normal` is the outward normal (on boundaries),
-    and `x.h` the diameter of the cell (on boundaries, the adjacent cell), shape (elements, 1). The
-    use of time and inputs is recorded: a form that uses neither is assembled once.
+    `x.inputs["Q"]` the value of an input channel. `x.normal` is the outward normal on boundaries,
+    and on oriented facets inside the mesh. `x.h` is the diameter of the cell (on boundaries, the
+    adjacent cell), shape (elements, 1). The use of time and inputs is recorded: a form that uses
+    neither is assembled once.
     """
 
     def __init__(
@@ -112,7 +113,11 @@ class Place:
     def normal(self) -> Array:
         """Outward normal on a boundary, shape (d, facets, points)."""
         if self._normal is None:
-            raise AttributeError("x.normal exists on boundaries only: wrap the form in lp.On(...).")
+            raise AttributeError(
+                "x.normal exists on boundaries only: wrap the form in lp.On(...). On a line inside "
+                "the mesh it has no side: write the direction, such as lp.grad(u)[0], or name "
+                "oriented facets, mesh.with_boundaries({NAME: mesh.facets_around(SUBDOMAIN)})."
+            )
         return self._normal
 
 
@@ -324,8 +329,11 @@ class Measure:
     def _sides(self) -> _Sides:
         """Geometric data of the facets of a boundary."""
         basis = self.facets(own(self.mesh.elem()), self.mesh.dofs)
-        x, normals = basis.global_coordinates(), basis.normals
-        return _Sides(basis.tind, np.asarray(x), np.asarray(basis.dx), np.asarray(normals))
+        x, normals, where = basis.global_coordinates(), np.asarray(basis.normals), self._where
+        # Inside the mesh, the sides of facets without orientation change along a line.
+        inside = (self.mesh.f2t[1, np.asarray(where)] >= 0).any()
+        sided = isinstance(where, OrientedBoundary) or not inside
+        return _Sides(basis.tind, np.asarray(x), np.asarray(basis.dx), normals if sided else None)
 
     @property
     def cells(self) -> IntArray | None:
@@ -349,7 +357,7 @@ class Measure:
 
     @property
     def normal(self) -> Array | None:
-        """Outward normals on a boundary."""
+        """Outward normals on a boundary; None inside the mesh, unless facets are oriented."""
         return self._sides.normals if self.on_boundary else None
 
     @cached_property
@@ -457,7 +465,7 @@ class _Sides(NamedTuple):
     cells: IntArray
     points: Array
     weights: Array
-    normals: Array
+    normals: Array | None
 
 
 def _chosen(members: IntArray, at: Any) -> IntArray:

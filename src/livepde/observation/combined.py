@@ -21,15 +21,16 @@ from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ObservationError
 from livepde.fem import FunctionSpace, Moment, Place, SensorState, Unknown, numbers
+from livepde.fem.fields import STEP, stepped_by
 from livepde.linalg import Array, Mask
-from livepde.observation.operator import STEP, Direct, Observation, Observed
+from livepde.observation.operator import Direct, Observation, Observed
 from livepde.spaces import HilbertSpace
 
 
@@ -427,7 +428,8 @@ class Transformed(Observation):
         if self.derivative is not None:
             slope = np.asarray(self.derivative(y), dtype=float)
         else:
-            slope = np.imag(np.asarray(self.function(cast(Array, y + 1j * STEP)))) / STEP
+            stepped: Any = y + 1j * STEP
+            slope = stepped_by(lambda: self.function(stepped), "Transformed: function")
         return np.broadcast_to(slope, y.shape)
 
 

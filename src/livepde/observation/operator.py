@@ -26,8 +26,6 @@ from livepde.linalg import Array, IntArray, Mask, Memo
 from livepde.spaces import HilbertSpace
 
 Direct = Callable[[Any, Place], Any]
-# Complex step: exact to rounding, as in `livepde.fem.forms`.
-STEP = 1e-30
 # Eigenvalues of G G* below this share of the largest count as zero: redundant sensors.
 DEPENDENT = 1e-12
 # Entries of G below this share of the largest in their row are rounding errors of shape functions.

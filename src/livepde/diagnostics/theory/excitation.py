@@ -259,8 +259,9 @@ def link(
     C >= sup x/theta for a = 1. For lambda x = ||p||_V^ (with noise + ||d||_V~), which needs the
     truth; for kappa x = mu.
 
-    Values along the run have the shape (samples,); theta = mu ||r||_VX~^2/||r||_V~ as in the paper.
-    The window is gamma_0; times before `start`, T_lambda or T_kappa, are ignored.
+    Values along the run have the shape (samples,); theta = mu ||r||_VX~^2/||r||_V~ as in the paper,
+    the theta of a damping rule times ||r||_VX~^2. The window is gamma_0; times before `start`,
+    T_lambda or T_kappa, are ignored.
 
     Examples
     --------
