@@ -276,6 +276,11 @@ def test_bad_laws_are_found(law, words):
         report.raise_if_failed()
 
 
+def test_samples_may_have_their_own_noise():
+    noisy = [(t, np.column_stack([z, [0.1, 0.2]])) for t, z in SAMPLES]
+    check_law(lp.SensitivityLaw(), build, noisy).raise_if_failed()
+
+
 def test_a_law_needs_some_samples():
     with pytest.raises(lp.errors.LawError, match="four samples"):
         check_law(OpenLoop(), build, SAMPLES[:2])

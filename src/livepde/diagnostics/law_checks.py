@@ -425,8 +425,9 @@ def _with(
         if isinstance(z, Mapping):
             new: Any = {**z, **{name: change(np.asarray(z[name])) for name in some if name in z}}
         else:
-            new = np.array(z, dtype=float).reshape(len(names))
-            new[: len(some)] = change(new[: len(some)])
+            new = np.atleast_1d(np.array(z, dtype=float))
+            values = new.reshape(len(names), -1)[: len(some), 0]  # a second column is the noise
+            values[:] = change(values)
         changed[k] = replace(items[k], z=new)
     return changed
 
