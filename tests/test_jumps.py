@@ -95,6 +95,22 @@ def test_samples_without_a_measurement_are_taken_again_with_those_since_the_jump
     assert alarms[0] - found[alarms[0]].diagnostics.jump_samples + 1 == 200
 
 
+@pytest.mark.parametrize("seed", [1, 2, 4])
+def test_a_jump_while_nothing_is_read_has_no_known_time(seed: int):
+    """Any time between readings is as likely: one of them would be a wrong state afterwards."""
+    nothing = np.full(len(POINTS), np.nan)
+    stream = samples(lambda t: 0.3 if t < 10.3 else 0.45, 260, seed)
+    stream = [(t, nothing if 200 < k < 212 else z) for k, (t, z) in enumerate(stream)]
+    law = filter_alone(jumps=Jumps(settle=20))
+    result = lp.Identifier(rod(), lp.Points(POINTS, noise=NOISE), law, u0=0.0).run(stream)
+    value, std = result.last.parameters["a"]
+    assert abs(value - 0.45) < 2.0 * std < 0.01
+    smoothed = result.smoothed()
+    assert smoothed["a"].values[-1] == pytest.approx(value, abs=0.1 * std)
+    assert smoothed["a_std"].values[-1] == pytest.approx(std, rel=0.02)
+    assert smoothed["a"].values[206] == pytest.approx(0.375, abs=0.05)  # halfway through the gap
+
+
 def test_values_that_the_gate_refuses_at_first_do_not_hide_a_later_jump():
     """They would make a usual size beside which any jump is small."""
     stream = samples(lambda t: 0.3 if t < 7.5 else 0.15, 180, 0)

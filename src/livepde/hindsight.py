@@ -10,6 +10,7 @@ import numpy as np
 
 from livepde.estimate import Estimate
 from livepde.laws import Belief, FixedInterval, Problem, Status
+from livepde.laws.history import unseen
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.records import INTERVAL_ENDS, SMOOTHED, Record, bare, interval_95
@@ -30,7 +31,7 @@ class Hindsight:
         self._q = [q0]
         self._opening: Interval | None = None
         self._intervals: list[Interval] = []
-        self._jumps: set[int] = set()
+        self._jumps: dict[int, int] = {}
         self._estimates: list[tuple[int, float, Status]] = []  # number of intervals, time, status
 
     def add(self, estimate: Estimate, interval: Interval, q: Array) -> None:
@@ -53,7 +54,8 @@ class Hindsight:
         # NaN if there is no alarm, so that the comparison is false.
         onset = estimate.diagnostics.jump_samples
         if onset > 0:
-            self._jumps.add(len(self._intervals) - int(onset))
+            when = unseen(self._intervals, len(self._intervals) - int(onset))
+            self._jumps |= dict.fromkeys(when, len(when))
         self._estimates.append((len(self._intervals), estimate.t, estimate.status))
 
     def fixed_interval(self, fields_every: int) -> FixedInterval | None:

@@ -161,3 +161,15 @@ def reaching(shown: Sequence[bool] | Mask, readings: int) -> int:
     """Return the number of last samples among which `readings` have a reading, or of all."""
     places = np.flatnonzero(shown)
     return len(shown) - int(places[max(len(places) - readings, 0)])
+
+
+def unseen(intervals: Sequence[Interval], number: int) -> range:
+    """Return the intervals up to the next readings in which a change may have begun.
+
+    Without readings, a change in interval `number` cannot be told from one in its neighbours.
+    """
+    shown = [bool(interval.present.any()) for interval in intervals]
+    first = number
+    while first and not shown[first - 1]:
+        first -= 1
+    return range(first, shown.index(True, number) + 1)

@@ -355,7 +355,8 @@ class FixedInterval:
     q
         Latent parameters estimated at the initial time and after each interval.
     jumps
-        Indices of the intervals in which unknowns may have jumped.
+        Indices of the intervals in which unknowns may have jumped, and the number of intervals in
+        which each of these jumps may have been.
     fields
         Times at which the state is requested: 0 is the initial time, k the end of interval k.
     """
@@ -363,7 +364,7 @@ class FixedInterval:
     opening: Interval
     intervals: Sequence[Interval]
     q: Sequence[Array]
-    jumps: Collection[int]
+    jumps: Mapping[int, int]
     fields: Collection[int]
 
 

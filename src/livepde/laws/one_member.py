@@ -13,7 +13,7 @@ import numpy as np
 
 from livepde.laws.assimilation import UpdateOptions, assimilate
 from livepde.laws.filter_state import FilterState, unaccompanied
-from livepde.laws.history import intervals_since, reaching
+from livepde.laws.history import intervals_since, reaching, unseen
 from livepde.laws.iterated_smoother import (
     AGREED,
     Window,
@@ -224,7 +224,7 @@ def _most_likely_onset(
     """
     guess = guesses[0]
     near = {*guesses, *(guess + shift for shift in NEAR_ONSETS)}
-    tried = sorted(near & set(range(len(known))))
+    tried = {unseen(known, number).start for number in near & set(range(len(known)))}
     # Refusals before the first trial onset stay; after it, each trial must explain all readings.
     open_gate = UpdateOptions(adaptive=work.options.adaptive)
     searching = replace(work.unaccompanied, options=open_gate)
@@ -233,7 +233,7 @@ def _most_likely_onset(
         if number in tried:
             likelihood = _likelihood(searching, jumps, x, known[number:])
             score, best = max((score, best), (likelihood, number))
-        x, report = filtered(searching if number >= tried[0] else work.unaccompanied, x, interval)
+        x, report = filtered(searching if number >= min(tried) else work.unaccompanied, x, interval)
         x = work.filter.relinearised(x)
         if not report.status.ok:
             break
@@ -244,16 +244,22 @@ def _likelihood(
     work: SensitivityWork, jumps: Jumps, x: FilterState, intervals: Sequence[Interval]
 ) -> float:
     """Return the log-likelihood of all samples if the unknowns jump before `intervals`."""
-    x, status = _filtered_all(work, work.filter.inflated(x, jumps.size, work.jumping), intervals)
+    when = unseen(intervals, 0)
+    x, status = _filtered_all(work, x, intervals, when, jumps.part(len(when)))
     return float(x.evidence[0]) if status.ok else -np.inf
 
 
 def _filtered_all(
-    work: SensitivityWork, x: FilterState, intervals: Sequence[Interval]
+    work: SensitivityWork, x: FilterState, intervals: Sequence[Interval], when: range, size: float
 ) -> tuple[FilterState, Status]:
-    """Return the filter after samples, up to the first failure, and the last status."""
+    """Return the filter after samples, up to the first failure, and the last status.
+
+    The unknowns jump by `size` at the start of each interval in `when`.
+    """
     status = Status()
-    for interval in intervals:
+    for number, interval in enumerate(intervals):
+        if number in when:
+            x = work.filter.inflated(x, size, work.jumping)
         x, report = filtered(work, x, interval)
         x, status = work.filter.relinearised(x), report.status
         if not status.ok:
@@ -301,16 +307,18 @@ def _with_jump_test(
     onsets = [max(onset, doubted) for onset in jumps.onsets(state.watch, moving)]
     guesses = [len(known) - reaching(shown, onset) for onset in onsets]
     before = _most_likely_onset(work, jumps, state.older, known, guesses)
+    when = unseen(known, before)
+    size, last = jumps.part(len(when)), when[-1]
     x = changed(work.filter.relinearised(state.older), kept=new.now.kept)
-    x, status = _filtered_all(work, x, known[:before])
-    start = work.filter.inflated(x, jumps.size, work.jumping)
+    x, status = _filtered_all(work, x, known[:last], when, size)
+    start = work.filter.inflated(x, size, work.jumping)
     # Rows without a time are samples that this member did not assimilate.
     taken = np.flatnonzero(np.isfinite(state.log[0, row:, 0]))
-    restart, outcome = _reassimilated(work, new, start, row + int(taken[before]), known[before:])
+    restart, outcome = _reassimilated(work, new, start, row + int(taken[last]), known[last:])
     if status.ok and outcome.status.ok:
         new = restart
     else:
         now = work.filter.relinearised(new.now)
         new = new_window(work, work.filter.inflated(now, jumps.size, work.jumping), new)
-    since = float(len(known) - before)
+    since = float(len(known) - when.start)
     return new, report.updated(Diagnostics(jump=1.0, jump_samples=since))

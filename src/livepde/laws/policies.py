@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -205,7 +206,8 @@ class Jumps:
     their expected standard deviation and by their usual size and correlation. After an alarm the
     law returns to the most likely time of the change. It adds `size` prior standard deviations to
     the uncertainty of the unknowns that may jump, and assimilates the samples since. The state and
-    the other unknowns keep their estimates from before the jump.
+    the other unknowns keep their estimates from before the jump. If the samples before it have no
+    readings, the change is equally likely in each of their intervals.
 
     The usual size and correlation are averages over about 500 samples, including the first `settle`
     samples but not the samples of rest after an alarm. After the first `settle` samples,
@@ -262,6 +264,13 @@ class Jumps:
     def _lengths(self) -> IntArray:
         """Numbers of samples in the tests, minus 1."""
         return 2 ** np.arange(int(np.log2(self.window)) + 1) - 1
+
+    def part(self, count: int) -> float:
+        """Return the size of the part of a jump in each of `count` intervals.
+
+        A jump in one of them, equally likely in each, has uncorrelated parts of equal variance.
+        """
+        return self.size / math.sqrt(count)
 
     def start(self, sensors: int, members: int = 1) -> Watch:
         zero, none = np.zeros((members, self.window)), np.zeros(members, dtype=np.int64)

@@ -298,7 +298,8 @@ class _FixedInterval:
         if jumps is not None and number in self.data.jumps:
             # The jump is at the start of the interval, and is propagated to its end.
             F = filter_.reduction.transition(h)
-            gained = gained + jumps.size**2 * (F**2 @ self.work.jumping)
+            size = jumps.part(self.data.jumps[number])
+            gained = gained + size**2 * (F**2 @ self.work.jumping)
         return np.asarray(gained)
 
     def _predicted(self, x: FilterState, number: int) -> tuple[FilterState, Array | None]:
@@ -306,7 +307,8 @@ class _FixedInterval:
         filter_, jumps, rows = self.work.filter, self.work.jumps, x.C.shape[1]
         x = changed(x, past=np.eye(rows)[None], dpast=np.zeros((1, rows)))
         if jumps is not None and number in self.data.jumps:
-            x = filter_.inflated(x, jumps.size, self.work.jumping)
+            size = jumps.part(self.data.jumps[number])
+            x = filter_.inflated(x, size, self.work.jumping)
         span = filter_.span(self.data.intervals[number])
         x, _, failure = filter_.predict(x, span)
         return x, x.past[0] if failure is None else None
