@@ -111,6 +111,28 @@ def test_a_jump_while_nothing_is_read_has_no_known_time(seed: int):
     assert smoothed["a"].values[206] == pytest.approx(0.375, abs=0.05)  # halfway through the gap
 
 
+@pytest.mark.parametrize("seed", [0, 3, 7])
+def test_a_jump_between_two_samples_is_one_jump(seed: int):
+    """A state that jumped half an interval early or late looks like another jump later."""
+    mesh, unknowns = line(2), {"s": lp.Normal(0.0, 1.0)}
+    model = lp.Model(
+        lp.Field(mesh, lp.linear(mesh)),
+        unknowns,
+        A=lambda q, _, v, x: -q.s * v,
+        B=lambda u, v, x: 0.1 * lp.dot(lp.grad(u), lp.grad(v)) + 0.1 * u * v,
+    )
+    t = 0.1 * np.arange(141)
+    since = np.maximum(t - 8.05, 0.0)
+    exact = 5.0 * (1.0 - np.exp(-0.1 * t)) + 20.0 * (1.0 - np.exp(-0.1 * since))
+    z = exact[:, None] + 0.02 * np.random.default_rng(seed).standard_normal((141, 2))
+    law = filter_alone(jumps=Jumps(settle=20))
+    identifier = lp.Identifier(model, lp.Points([0.2, 0.8], noise=0.02), law, u0=0.0)
+    found = [identifier.step(*sample) for sample in zip(t, z, strict=True)]
+    assert sum(one.diagnostics.jump > 0.0 for one in found) == 1
+    value, std = found[-1].parameters["s"]
+    assert abs(value - 2.5) < 2.5 * std < 0.01
+
+
 def test_values_that_the_gate_refuses_at_first_do_not_hide_a_later_jump():
     """They would make a usual size beside which any jump is small."""
     stream = samples(lambda t: 0.3 if t < 7.5 else 0.15, 180, 0)

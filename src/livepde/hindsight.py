@@ -10,7 +10,7 @@ import numpy as np
 
 from livepde.estimate import Estimate
 from livepde.laws import Belief, FixedInterval, Problem, Status
-from livepde.laws.history import unseen
+from livepde.laws.history import changing
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.records import INTERVAL_ENDS, SMOOTHED, Record, bare, interval_95
@@ -54,7 +54,7 @@ class Hindsight:
         # NaN if there is no alarm, so that the comparison is false.
         onset = estimate.diagnostics.jump_samples
         if onset > 0:
-            when = unseen(self._intervals, len(self._intervals) - int(onset))
+            when = changing(self._intervals, len(self._intervals) - int(onset))
             self._jumps |= dict.fromkeys(when, len(when))
         self._estimates.append((len(self._intervals), estimate.t, estimate.status))
 

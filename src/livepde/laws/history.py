@@ -163,13 +163,14 @@ def reaching(shown: Sequence[bool] | Mask, readings: int) -> int:
     return len(shown) - int(places[max(len(places) - readings, 0)])
 
 
-def unseen(intervals: Sequence[Interval], number: int) -> range:
-    """Return the intervals up to the next readings in which a change may have begun.
+def changing(intervals: Sequence[Interval], number: int) -> range:
+    """Return the intervals at whose starts a change in interval `number` may act.
 
-    Without readings, a change in interval `number` cannot be told from one in its neighbours.
+    A change within an interval acts in part at its start and in part at its end. Without readings
+    at its ends, it cannot be told from a change in a neighbour.
     """
     shown = [bool(interval.present.any()) for interval in intervals]
     first = number
     while first and not shown[first - 1]:
         first -= 1
-    return range(first, shown.index(True, number) + 1)
+    return range(first, shown.index(True, number) + 2)

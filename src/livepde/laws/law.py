@@ -355,8 +355,8 @@ class FixedInterval:
     q
         Latent parameters estimated at the initial time and after each interval.
     jumps
-        Indices of the intervals in which unknowns may have jumped, and the number of intervals in
-        which each of these jumps may have been.
+        Indices of the intervals at whose starts unknowns may have jumped, and the number of parts
+        of each of these jumps.
     fields
         Times at which the state is requested: 0 is the initial time, k the end of interval k.
     """

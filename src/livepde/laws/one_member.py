@@ -13,7 +13,7 @@ import numpy as np
 
 from livepde.laws.assimilation import UpdateOptions, assimilate
 from livepde.laws.filter_state import FilterState, unaccompanied
-from livepde.laws.history import intervals_since, reaching, unseen
+from livepde.laws.history import changing, intervals_since, reaching
 from livepde.laws.iterated_smoother import (
     AGREED,
     Window,
@@ -224,7 +224,7 @@ def _most_likely_onset(
     """
     guess = guesses[0]
     near = {*guesses, *(guess + shift for shift in NEAR_ONSETS)}
-    tried = {unseen(known, number).start for number in near & set(range(len(known)))}
+    tried = {changing(known, number).start for number in near & set(range(len(known)))}
     # Refusals before the first trial onset stay; after it, each trial must explain all readings.
     open_gate = UpdateOptions(adaptive=work.options.adaptive)
     searching = replace(work.unaccompanied, options=open_gate)
@@ -244,7 +244,7 @@ def _likelihood(
     work: SensitivityWork, jumps: Jumps, x: FilterState, intervals: Sequence[Interval]
 ) -> float:
     """Return the log-likelihood of all samples if the unknowns jump before `intervals`."""
-    when = unseen(intervals, 0)
+    when = changing(intervals, 0)
     x, status = _filtered_all(work, x, intervals, when, jumps.part(len(when)))
     return float(x.evidence[0]) if status.ok else -np.inf
 
@@ -307,15 +307,19 @@ def _with_jump_test(
     onsets = [max(onset, doubted) for onset in jumps.onsets(state.watch, moving)]
     guesses = [len(known) - reaching(shown, onset) for onset in onsets]
     before = _most_likely_onset(work, jumps, state.older, known, guesses)
-    when = unseen(known, before)
+    when = changing(known, before)
     size, last = jumps.part(len(when)), when[-1]
     x = changed(work.filter.relinearised(state.older), kept=new.now.kept)
     x, status = _filtered_all(work, x, known[:last], when, size)
     start = work.filter.inflated(x, size, work.jumping)
-    # Rows without a time are samples that this member did not assimilate.
-    taken = np.flatnonzero(np.isfinite(state.log[0, row:, 0]))
-    restart, outcome = _reassimilated(work, new, start, row + int(taken[last]), known[last:])
-    if status.ok and outcome.status.ok:
+    if last < len(known):
+        # Rows without a time are samples that this member did not assimilate.
+        taken = np.flatnonzero(np.isfinite(state.log[0, row:, 0]))
+        restart, outcome = _reassimilated(work, new, start, row + int(taken[last]), known[last:])
+        status = outcome.status if status.ok else status
+    else:
+        restart = restarted(work, start, new)
+    if status.ok:
         new = restart
     else:
         now = work.filter.relinearised(new.now)

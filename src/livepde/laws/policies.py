@@ -207,7 +207,8 @@ class Jumps:
     law returns to the most likely time of the change. It adds `size` prior standard deviations to
     the uncertainty of the unknowns that may jump, and assimilates the samples since. The state and
     the other unknowns keep their estimates from before the jump. If the samples before it have no
-    readings, the change is equally likely in each of their intervals.
+    readings, the change is equally likely in each of their intervals. A change between two samples
+    acts in part at the first and in part at the second.
 
     The usual size and correlation are averages over about 500 samples, including the first `settle`
     samples but not the samples of rest after an alarm. After the first `settle` samples,
@@ -266,10 +267,7 @@ class Jumps:
         return 2 ** np.arange(int(np.log2(self.window)) + 1) - 1
 
     def part(self, count: int) -> float:
-        """Return the size of the part of a jump in each of `count` intervals.
-
-        A jump in one of them, equally likely in each, has uncorrelated parts of equal variance.
-        """
+        """Return the size of one of `count` parts of a jump, uncorrelated and of equal variance."""
         return self.size / math.sqrt(count)
 
     def start(self, sensors: int, members: int = 1) -> Watch:
