@@ -126,6 +126,18 @@ def test_the_clock_of_one_of_several_files_is_corrected_before_they_are_joined(t
         np.testing.assert_allclose(found.values[:, columns], plain.values)
 
 
+def test_the_start_of_late_channels_is_that_of_their_table(tmp_path):
+    change = without("T_10", slice(3))
+    late = {
+        f"channels.{name}.late": "90 s" for name in ("T_left", "T_10", "T_20", "T_30", "T_right")
+    }
+    plain = changed(tmp_path / "plain", change).stream
+    found = changed(tmp_path / "late", change, **late).stream
+    np.testing.assert_allclose(found.t + 90.0, plain.t)
+    columns = [found.names.index(name) for name in plain.names]
+    np.testing.assert_array_equal(found.values[:, columns], plain.values)
+
+
 @pytest.mark.parametrize("dated", [False, True])
 def test_what_is_late_is_read_until_the_stop(tmp_path, dated):
     def change(table: pd.DataFrame) -> None:

@@ -123,8 +123,8 @@ def not_late(
 ) -> list[DataTable]:
     """Split a table so that the times of late channels can be corrected.
 
-    A channel without values is not corrected. If a correction makes a sensor begin after the other
-    channels, it has a missing value at their start; an input must be known from the start.
+    A channel without values is not corrected. If the first reading of a late sensor is after the
+    start of the channels, it has a missing value at their start; an input must be known there.
 
     `late`: channel -> delay of its times relative to its values, in the unit of the times.
     `sensors`: channels that may be missing.
@@ -134,12 +134,13 @@ def not_late(
     rest = [name not in late for name in table.names]
     names = tuple(compress(table.names, rest))
     found = [replace(table, values=table.values[:, rest], names=names)] if names else []
+    start = table.t[0] - (0.0 if names else min(late.values()))
     for name, by in late.items():
         values = table.values[:, table.names.index(name)]
         known = np.isfinite(values)
         t, own = table.t[known] - by, values[known, None]
-        if names and name in sensors and t[0] > table.t[0]:
-            t, own = np.append(table.t[:1], t), np.vstack([np.full((1, 1), np.nan), own])
+        if name in sensors and t[0] > start:
+            t, own = np.append(start, t), np.vstack([np.full((1, 1), np.nan), own])
         found.append(replace(table, t=t, values=own, names=(name,), remarks={}))
     return found
 
