@@ -297,10 +297,10 @@ def test_an_estimated_sensor_error_is_not_a_model_error():
     samples, one = best_fit(process, sensors, truth(1)[:40])
     used = np.isfinite(one.residuals)
     T = samples.filter.reduction.Phi @ samples.start.C[0].T
-    model, causes, _ = linear_model(samples, one, used, T)
+    model, causes, *_ = linear_model(samples, one, used, T)
     effects = [effect[effect != 0.0] for effect in model.Z[:, causes.columns].T]
     assert sum(bool(effect.size) and np.ptp(effect) < 1e-9 for effect in effects) == 2
-    found = model_errors(samples, lp.laws.Refit(), np.full(2, 0.1), np.zeros(2))
+    found, _ = model_errors(samples, lp.laws.Refit(), np.full(2, 0.1), np.zeros(2))
     assert isinstance(found, ModelErrors)
     assert {one.label: one.of_sensor for one in found.unknowns} == {"k": False, "offset": True}
 

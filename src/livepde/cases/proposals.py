@@ -37,6 +37,7 @@ NAMES = {  # kind of cause -> name of the variant
     "response": "time constant of {}",
     "averaging": "length of {}",
     "jump": "jumps of {}",
+    "layers": "layers of {}",
     "source": "source",
     "loss": "loss",
     "channel": "gain of {}",

@@ -13,14 +13,15 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 
-from livepde.fem import dot, grad, shares
+from livepde.fem import Inputs, Moment, dot, grad, shares
 from livepde.laws.filter_state import PAUSE
+from livepde.laws.layers import places_of
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array
 from livepde.model import Model
@@ -37,6 +38,7 @@ from livepde.verdict.directions import (
 
 MOST_WORK = 1e8  # maximum number of coefficients of responses in a pass
 MOST_STEPS = 500  # maximum number of Euler steps; more change intervals by less than 2 %
+MOST_BORDERS = 7  # maximum number of borders of layers
 MOST_UNKNOWNS = 4  # maximum number of unknowns that may jump or drift
 STARTS = (0.25, 0.5, 0.75)  # switching times, as fractions of the run
 PLACES = (0.2, 0.4, 0.6, 0.8)  # places of a contact resistance, as fractions of the length
@@ -50,7 +52,8 @@ ROUNDING = 1e-11  # size of an effect, relative to its terms, below which it cou
 class ErrorShape(NamedTuple):
     """Spatial shape of an error of the process; its columns differ in their course in time."""
 
-    # "source", "switched", "conductivity", "state", "layer", "contact", "flow", "steady flow",
+    # "source", "switched", "conductivity", "state", "layer", "border" (of layers, at `subject`; its
+    # column is no single cause), "contact", "flow", "steady flow",
     # "loss", "boundary", "late boundary", "channel", "flux", "transfer", "initial" or "unknown"
     kind: str
     subject: str = ""  # channel, boundary, component, axis or unknown
@@ -218,6 +221,10 @@ class ErrorColumns:
             for place in places:
                 matrix = stiffness(self._band(axis, place, max(NARROW, 1.5 * cell)))
                 yield ErrorShape("contact", "xyz"[axis], load=_minus(matrix)), ALWAYS
+        if self.conductivity:
+            for border in self.borders:
+                matrix = stiffness(partial(_sides, border))
+                yield ErrorShape("border", f"{border:.4g}", load=_minus(matrix)), ALWAYS
         modes, times = self.numbers.flow
         axes = len(self.span)
         for k in range(axes * math.ceil(modes / axes)):  # equally many along each axis
@@ -227,6 +234,31 @@ class ErrorColumns:
             if number == 0:
                 yield ErrorShape("steady flow", "xyz"[axis], load=load), ALWAYS
         yield ErrorShape("loss", load=_lost(model.mass, self._rest)), SWITCHED
+
+    @cached_property
+    def borders(self) -> list[float]:
+        """Possible borders of layers: the middles between sensors on an interval."""
+        if len(self.span) > 1:
+            return []
+        places = np.unique([*places_of(self.observed.observation)])
+        middles: list[float] = (0.5 * (places[1:] + places[:-1])).tolist()
+        return middles if len(middles) <= MOST_BORDERS else []
+
+    @cached_property
+    def conductivity(self) -> str:
+        """Label of the constant unknown that is a uniform conductivity; empty if there is none."""
+        model, reduction = self.model, self.samples.filter.reduction
+        free = model.X.free * model.state_space.of_fields
+        u = np.random.default_rng(0).standard_normal(model.X.dim)
+        moment = Moment(0.0, Inputs(dict.fromkeys(model.channels, 1.0)))
+        now = Now(u, self.samples.start.q[0], moment)
+        plain = free * (model.bilinear(lambda u, v, x: dot(grad(u), grad(v))) @ u)
+        for label, place in reduction.stay[:MOST_UNKNOWNS]:
+            own = free * _changed(model, reduction.Phi[:, place])(now)
+            rest = own - plain * (own @ plain) / (plain @ plain)
+            if own.any() and np.linalg.norm(rest) <= ALIKE * np.linalg.norm(own):
+                return label
+        return ""
 
     @cached_property
     def _rest(self) -> float:
@@ -346,6 +378,11 @@ class ErrorColumns:
                 lift = shape.lift(now) if callable(shape.lift) else shape.lift
                 lifts[own] = weights * lift
         return later(stage, p, now, h, loads, lifts)
+
+
+def _sides(border: float, x: Any) -> Array:
+    """Return a shape of two layers, -0.5 and 0.5 on the two sides of a border."""
+    return np.where(x[0] > border, 0.5, -0.5)
 
 
 def beyond_rounding(values: Array, terms: Array) -> Array:

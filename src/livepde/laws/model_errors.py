@@ -22,11 +22,13 @@ from livepde.laws.error_columns import FULL, MOST_WORK, SMALL, ErrorColumns, bey
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.law import Problem
+from livepde.laws.layers import Layers
 from livepde.laws.policies import Refit
 from livepde.laws.refit import plausible
 from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
 from livepde.model import Model
+from livepde.verdict import Cause
 from livepde.verdict.directions import (
     AVERAGED,
     LONGEST_AVERAGE,
@@ -192,8 +194,10 @@ def _families(known: Mapping[str, tuple[IntArray, Roots]]) -> Iterator[Family]:
 @nonfinite_allowed()  # a hypothesis that overflows has no evidence
 def model_errors(
     samples: StoredSamples, options: Refit, std: Array, shift: Array
-) -> ModelErrors | str:
+) -> tuple[ModelErrors, list[Cause]] | str:
     """Return misfit and intervals that allow for model errors, or the reason why there are none.
+
+    Also return layers as a cause of the misfit, if a constant conductivity is unknown.
 
     `std`, `shift`: reported standard deviations of the latent unknowns, and their shifts by the
     discretisation, (m,).
@@ -206,7 +210,7 @@ def model_errors(
         return f"fewer than {FEWEST} readings are in use"
     start, reduction = samples.start, samples.filter.reduction
     T = reduction.Phi @ start.C[0].T
-    model, causes, families = linear_model(samples, fit, used, T)
+    model, causes, families, layers = linear_model(samples, fit, used, T)
     mixture = averaged(model, causes, families).widened(shift)
     low, high = mixture.interval
     if not np.isfinite([low, high]).all():
@@ -214,7 +218,7 @@ def model_errors(
     noise = _noise_of_each(fit.residuals, used)
     narrow = np.sqrt(model.asked[1] + shift**2)
     base = start.q[0]
-    return ModelErrors(
+    errors = ModelErrors(
         misfit=_rms((fit.residuals / noise)[used]),
         of_signal=_of_signal(samples.readings, fit.residuals, used),
         sensors={
@@ -228,6 +232,8 @@ def model_errors(
             _allowed(samples.filter, samples.state.now, (base + low, base + high), narrow, std)
         ),
     )
+    unit = samples.filter.problem.model.length_unit
+    return errors, [] if layers is None else [layers.cause(model, unit)]
 
 
 @nonfinite_allowed()  # a cause that overflows has no evidence
@@ -375,8 +381,8 @@ def _root_mean_squares(every: Array) -> Array:
 
 def linear_model(
     samples: StoredSamples, one: Passed, used: Mask, T: Array
-) -> tuple[LinearModel, Causes, list[Family]]:
-    """Return a linear model of the readings in use, and the possible errors.
+) -> tuple[LinearModel, Causes, list[Family], Layers | None]:
+    """Return a linear model of the readings in use, the possible errors, and possible layers.
 
     `one`, `used`: best fit, and readings in use. `T`: linear map from the coordinates xi to the
     requested numbers, (numbers, r).
@@ -402,10 +408,13 @@ def linear_model(
 
     own = add(responses)
     family: dict[str, list[tuple[float, IntArray, int]]] = {}
+    steps: list[int] = []
     for first, (shape, course) in zip(errors.first, errors.shapes, strict=True):
         columns = own[first : first + course.size]
         if shape.kind in ("source", "conductivity", "flow"):
             family.setdefault(shape.kind, []).append((shape.mode, columns, course.size))
+        elif shape.kind == "border":
+            steps += columns.tolist()
         else:
             causes += [(column, math.inf) for column in columns.tolist()]
     for kind, members in family.items():
@@ -430,7 +439,11 @@ def linear_model(
     J, z, Z = J[known], z[known], Z[known]
     columns, most = map(np.array, zip(*causes, strict=True))
     single = Causes(columns, most, CAUSE_SIZES)
-    return LinearModel(J=J, Z=Z, z=z, T=T), single, list(_families(families))
+    layers = None
+    if steps:
+        ends = float(errors.model.mesh.p.min()), float(errors.model.mesh.p.max())
+        layers = Layers(errors.conductivity, errors.borders, ends, np.array(steps))
+    return LinearModel(J=J, Z=Z, z=z, T=T), single, list(_families(families)), layers
 
 
 def _basis_of_sensors(samples: StoredSamples, J: Array) -> Array:

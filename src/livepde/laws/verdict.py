@@ -26,6 +26,7 @@ from livepde.stepping import MOST_SUBSTEPS
 from livepde.verdict import (
     NOT_JUDGED,
     REFUSED,
+    Cause,
     Dictionary,
     Finding,
     Judge,
@@ -181,14 +182,19 @@ def with_errors(verdict: Verdict, work: SensitivityWork, state: SensitivityState
     """Return a verdict whose level follows from the misfit and its effects, if available."""
     if verdict.level == NOT_JUDGED:
         return verdict
-    errors = _errors(work, state)
-    if isinstance(errors, str):
-        return verdict.with_untested(f"intervals that allow for errors of the model: {errors}")
+    found = _errors(work, state)
+    if isinstance(found, str):
+        return verdict.with_untested(f"intervals that allow for errors of the model: {found}")
+    errors, causes = found
+    if any(finding.what == "misfit" for finding in verdict.findings):
+        verdict = verdict.with_causes(causes)
     return verdict.with_errors(errors)
 
 
-def _errors(work: SensitivityWork, state: SensitivityState) -> ModelErrors | str:
-    """Return misfit and effects for one member, or the reason why there are none."""
+def _errors(
+    work: SensitivityWork, state: SensitivityState
+) -> tuple[ModelErrors, list[Cause]] | str:
+    """Return misfit, effects and causes for one member, or the reason why there are none."""
     filter_, x = work.filter, state.now
     Phi, (_, C) = filter_.reduction.Phi, reported_factors(filter_, x)
     shift = np.zeros(len(Phi))
@@ -197,7 +203,8 @@ def _errors(work: SensitivityWork, state: SensitivityState) -> ModelErrors | str
     std = np.linalg.norm(Phi @ C[0].T, axis=1)
     # In a later window, the information of earlier samples would count as exact.
     if work.refit is None or work.unstored(state) or state.window[0]:
-        return errors_of_innovations(filter_, x, state.scale.ranges[0], std, shift)
+        errors = errors_of_innovations(filter_, x, state.scale.ranges[0], std, shift)
+        return errors if isinstance(errors, str) else (errors, [])
     return model_errors(StoredSamples.of(work, state), work.refit, std, shift)
 
 

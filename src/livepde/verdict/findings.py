@@ -73,7 +73,7 @@ class Cause:
     ----------
     kind, subject
         Kind of error ("offset", "lag", "response", "position", "averaging", "gain", "drift",
-        "jump", "boundary", "source", "loss", "flux", "transfer", "initial", "unit",
+        "jump", "layers", "boundary", "source", "loss", "flux", "transfer", "initial", "unit",
         "exchange"), and the sensor, channel, boundary or unknown that it concerns.
     text
         The cause in words, with its size.

@@ -318,6 +318,10 @@ LIKELY: dict[str, Sentence] = {
         "{name} may average over {amount}",
         "Check the length of {name}. For a mean along a line, use `along` instead of `at`.",
     ),
+    "layers": Sentence(
+        "{name} may differ between layers, with borders near {at} {unit}",
+        "To test this, estimate it by layer: add `regions = {regions}` to {table}.",
+    ),
     "jump": Sentence("{name} may have changed during the run", JUMPS),
     "boundary": Sentence(
         "{name} may be {amount} too {side}",
