@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
@@ -689,3 +690,41 @@ def test_a_power_is_not_read_as_power_per_volume(here):
     Path("t.csv").write_text(f"time_s,T_room (in),T_1cm,P\n{rows}")  # an inlet, no inches
     case.write_text(case.read_text().replace("(C)", "(in)").replace("P(W)", "P"))
     assert cases.load(case).prepare()
+
+
+UNDER = """\
+# Survey of a wall; plates by A, B
+timestamp,T_in,q,P / kW,10cm
+,degC,W/m2,,[degF]
+2024-01-10 00:00,18.1,24.5,1,68
+2024-01-10 00:10,18.2,24.4,2,69
+"""
+
+
+def test_a_line_of_units_under_the_header_states_units(here):
+    found = begun(UNDER, equation="conduction")
+    assert found["data"]["skip"] == 1
+    channels = found["channels"]
+    assert "unit" not in channels["T_in"]  # that of the model
+    assert channels["q"]["quantity"] == "flux"
+    assert "unit" not in channels["q"]
+    assert channels["P_kW"]["unit"] == "? kW"
+    assert channels["10cm"]["unit"] == "degF"
+
+
+def test_a_unit_of_times_under_the_header(here):
+    text = "Elapsed,W1,OW (30 m)\nmin,m3/h,depth to water m\n0.5,45,4.2\n2,45,4.4\n"
+    found = begun(f"Test W1\nOperator: B, C.\n{text}", equation="pumping_test")
+    assert (found["data"]["skip"], found["data"]["time_unit"]) == (2, "min")
+    assert found["channels"]["Q"]["unit"] == "m^3/h"
+
+
+def test_a_case_for_a_parquet_file(here):
+    times = pd.date_range("2024-01-10", periods=4, freq="10min")
+    table = {"time": times, "T_5cm": [20.0, 20.1, np.nan, 20.3], "note": ["", "", "x", ""]}
+    pd.DataFrame(table).to_parquet("my.parquet")
+    made = CliRunner().invoke(app, ["init", "mine", "--data", "my.parquet"])
+    assert made.exit_code == 0, made.output
+    found = tomllib.loads(Path("mine/case.toml").read_text())
+    assert found["data"] == {"file": "../my.parquet", "time": "time"}
+    assert found["channels"]["T_5cm"]["at"] == "5 cm"

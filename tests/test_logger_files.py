@@ -89,6 +89,13 @@ def test_a_repeated_row_is_not_a_repeated_hour(tmp_path: Path, read: Reader, aga
         read(tmp_path, [*rows[:80], rows[again], *rows[80:]])
 
 
+@pytest.mark.parametrize("read", [from_csv, from_json, from_memory])
+def test_a_row_is_repeated_in_the_second_pass(tmp_path: Path, read: Reader) -> None:
+    """A third time cannot be meant: the row is dropped as in any other hour."""
+    rows = [{"t": text, "a": float(k)} for k, text in enumerate(local(10, 18))]
+    assert read(tmp_path, [*rows[:14], rows[13], *rows[14:]]) == read(tmp_path, rows)
+
+
 @pytest.mark.parametrize("minutes", [10, 60])
 def test_a_case_for_local_times_needs_their_zone(tmp_path: Path, minutes: int) -> None:
     """Sorting rows or dropping repeated rows would mix or lose an hour."""

@@ -31,7 +31,7 @@ NOT_A_UNIT = (
     ValueError,
 )
 IN_BRACKETS = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]\s*$")  # T [degC], time (min)
-AFTER_SLASH = re.compile(r"^[^\s/]+\s*/\s*([^\s/]+)$")  # Ewe/V, T / K; not flow m3/h
+AFTER_SLASH = re.compile(r"^(?:[^\s/]+\s*|.+\s)/\s*([^\s/]+)$")  # Ewe/V, T 2cm / K; not flow m3/h
 AT_THE_END = re.compile(r"(?:_|^(?=\w{3}))([A-Za-z]+)$")  # time_s, minutes
 # power_kW, T_30cm degF, T_1 degF; not T_1 cm, which is a position
 AFTER_A_WORD = re.compile(r"(?:(?<=[^\W\d])[_ ]|(?<=\d)[_ ](?=deg))(deg[CF]|[kM]W|[mc]m|ft)$")

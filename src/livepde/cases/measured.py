@@ -21,9 +21,9 @@ from livepde.linalg import Array
 from livepde.streams import Clock, Column, DataTable, read_csv
 from livepde.streams.cells import Missing, is_limit, is_missing, number_of
 from livepde.streams.clock import CALLED_TIME, ELAPSED, date_formats, elapsed_formats
-from livepde.streams.csvfile import Written, how_written, read_long_csv, texts_of
+from livepde.streams.csvfile import UTF_8, Written, how_written, read_long_csv, texts_of
 from livepde.streams.join import join_tables
-from livepde.streams.table import JSON_LINES
+from livepde.streams.table import JSON_LINES, parquet_file, read_parquet
 from livepde.units import OF_TIMES, conversion, counted_since, unit_in
 
 HOUR = re.compile(r"\d+:\d{2}(:\d{2}(\.\d+)?)?( ?[AaPp][Mm])?")
@@ -38,6 +38,7 @@ LATEST = 2.7  # largest plausible over smallest number: the year 2051, or 2169 f
 DATED = re.compile(r"^t\b|time|date|datum|zeit|temps", re.I)
 VALUED = re.compile(r"val|wert|reading|result|state", re.I)  # name of the column of values
 UNITS = re.compile(r"unit|einheit|unité|eenheid", re.I)  # name of the column of units
+FIRST_ROWS = 1000  # rows from which the columns of a Parquet file are recognised
 MOSTLY = 0.9  # smallest share of distinct pairs of time and sensor in a long table
 VALUES = {"number", "date", "hour"}  # kinds of cells that do not occur in a header
 
@@ -88,9 +89,11 @@ class Measured:
         return replace(self, more=(*self.more, other))
 
     def titled(self, name: str) -> str:
-        """Return the name of a sensor with its unit in brackets, if a column of units has it."""
-        unit = self.units.get(name, "")
-        return f"{name} [{unit}]" if unit else name
+        """Return the name of a column with its unit in brackets, if the table has it elsewhere."""
+        if unit := self.units.get(name, ""):
+            return f"{name} [{unit}]"
+        (table,) = (one for one in self.tables if name in one.samples.names)
+        return table.written.titled(name)
 
     @property
     def is_of_numbers(self) -> bool:
@@ -133,7 +136,7 @@ def measured(
     sensor: str = "",
     value: str = "",
 ) -> Measured:
-    """Read a CSV file whose format is unknown, apart from the arguments; raises `SampleError`.
+    """Read a CSV or Parquet file of unknown format, except for arguments; raises `SampleError`.
 
     `time_unit`: time unit of the equation. `time_format`: format of dates; empty: detected from the
     cells. `skip`: number of lines before the header; None: detected. `zone`: time zone of dates
@@ -141,9 +144,10 @@ def measured(
     name and numbers. `sensor`, `value`: columns of a long table, with a row for each reading;
     empty: detected.
     """
-    if table.suffix in (*JSON_LINES, ".parquet"):
-        raise SampleError(f"{table}: expected a CSV file with a header.")
-    written = how_written(table, skip=skip)
+    if table.suffix in JSON_LINES:
+        raise SampleError(f"{table}: expected a CSV file with a header, or a Parquet file.")
+    parquet = table.suffix == ".parquet"
+    written = _parquet_written(table) if parquet else how_written(table, skip=skip)
     written = replace(written, rows=[_without(row, missing) for row in written.rows])
     kinds = _kinds(table, written, time_format)
     time = _times(table, written, kinds)
@@ -155,7 +159,9 @@ def measured(
     units: Mapping[str, str] = {}
     how: dict[str, Any] = {"separator": written.separator, "encoding": written.encoding}
     how |= {"skip": written.skip, "missing": missing}
-    if found := _readings(table, written, zoned, list(columns), texts, sensor, value):
+    if parquet:
+        samples = read_parquet(table, columns, zoned, missing=missing)
+    elif found := _readings(table, written, zoned, list(columns), texts, sensor, value):
         long, units = (found.sensor, found.value), found.units
         columns = {name: Column((name,), decimal=written.decimal) for name in found.names}
         parts = read_long_csv(table, columns, zoned, long, **how)
@@ -167,6 +173,16 @@ def measured(
     steps = time_unit and (steps or BLANK)
     known = (samples, row_numbers, texts, missing, counted)
     return Measured(table, written, time, clock.format, steps, *known, long=long, units=units)
+
+
+def _parquet_written(path: Path) -> Written:
+    """Return the columns and the first rows of a Parquet file as a text file has them."""
+    with parquet_file(path) as file:
+        names = file.schema_arrow.names
+        batch = next(file.iter_batches(FIRST_ROWS), None)
+    columns = [column.to_pylist() for column in batch.columns] if batch else []
+    rows = [["" if x is None else str(x) for x in row] for row in zip(*columns, strict=True)]
+    return Written(",", ".", UTF_8, 0, (), names, rows)
 
 
 @dataclass(frozen=True)
@@ -262,7 +278,7 @@ def _sorted_out(
 
 def _unit_of_times(written: Written, name: str) -> str:
     """Return the unit of times that are numbers, with its reference date, if any, or empty."""
-    if found := counted_since(name) or unit_in(name, "s", *OF_TIMES):
+    if found := counted_since(name) or unit_in(written.titled(name), "s", *OF_TIMES):
         return found
     values, named = _values(name, written), DATED.search(name)
     for unit, least in COUNTED.items() if named else ():
@@ -335,7 +351,7 @@ def _most_like_times(numbers: Sequence[str], hours: Sequence[str], written: Writ
     `hours`: columns such as 0:10:00, which are times if they are elapsed times. If there are any,
     columns of numbers are times only if their name indicates it.
     """
-    timed = [n for n in numbers if counted_since(n) or unit_in(n, "s", *OF_TIMES)]
+    timed = [n for n in numbers if counted_since(n) or unit_in(written.titled(n), "s", *OF_TIMES)]
     rising = [name for name in numbers if _rises(name, written)]
     named = [*filter(rising.__contains__, timed), *filter(CALLED_TIME.match, rising)]
     if hours:

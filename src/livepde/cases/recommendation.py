@@ -162,6 +162,9 @@ def _disagreements(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[s
             found.setdefault(name, []).append(one.variant.name)
     for name, names in found.items():
         listed = ", ".join(f"'{one}'" for one in names)
-        yield f"{name} depends on the variant: its interval in {listed} does not overlap."
+        yield (
+            f"{name} depends on the variant: its interval in {listed} does not overlap with the "
+            "interval in the recommended one."
+        )
     if shared and not found and best.level in USABLE:
         yield "All variants agree: their intervals overlap with that of the recommended one."

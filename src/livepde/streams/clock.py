@@ -103,14 +103,17 @@ class Clock:
         return low, high + self.margin
 
     def repeated_hour(self, t: float) -> float:
-        """Return the time until clocks show a time, given since 1970, again; 0 if they do not."""
+        """Return the time until clocks show a time, given since 1970, again; 0 if they do not.
+
+        In the second pass of an hour that clocks repeat, they do not show it again.
+        """
         try:
             here = datetime.fromtimestamp(t / self.second, self.zone)
         except (ValueError, OverflowError, OSError):
             return 0.0
         # A repeated time has a different UTC offset in the second pass (fold = 1).
         first, again = here.replace(fold=0).utcoffset(), here.replace(fold=1).utcoffset()
-        if first is None or again is None:
+        if first is None or again is None or here.fold:
             return 0.0
         return (first - again).total_seconds() * self.second
 

@@ -8,7 +8,7 @@ import io
 import stat
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain, filterfalse, islice
 from operator import itemgetter
 from pathlib import Path
@@ -29,6 +29,7 @@ from livepde.streams.cells import (
     number_of,
 )
 from livepde.streams.clock import ELAPSED, Clock, date_formats, elapsed, read_times
+from livepde.units import SCALES, in_si
 
 T = TypeVar("T")
 
@@ -58,6 +59,13 @@ class Written:
     time_formats: tuple[str, ...]
     header: list[str]
     rows: list[list[str]]
+    labels: list[str] = field(default_factory=list)  # first line under the header, without data
+
+    def titled(self, name: str) -> str:
+        """Return the name of a column with its unit in brackets, if the line of units has it."""
+        label = dict(zip(self.header, self.labels, strict=False)).get(name, "")
+        unit = label.strip().strip("[]()")
+        return f"{name} [{unit}]" if unit and in_si(SCALES.get(unit, unit)) else name
 
     @property
     def time_format(self) -> str:
@@ -330,11 +338,12 @@ def how_written(path: str | Path, encoding: str = "", skip: int | None = None) -
     separator = _separator(lines[skip:])
     if skip is None:
         skip = _titles(lines, separator)
-    found = rows_of(lines[skip:], separator)
-    header, *rows = [*below_title(filter(None, found), list)] or [[]]
+    found = [row for row in rows_of(lines[skip:], separator) if row]
+    header, *rows = [*below_title(iter(found), list)] or [[]]
+    under = found[found.index(header) + 1 : len(found) - len(rows)] if found else []
     decimal = "," if any(map(has_decimal_comma, chain.from_iterable(rows))) else "."
     formats = _time_formats(header, rows, decimal)
-    return Written(separator, decimal, encoding, skip, formats, header, rows)
+    return Written(separator, decimal, encoding, skip, formats, header, rows, *under[:1])
 
 
 def _time_formats(
@@ -379,7 +388,9 @@ def _titles(lines: Sequence[str], separator: str) -> int:
     usual = min(multimode(filter(None, widths)), default=0)
     start = next((k for k, found in enumerate(widths) if found >= usual), 0)
     names = rows[start] if rows else []
-    titled = all(found <= 1 for found in widths[:start])
+    above = zip(widths[:start], lines, strict=False)
+    plain = all(found <= 1 or line.startswith("#") for found, line in above)
+    titled = plain or are_labels(names)
     if not titled or any(number_of(name.strip(), ",") is not None for name in names):
         return 0  # the header itself is short
     return start + _is_comment_above(lines, rows, start)
