@@ -10,7 +10,7 @@ from skfem import ElementLineP1
 import livepde as lp
 from livepde.cases.preview import StatedNoise
 from livepde.diagnostics import Identifiability
-from livepde.diagnostics.information_gain import information_gains
+from livepde.diagnostics.information_gain import InformationGain, information_gains
 
 MESH = lp.interval(0.0, 1.0, 12)
 TIMES = 0.1 * np.arange(1, 31)
@@ -55,6 +55,15 @@ def test_two_that_only_their_difference_shows_are_named_whatever_their_units(sca
     assert (a, b) == ("a", "b")
     assert r == pytest.approx(1.0, abs=1e-3)
     assert found.sentences[0].startswith("a and b are correlated (")
+
+
+@pytest.mark.parametrize(
+    ("left", "text"), [(0.01, "both are well determined"), (0.3, "not each alone")]
+)
+def test_a_correlation_of_two_that_are_well_determined_is_no_ambiguity(left: float, text: str):
+    unknowns = (InformationGain("a", 0.01), InformationGain("b", left))
+    (found,) = Identifiability(unknowns, (("a", "b", 0.99),), ()).sentences
+    assert text in found
 
 
 @pytest.mark.slow

@@ -167,6 +167,11 @@ def test_a_start_that_the_first_readings_miss_is_named(tmp_path):
     assert not start_missed(prepared, Verdict.of([]))
     near = changed(tmp_path / "near", lambda table: None)
     assert not start_missed(near, doubted)
+    # An unknown offset explains what the readings of its sensor miss.
+    assert "`offset`" in found.remedy
+    sensors = {f"channels.{name}.offset": "70 K" for name in prepared.case.roles("sensor")}
+    shifted = changed(tmp_path / "shifted", lambda table: None, initial="90 degC", **sensors)
+    assert not start_missed(shifted, doubted)
     # Later readings have moved on from the start: they say nothing of it.
     later = changed(tmp_path / "later", lambda table: None, initial="90 degC", **{"data.t0": -60.0})
     assert not start_missed(later, doubted)

@@ -349,9 +349,10 @@ def first_miss(prepared: Prepared) -> float:
 
 
 def _first_readings(prepared: Prepared) -> Array:
-    """Return the readings of the state by assimilated sensors in the first sample."""
+    """Return the first readings of the state by assimilated sensors without unknown offsets."""
     given, channels = by_name(prepared.first.z, ()), prepared.case.roles("sensor")
-    names = [name for name, item in channels.items() if item.quantity is None and name in given]
+    plain = [n for n, item in channels.items() if item.quantity is None and item.offset is None]
+    names = [name for name in plain if name in given]
     seen: Array = np.array([float(given[name]) for name in names])
     return np.compress(np.isfinite(seen), seen)
 

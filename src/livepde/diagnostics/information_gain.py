@@ -22,7 +22,7 @@ from livepde.verdict import FLAT
 
 # Largest remaining share of the prior standard deviation of a well-determined unknown.
 PINNED = 0.1
-# Correlation from which only a combination of two unknowns is determined.
+# Correlation from which a pair of unknowns is named.
 TRADED = 0.9
 # Smallest coefficient in a unit vector with which an unknown is listed in a combination.
 WEIGHT = 0.3
@@ -84,8 +84,8 @@ class Identifiability:
     unknowns
         One item for each number and field.
     pairs
-        Two names and their correlation, if beyond 0.9: only a combination of both is determined.
-        For a number and a field, the multiple correlation with the modes.
+        Two names and their correlation, if beyond 0.9. Unless both are pinned, only a combination
+        of them is determined. For a number and a field, the multiple correlation with the modes.
     directions
         Leading combinations of three or more numbers that are pinned although no single number is.
     """
@@ -97,9 +97,11 @@ class Identifiability:
     @property
     def sentences(self) -> list[str]:
         """Sentences on correlated unknowns and on the determined modes of each field."""
+        pinned = {item.name for item in self.unknowns if item.left <= PINNED}
+        both = "both are well determined, but an error of one shifts the other."
+        one = "the data identify a combination of them, not each alone."
         found = [
-            f"{a} and {b} are correlated ({r:+.2f}): the data identify a combination of them, "
-            "not each alone."
+            f"{a} and {b} are correlated ({r:+.2f}): {both if pinned >= {a, b} else one}"
             for a, b, r in self.pairs
         ]
         found += [

@@ -215,8 +215,9 @@ FINDINGS: dict[str, Sentence] = {
     ),
     "start, missed": Sentence(
         "The first readings miss the stated initial state by {missed} (root mean square).",
-        "If the process began before the first row, set `data.t0`. Otherwise specify the "
-        "uncertainty of its start: `{setting}`.",
+        "If the process began before the first row, set `data.t0`. If the readings have another "
+        "zero than the model, estimate the `offset` of each sensor. Otherwise specify the "
+        "uncertainty of the start: `{setting}`.",
     ),
     "hold": Sentence(
         'Inputs are held between readings (`between = "hold"` or `"next"`), but vary smoothly. '
