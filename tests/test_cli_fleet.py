@@ -85,6 +85,18 @@ def test_each_row_is_a_separate_run(here):
 
 
 @pytest.mark.long
+def test_the_summary_has_the_intervals_with_model_errors(here):
+    Path("rods.csv").write_text("name,data,channels.T_10.at\nplain,,\nwrong,,11 cm\n")
+    call("fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods", "--separately")
+    table = pd.read_csv("rods/fleet.csv").set_index("name")
+    for name, row in table.iterrows():
+        last = runs.open(Path("rods") / str(name)).dataset
+        errors = runs.verdict(last).errors["alpha"]
+        assert (row["alpha_low"], row["alpha_high"]) == (errors.low, errors.high)
+    assert table.loc["wrong", "alpha_high"] > float(last["alpha_high"][-1])
+
+
+@pytest.mark.long
 def test_failed_steps_are_reported(here):
     """Failed steps are also reported for members that step together."""
     table = pd.read_csv("rod/rod.csv")
@@ -96,7 +108,7 @@ def test_failed_steps_are_reported(here):
     )
     assert code == 1
     notes = json.loads(output)["notes"]
-    assert "Of 2 members 2 were stepped together." in notes
+    assert "Of 2 members, 2 were stepped together." in notes
     assert "hot: 19 of 39 steps failed: not_finite" in notes
     assert not any("plain: " in note and "steps failed" in note for note in notes)
 
@@ -247,9 +259,9 @@ def test_similar_members_step_together(alike):
     """The results of each member equal those of a separate run."""
     code, output = call(*FIRST, "rods", "--json")
     assert code == 1  # too few samples for the expectations of the case
-    assert json.loads(output)["notes"][0] == "Of 3 members 3 were stepped together."
+    assert json.loads(output)["notes"][0] == "Of 3 members, 3 were stepped together."
     _, output = call(*FIRST, "apart", "--separately", "--json")
-    assert "3 separately: --separately (3)" in json.loads(output)["notes"][0]
+    assert "3 were stepped separately: --separately (3)" in json.loads(output)["notes"][0]
     for name in "abc":
         equal(Path("rods") / name, Path("apart") / name)
     left, right = (pd.read_csv(f"{folder}/fleet.csv") for folder in ("rods", "apart"))
@@ -262,7 +274,7 @@ def test_each_process_steps_its_part_together(alike):
     Path("rods.csv").write_text(ALIKE + "d,rod/third.csv,\n")
     call(*FIRST, "one")
     _, output = call(*FIRST, "two", "--jobs", "2", "--json")
-    assert json.loads(output)["notes"][0] == "Of 4 members 4 were stepped together."
+    assert json.loads(output)["notes"][0] == "Of 4 members, 4 were stepped together."
     for name in "abcd":
         equal(Path("two") / name, Path("one") / name)
 
@@ -438,7 +450,7 @@ def test_other_commands_accept_the_runs_of_a_fleet(alike):
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("waiting", "how"),
-    [(250, "3 separately: resumed runs (3)."), (10**9, "3 were stepped together.")],
+    [(250, "3 were stepped separately: resumed runs (3)."), (10**9, "3 were stepped together.")],
 )
 def test_a_killed_fleet_resumes(alike, monkeypatch, waiting, how):
     """Members with results resume separately, members without begin together."""
@@ -458,7 +470,7 @@ def test_a_killed_fleet_resumes(alike, monkeypatch, waiting, how):
     assert runs.open(Path("again/a")).status == "running"
     assert (Path("again/a") / JOURNAL).exists() == (waiting == 250)
     _, output = call(*FIRST, "again", "--resume", "--json")
-    assert json.loads(output)["notes"][0] == f"Of 3 members {how}"
+    assert json.loads(output)["notes"][0] == f"Of 3 members, {how}"
     assert runs.open(Path("again/a")).status == "finished"
     for name in "abc":
         same(runs.open(Path("again") / name).dataset, runs.open(Path("rods") / name).dataset)
@@ -544,8 +556,8 @@ def test_the_reason_for_separate_members_is_reported(alike):
     found = json.loads(output)
     assert code == 0
     assert found["notes"][0] == (
-        "Of 7 members 4 were stepped together, 3 separately: no other one has their settings and "
-        "sample times (3)."
+        "Of 7 members, 4 were stepped together, and 3 were stepped separately: no other member has "
+        "their settings and sample times (3)."
     )
     # A run begins with the first row in which each input has a value.
     assert [row[1] for row in found["tables"][0]["rows"]] == ["finished"] * 7

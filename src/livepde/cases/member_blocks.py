@@ -26,7 +26,7 @@ from livepde.samples import by_name
 from livepde.streams import DataTable
 
 WAITING = 2**23  # pending numbers above which the journals are written
-ALONE = "no other one has their settings and sample times"
+ALONE = "no other member has their settings and sample times"
 # Keys of channels (how they are read) and tables of the case in which members may differ.
 READ = {"column", "columns", "noise_column", "unit", "factor", "late", "valid"}
 READ |= {"missing", "spikes", "wait", "repeated"}

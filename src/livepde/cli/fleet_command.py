@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
@@ -23,7 +24,8 @@ from livepde.cli.options import CaseArgument, CodeOption, JsonOption, SetOption,
 from livepde.cli.printing import CHECK_FAILED, INTERRUPTED, present
 from livepde.cli.run import concluded, run_batch, writer_of
 from livepde.errors import ConfigurationError, DataError, LivepdeError, RunError
-from livepde.records import STATUS_CODES, scalars
+from livepde.frames import estimates
+from livepde.records import STATUS_CODES
 from livepde.runs import JOURNAL, Check, Driven, Run, RunWriter, Table
 from livepde.streams import DataTable
 
@@ -59,7 +61,8 @@ class MemberOutcome:
     status: str  # "finished", "interrupted" or "failed"
     samples: int = 0
     level: str = ""  # level of the verdict; empty without samples
-    unknowns: dict[str, tuple[float, float]] = field(default_factory=dict)  # last value, std
+    # Last estimates: D, D_std, D_low and D_high, an interval with model errors if it is known.
+    unknowns: dict[str, float] = field(default_factory=dict)
     failed: tuple[str, ...] = ()  # names of failed checks
     lost: dict[str, int] = field(default_factory=dict)  # reason -> number of failed steps
     error: str = ""
@@ -104,8 +107,8 @@ def fleet(
     """Run a case for each row of a table, with its own data, settings and run directory.
 
     If members differ only in data and initial state, they are stepped together, which is much
-    faster. For other cases the summary, fleet.csv, gives the reason. If a run fails, the others
-    continue, and the summary contains its message.
+    faster. A note gives the reason for separate runs. The summary is fleet.csv. If a run fails, the
+    others continue, and its message is printed.
 
     Example:  livepde fleet rod/case.toml --members rods.csv --out rods --jobs 4
     """
@@ -120,8 +123,10 @@ def fleet(
     wrong = [item for item in ended if item.status == "failed" or item.failed]
     notes = [*_how(ended), *losses, *_complaints(ended)]
     lines = [f"[bold]Run directories: {escape(str(folder))}[/]"]
-    cells = list(summary.itertuples(index=False, name=None))
-    tables = [Table(f"{len(cells)} runs", list(map(str, summary.columns)), cells)]
+    # The intervals make standard deviations redundant.
+    short = summary[[name for name in summary.columns if not str(name).endswith("_std")]]
+    cells = list(short.itertuples(index=False, name=None))
+    tables = [Table(f"{len(cells)} runs", list(map(str, short.columns)), cells)]
     present(tables, [], notes, as_json=as_json, lines=lines, run=str(folder), failed=len(wrong))
     if _interrupted(ended):
         raise typer.Exit(INTERRUPTED)
@@ -355,11 +360,11 @@ def _interrupted(ended: Iterable[MemberOutcome]) -> bool:
 def _outcome_of(
     name: str, run: Driven | Run, dataset: xr.Dataset, checks: Sequence[Check]
 ) -> MemberOutcome:
-    unknowns = {
-        label: (float(dataset[label][-1]), float(dataset[f"{label}_std"][-1]))
-        for label in scalars(dataset)
-        if dataset.sizes["time"]
-    }
+    unknowns: dict[str, float] = {}
+    for label, row in estimates(dataset).iterrows():
+        kind = "" if math.isnan(row["model_low"]) else "model_"
+        columns = {"": "value", "_std": "std", "_low": f"{kind}low", "_high": f"{kind}high"}
+        unknowns |= {f"{label}{end}": float(row[column]) for end, column in columns.items()}
     failed = tuple(check.name for check in checks if not check.ok)
     error = getattr(run, "error", None)
     samples = dataset.sizes["time"]
@@ -393,8 +398,8 @@ def _how(ended: Sequence[MemberOutcome]) -> list[str]:
     together = sum(not item.apart and item.samples > 0 for item in ended)
     parts = [f"{together} were stepped together"] if together else []
     reasons = "; ".join(f"{why} ({number})" for why, number in apart.items())
-    parts += [f"{count} separately: {reasons}"] if apart else []
-    return [f"Of {len(ended)} members {', '.join(parts)}."] if parts else []
+    parts += [f"{count} were stepped separately: {reasons}"] if apart else []
+    return [f"Of {len(ended)} members, {', and '.join(parts)}."] if parts else []
 
 
 def _summary(ended: Sequence[MemberOutcome]) -> pd.DataFrame:
@@ -403,13 +408,8 @@ def _summary(ended: Sequence[MemberOutcome]) -> pd.DataFrame:
 
     rows = []
     for item in ended:
-        found = {
-            key: number
-            for label, (value, std) in item.unknowns.items()
-            for key, number in ((label, value), (f"{label}_std", std))
-        }
         own = {NAME: item.name, "status": item.status, "samples": item.samples}
-        rows.append({**own, "verdict": item.level, **found})
+        rows.append({**own, "verdict": item.level, **item.unknowns})
     return pd.DataFrame(rows)
 
 
