@@ -159,7 +159,7 @@ def test_iterations_with_new_factors(monkeypatch):
     assert all(any(engine in row[4] for engine in engines) for row in outcome.tables[0].rows)
     assert all(row[5] for row in outcome.tables[0].rows)
     monkeypatch.setattr(stage_solvers, "LARGE", 10**9)
-    with pytest.raises(ConfigurationError, match="take more"):
+    with pytest.raises(ConfigurationError, match="use more"):
         scale.iterations((300,))
 
 
