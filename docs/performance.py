@@ -221,7 +221,7 @@ def report(title: str, content: Mapping[str, Any]) -> str:
         )
         for item in content["checks"]
     ]
-    return markdown(title, shown, checks, content["notes"]).replace("| None |", "| – |")
+    return markdown(title, shown, checks, content["notes"])
 
 
 def section(name: str, content: Mapping[str, Any]) -> str:

@@ -17,10 +17,12 @@ from rich.table import Table as RichTable
 
 from livepde import __version__, plots, runs
 from livepde.cases.read import did_you_mean
+from livepde.diagnostics.check_report import shown_cell
 from livepde.errors import ConfigurationError
 from livepde.runs import Check, Journal, Table
 from livepde.runs.directory import plain
 
+DIGITS = 4  # significant digits of a number in a table
 MOST_CURVES = 100_000  # largest number of samples for which readings are drawn
 CHECK_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
 FIGURES_MISSING = "No figures: they require Matplotlib, pip install 'livepde[plots]'."
@@ -106,7 +108,9 @@ def show(
     grid = RichTable.grid(padding=(0, 2))
     for item in checks:
         mark = "[green]ok[/]" if item.ok else "[bold red]failed[/]"
-        grid.add_row(mark, escape(item.name), _cell(item.value), item.sense, item.bound_text)
+        grid.add_row(
+            mark, escape(item.name), shown_cell(item.value, DIGITS), item.sense, item.bound_text
+        )
     if grid.row_count:
         console.print(grid, soft_wrap=False)
     for note in notes:
@@ -133,7 +137,7 @@ def print_table(console: Console, table: Table) -> None:
         values = [row[k] for row in table.rows]
         numbers = k > 0 and all(map(_numeric, values))
         # The heading and text can be folded between words.
-        cells = list(map(_cell, values))
+        cells = [shown_cell(value, DIGITS) for value in values]
         words = [*(cells if numbers else " ".join(cells).split()), *column.split()]
         width = max(map(len, words), default=0)
         needed += width + 2  # two blanks between columns
@@ -141,16 +145,12 @@ def print_table(console: Console, table: Table) -> None:
             escape(column), justify="right" if numbers else "left", min_width=width, overflow="fold"
         )
     for row in table.rows:
-        grid.add_row(*(escape(_cell(value)) for value in row))
+        grid.add_row(*(escape(shown_cell(value, DIGITS)) for value in row))
     console.print(grid, width=max(console.width, needed), crop=False, soft_wrap=False)
 
 
 def _numeric(value: Any) -> bool:
-    if isinstance(value, int | float):
+    if value is None or isinstance(value, int | float):
         return True
     text = str(value).removesuffix(" %")
     return text == "–" or text.lstrip("+-").replace(".", "").replace("e", "").isdigit()
-
-
-def _cell(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -106,13 +106,20 @@ class Table:
         """Return the table in Markdown with `digits` significant digits, or its title if empty."""
 
         def line(cells: Iterable[Any]) -> str:
-            shown = (f"{c:.{digits}g}" if isinstance(c, float) else str(c) for c in cells)
+            shown = (shown_cell(cell, digits) for cell in cells)
             return "| " + " | ".join(cell.replace("|", "\\|") for cell in shown) + " |"
 
         if not self.rows:
             return f"## {self.title}"
         rule = "|" + "---|" * len(self.columns)
         return "\n".join([f"## {self.title}", "", line(self.columns), rule, *map(line, self.rows)])
+
+
+def shown_cell(value: Any, digits: int) -> str:
+    """Return a cell of a table as text, a dash for None."""
+    if value is None:
+        return "–"
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
 @dataclass(frozen=True)
