@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import islice
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,11 @@ from factories import driven_rod, filter_alone, line, readings
 
 import livepde as lp
 from benchmarks import soak
+from livepde.hindsight import Hindsight
+from livepde.laws import Status
 from livepde.laws.policies import Jumps
+from livepde.laws.step_diagnostics import Diagnostics
+from livepde.stepping import End, Interval
 
 pytestmark = pytest.mark.slow
 
@@ -255,3 +260,16 @@ def test_a_large_jump_begins_with_its_first_sample():
     for size in np.repeat([1.0, 1.3], [100, 60]):
         watch, _ = jumps.add(watch, size * rng.standard_normal((1, 3)))
     assert jumps.onsets(watch, np.array([[140.0, np.nan, -3.0]]))[0] == 1
+
+
+def test_the_variances_of_two_jumps_in_one_interval_add_up():
+    """Each of two jumps in consecutive intervals acts at both ends of its interval."""
+    hindsight = Hindsight(np.zeros(1))
+    for number in range(1, 5):
+        ends = [End(t=t, inputs=lp.fem.Inputs({}), z=np.ones(1)) for t in (number - 1.0, number)]
+        diagnostics = Diagnostics(jump_samples=1.0) if number in (2, 3) else Diagnostics()
+        estimate = SimpleNamespace(status=Status(), diagnostics=diagnostics, t=float(number))
+        hindsight.add(estimate, Interval.between(*ends), np.zeros(1))
+    data = hindsight.fixed_interval(1)
+    assert data is not None
+    assert data.jumps == {1: 0.5, 2: 1.0, 3: 0.5}

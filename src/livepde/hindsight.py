@@ -31,7 +31,7 @@ class Hindsight:
         self._q = [q0]
         self._opening: Interval | None = None
         self._intervals: list[Interval] = []
-        self._jumps: dict[int, int] = {}
+        self._jumps: dict[int, float] = {}
         self._estimates: list[tuple[int, float, Status]] = []  # number of intervals, time, status
 
     def add(self, estimate: Estimate, interval: Interval, q: Array) -> None:
@@ -55,7 +55,8 @@ class Hindsight:
         onset = estimate.diagnostics.jump_samples
         if onset > 0:
             when = changing(self._intervals, len(self._intervals) - int(onset))
-            self._jumps |= dict.fromkeys(when, len(when))
+            for number in when:
+                self._jumps[number] = self._jumps.get(number, 0.0) + 1.0 / len(when)
         self._estimates.append((len(self._intervals), estimate.t, estimate.status))
 
     def fixed_interval(self, fields_every: int) -> FixedInterval | None:

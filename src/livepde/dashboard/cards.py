@@ -162,8 +162,8 @@ def _failures(seen: RunView) -> Iterator[str]:
         # The page has only the newest events, and this event may be older.
         messages = ["", *(f": {one.message}" for one in seen.events if one.kind == "silent")]
         yield f"The source is silent{messages[-1]}."
-    if seen.unwell:
-        yield f"Unhealthy: {seen.unwell}."
+    if seen.unhealthy:
+        yield f"Unhealthy: {seen.unhealthy}."
     if seen.estimates is not None and (code := int(seen.estimates["status"].values[-1])):
         text = f"The last step failed ({STATUS_CODES[code].replace('_', ' ')})"
         yield f"{text}. The estimate is from the last successful step."

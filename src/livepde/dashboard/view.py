@@ -89,7 +89,7 @@ class RunView:
     reading: bool = False  # whether there are more records to read
     events: Sequence[Event] = ()  # events and counts of the journal
     counts: Mapping[tuple[str, str], int] = field(default_factory=dict)
-    unwell: str = ""  # reason of an unhealthy run, as in /health; empty for a healthy one
+    unhealthy: str = ""  # reason why the run is unhealthy, as in /health; empty if it is healthy
     doubts: Sequence[str] = ()  # findings against the estimates
     notes: Sequence[str] = ()  # further notes of the run
     checks: Sequence[Check] = ()
@@ -202,7 +202,7 @@ class View:
             new = [*islice(journal.after(max(self._number - 1, 0)), AT_ONCE)]
             readings = dict(journal.values(new[0][0], new[-1][0])) if new else {}
             layout, count = journal.layout, journal.estimated
-            events, counts, unwell = journal.events, journal.counts, journal.health
+            events, counts, unhealthy = journal.events, journal.counts, journal.health
             verdict = journal.verdict
         names = [*layout.sensors, *(layout.validation or ())]
         for number, record in new:
@@ -220,7 +220,7 @@ class View:
             reading=len(new) == AT_ONCE,
             events=events[-SHOWN:],
             counts=counts,
-            unwell=unwell if status == "running" else "",
+            unhealthy=unhealthy if status == "running" else "",
         )
 
     def _add(

@@ -63,11 +63,11 @@ def beginnings(
     `readings`: readings from which each initial state was computed. `errors`: its own errors,
     (errors, n). `initial`: u0 as specified, which laws with a covariance evaluate on other meshes.
     """
-    made: dict[int, Beginning] = {}  # shared by members with one u0, since work caches matrices
+    shared: dict[int, Beginning] = {}  # one for members with the same u0: work caches matrices
     result = []
     for initial_readings, own_errors, u0 in zip(readings, errors, initial, strict=True):
         separate = bool(initial_readings) or bool(len(own_errors))
-        begin = made.get(id(u0)) if not separate else None
+        begin = shared.get(id(u0)) if not separate else None
         if begin is None:
             own = replace(
                 problem,
@@ -76,7 +76,7 @@ def beginnings(
                 initial=u0,
             )
             begin = Beginning(own, law.work_from(work, own))
-            made |= {} if separate else {id(u0): begin}
+            shared |= {} if separate else {id(u0): begin}
         result.append(begin)
     return result
 

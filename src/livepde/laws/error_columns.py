@@ -21,7 +21,6 @@ import scipy
 
 from livepde.fem import Inputs, Moment, dot, grad, shares
 from livepde.laws.filter_state import PAUSE
-from livepde.laws.layers import places_of
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array
 from livepde.model import Model
@@ -240,7 +239,7 @@ class ErrorColumns:
         """Possible borders of layers: the middles between sensors on an interval."""
         if len(self.span) > 1:
             return []
-        places = np.unique([*places_of(self.observed.observation)])
+        places = np.unique([at[0] for at in self.observed.places.values()])
         middles: list[float] = (0.5 * (places[1:] + places[:-1])).tolist()
         return middles if len(middles) <= MOST_BORDERS else []
 

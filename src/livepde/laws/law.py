@@ -355,8 +355,8 @@ class FixedInterval:
     q
         Latent parameters estimated at the initial time and after each interval.
     jumps
-        Indices of the intervals at whose starts unknowns may have jumped, and the number of parts
-        of each of these jumps.
+        Indices of the intervals at whose starts unknowns may have jumped, and the share of the
+        variance of a jump there; shares of several jumps add up.
     fields
         Times at which the state is requested: 0 is the initial time, k the end of interval k.
     """
@@ -364,7 +364,7 @@ class FixedInterval:
     opening: Interval
     intervals: Sequence[Interval]
     q: Sequence[Array]
-    jumps: Mapping[int, int]
+    jumps: Mapping[int, float]
     fields: Collection[int]
 
 

@@ -7,14 +7,13 @@ and the best amplitudes explain s^T S^+ s of the sum of squares z^T P z.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from livepde.linalg import Array, IntArray
-from livepde.observation import Calibrated, Combined, Observation, Points, Slow
 from livepde.verdict import Cause
 from livepde.verdict.evidence import LinearModel
 from livepde.verdict.sentences import clause, quoted
@@ -58,17 +57,6 @@ class Layers(NamedTuple):
         setting = f"unknowns.{quoted(self.name)}.regions={regions}"
         share = float(np.clip(shares[best], 0.0, 1.0))
         return Cause("layers", self.name, text, share, remedy, setting)
-
-
-def places_of(observation: Observation) -> Iterator[float]:
-    """Iterate over the places of the sensors at points of an interval, calibrated ones included."""
-    if isinstance(observation, Combined):
-        for part in observation.parts:
-            yield from places_of(part)
-    elif isinstance(observation, Calibrated | Slow):
-        yield from places_of(observation.base)
-    elif isinstance(observation, Points):
-        yield from observation.positions[:, 0].tolist()
 
 
 def _explained(S: Array, s: Array, columns: IntArray) -> float:

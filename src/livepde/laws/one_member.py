@@ -245,7 +245,7 @@ def _likelihood(
 ) -> float:
     """Return the log-likelihood of all samples if the unknowns jump before `intervals`."""
     when = changing(intervals, 0)
-    x, status = _filtered_all(work, x, intervals, when, jumps.part(len(when)))
+    x, status = _filtered_all(work, x, intervals, when, jumps.part(1.0 / len(when)))
     return float(x.evidence[0]) if status.ok else -np.inf
 
 
@@ -308,7 +308,7 @@ def _with_jump_test(
     guesses = [len(known) - reaching(shown, onset) for onset in onsets]
     before = _most_likely_onset(work, jumps, state.older, known, guesses)
     when = changing(known, before)
-    size, last = jumps.part(len(when)), when[-1]
+    size, last = jumps.part(1.0 / len(when)), when[-1]
     x = changed(work.filter.relinearised(state.older), kept=new.now.kept)
     x, status = _filtered_all(work, x, known[:last], when, size)
     start = work.filter.inflated(x, size, work.jumping)

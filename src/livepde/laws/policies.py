@@ -266,9 +266,9 @@ class Jumps:
         """Numbers of samples in the tests, minus 1."""
         return 2 ** np.arange(int(np.log2(self.window)) + 1) - 1
 
-    def part(self, count: int) -> float:
-        """Return the size of one of `count` parts of a jump, uncorrelated and of equal variance."""
-        return self.size / math.sqrt(count)
+    def part(self, share: float) -> float:
+        """Return the size of a part of a jump with a share of its variance."""
+        return self.size * math.sqrt(share)
 
     def start(self, sensors: int, members: int = 1) -> Watch:
         zero, none = np.zeros((members, self.window)), np.zeros(members, dtype=np.int64)

@@ -500,14 +500,14 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         if state.window[0] or not len(rows.times) or rows.times[0] != t0:
             return Verdict.of((), (NOT_STORED,), judged=False)
         work = self.prepare(problem)
-        again = start(work, Inputs(dict(zip(channels, rows.inputs[0].tolist(), strict=True))))
+        after = start(work, Inputs(dict(zip(channels, rows.inputs[0].tolist(), strict=True))))
         if np.isfinite(rows.readings[0]).any():
             first = first_interval(state.log, channels)
-            again, _ = stepped(self, work, problem, again, first)
+            after, _ = stepped(self, work, problem, after, first)
         for interval in intervals_since(state.log, channels):
-            again, _ = stepped(self, work, problem, again, interval)
+            after, _ = stepped(self, work, problem, after, interval)
         # The log lacks readings of excluded sensors: the memory of the gate is that of the member.
-        return work, changed(again, now=changed(again.now, screened=state.now.screened))
+        return work, changed(after, now=changed(after.now, screened=state.now.screened))
 
     def live(self) -> SensitivityLaw:
         if self.refit is None or self.refit.apart is not None:
